@@ -1,0 +1,140 @@
+r"""Alpha-beta filters: the fixed-gain tracker of one coordinate and its exact error statistics.
+
+The filter of gain ``alpha`` follows position and velocity of a coordinate measured every T seconds:
+
+    prediction  x' = x + T v,  v' = v
+    update      x = x' + alpha nu,  v = v' + (beta / T) nu,  nu = z - x'            (19), (20)
+
+Numbers in brackets are those of the IMM paper by Bakulev, Sychev and Nguyen. With P the error covariance,
+H = [1 0] and the gain K = [alpha, beta / T]^T in force, whatever it is,
+
+    P(k|k) = (I - K H) P(k|k-1) (I - K H)^T + K R K^T                               (Joseph form)
+
+belongs to the gains that were used. Reading: the paper needs a covariance for the likelihood (11) and gives
+none; of the readings tried this is the only one that reproduces its claim about the best gains, and
+(I - K H) P with a gain that is not Kalman's is indefinite.
+
+All arrays are elementwise in the batch; axes of space are just more batch.
+"""
+
+from typing import NamedTuple
+
+from .array_namespace import Array
+
+
+class Covariance(NamedTuple):
+    """Error covariance of one coordinate: three arrays of one shape."""
+
+    position: Array
+    """Variance of the position, m^2."""
+    cross: Array
+    """Covariance of position and velocity, m^2/s."""
+    velocity: Array
+    """Variance of the velocity, m^2/s^2."""
+
+
+def benedict_bordner_beta(alpha: Array) -> Array:
+    """Velocity gain that goes with a position gain: ``beta = alpha^2 / (2 - alpha)``, equation (21).
+
+    Benedict and Bordner (1962): the relation that minimises noise and transient error together.
+    """
+    return alpha * alpha / (2.0 - alpha)
+
+
+def predict(position: Array, velocity: Array, T: float) -> Array:
+    """Predicted position, ``x + T v``; the predicted velocity is the velocity."""
+    return position + T * velocity
+
+
+def update(
+    predicted: Array, velocity: Array, innovation: Array, alpha: Array, beta: Array, T: float
+) -> tuple[Array, Array]:
+    """Position and velocity after the innovation, equations (19) and (20)."""
+    return predicted + alpha * innovation, velocity + (beta / T) * innovation
+
+
+def predict_covariance(P: Covariance, T: float) -> Covariance:
+    """Covariance of the prediction, ``F P F^T`` with ``F = [[1, T], [0, 1]]`` and no process noise."""
+    cross = P.cross + T * P.velocity
+    return Covariance(P.position + T * (P.cross + cross), cross, P.velocity)
+
+
+def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: float) -> Covariance:
+    """Covariance after an update with any gains (Joseph form).
+
+    Args:
+        P: covariance of the prediction.
+        R: variance of the measurement, m^2.
+        alpha: position gain.
+        beta: velocity gain; ``beta / T`` enters the filter.
+        T: sampling interval, s.
+    """
+    rate = beta / T
+    rest = 1.0 - alpha
+    noise = alpha * R
+    return Covariance(
+        rest * rest * P.position + alpha * noise,
+        rest * (P.cross - rate * P.position) + rate * noise,
+        P.velocity - rate * (2.0 * P.cross - rate * (P.position + R)),
+    )
+
+
+class VarianceReduction(NamedTuple):
+    """Steady error variances per unit variance of a white measurement noise."""
+
+    position: Array
+    velocity: Array
+    """In units of 1 / T^2."""
+    prediction: Array
+
+
+def variance_reduction(alpha: Array, beta: Array) -> VarianceReduction:
+    """Steady variance-reduction ratios of an alpha-beta filter.
+
+    Textbook results (Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 1999), with
+    ``d = alpha (4 - 2 alpha - beta)``: position ``(2 alpha^2 + 2 beta - 3 alpha beta) / d``, velocity
+    ``2 beta^2 / d / T^2``, prediction ``(2 alpha^2 + alpha beta + 2 beta) / d``.
+    """
+    d = alpha * (4.0 - 2.0 * alpha - beta)
+    return VarianceReduction(
+        (2.0 * alpha**2 + 2.0 * beta - 3.0 * alpha * beta) / d,
+        2.0 * beta**2 / d,
+        (2.0 * alpha**2 + alpha * beta + 2.0 * beta) / d,
+    )
+
+
+def acceleration_lag(alpha: Array, beta: Array, T: float, acceleration: Array) -> Array:
+    """Steady position error after the update under constant acceleration, ``a T^2 (1 - alpha) / beta``, m."""
+    return acceleration * T**2 * (1.0 - alpha) / beta
+
+
+class ErrorMoments(NamedTuple):
+    """Mean and covariance of the error "truth minus estimate" of one coordinate."""
+
+    position: Array
+    velocity: Array
+    covariance: Covariance
+
+
+def propagate_error(
+    moments: ErrorMoments, displacement: Array, increment: Array, R: Array, alpha: Array, beta: Array, T: float
+) -> ErrorMoments:
+    """Exact moments of the error over one scan, known gains, known manoeuvre of the target.
+
+    The error of the filter is linear in its initial error, the measurement noise and what the target does
+    beyond straight flight, so its mean and covariance follow without Monte Carlo:
+    ``e(k|k) = (I - K H) (F e + [displacement, increment]) - K v``.
+
+    Args:
+        moments: of the error after the previous update.
+        displacement: what the manoeuvre adds to the position in this scan, m (``a T^2 / 2``).
+        increment: what it adds to the velocity, m/s (``a T``).
+        R: variance of the measurement noise, m^2.
+        alpha: position gain of this scan.
+        beta: velocity gain of this scan.
+        T: sampling interval, s.
+    """
+    position = moments.position + T * moments.velocity + displacement
+    velocity = moments.velocity + increment
+    covariance = update_covariance(predict_covariance(moments.covariance, T), R, alpha, beta, T)
+    return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)

@@ -1,0 +1,115 @@
+r"""The interacting multiple model: mixing, mode probabilities, combination.
+
+M filters run side by side, one for each mode of the target; the mode is a Markov chain with matrix
+``transition[i, j] = P{mode j at k | mode i at k-1}`` (row = from, column = to, rows sum to one). Equation
+numbers are those of the paper by Bakulev, Sychev and Nguyen (the recursion itself is Blom and Bar-Shalom's,
+1988). One cycle: :func:`predict_mode_probabilities`, :func:`mix`, the M filters, :func:`mode_posterior`,
+:func:`combine`.
+
+Shapes: mode probabilities ``(M, N)``, means ``(n, M, N)``, covariances ``(n, n, M, N)``.
+
+Reading: (9) is lost in the scan and restored with the spread of the means, as in (16).
+Reading: (10), (12)-(14) are damaged; the sums run over the first index of ``p_ij``.
+"""
+
+from typing import NamedTuple
+
+from .array_namespace import Array, namespace
+from .small_matrices import outer
+
+
+class ModePrediction(NamedTuple):
+    """What the Markov chain says before the measurement."""
+
+    probabilities: Array
+    """Predicted mode probabilities (13), ``(M, N)``."""
+    mixing: Array
+    """Weights of (10), ``[i, j] = mu_{i|j}``, ``(M, M, N)``; every column sums to one."""
+
+
+def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModePrediction:
+    """Predicted probabilities (13) and mixing weights (10).
+
+    A mode that cannot be reached (predicted probability zero) keeps its own estimate.
+
+    Args:
+        transition: ``(M, M)``, or ``(M, M, N)`` where it differs in the batch.
+        probabilities: ``mu_i(k-1)``, ``(M, N)``.
+    """
+    xp = namespace(probabilities)
+    if transition.ndim == 2:
+        transition = transition[:, :, None]
+    joint = transition * probabilities[:, None]
+    predicted = joint[0]
+    for i in range(1, joint.shape[0]):
+        predicted = predicted + joint[i]
+    reachable = predicted > 0.0
+    stay = xp.eye(joint.shape[0], dtype=joint.dtype, device=joint.device)[:, :, None]
+    mixing = xp.where(reachable, joint / xp.where(reachable, predicted, 1.0), stay)
+    return ModePrediction(predicted, mixing)
+
+
+def mix(mean: Array, covariance: Array, mixing: Array) -> tuple[Array, Array]:
+    """Mixed inputs of the M filters, equations (8) and (9).
+
+    Args:
+        mean: ``x^i(k-1|k-1)``, ``(n, M, N)``.
+        covariance: ``P^i(k-1|k-1)``, ``(n, n, M, N)``.
+        mixing: ``mu_{i|j}``, ``(M, M, N)``.
+
+    Returns:
+        ``x^{0j}`` and ``P^{0j}``, of the same shapes.
+    """
+    xp = namespace(mean)
+    columns = [combine(mean, covariance, mixing[:, j]) for j in range(mean.shape[1])]
+    return xp.stack([m for m, _ in columns], axis=-2), xp.stack([P for _, P in columns], axis=-2)
+
+
+def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
+    """Mean and covariance of a Gaussian mixture, equations (15) and (16).
+
+    Args:
+        mean: ``(n, M, N)``.
+        covariance: ``(n, n, M, N)``.
+        weights: ``(M, N)``, summing to one over the M components.
+
+    Returns:
+        ``(n, N)`` and ``(n, n, N)``; the covariance holds the spread of the means.
+    """
+    count = weights.shape[0]
+    centre = weights[0] * mean[:, 0]
+    for i in range(1, count):
+        centre = centre + weights[i] * mean[:, i]
+    total = None
+    for i in range(count):
+        difference = mean[:, i] - centre
+        term = weights[i] * (covariance[:, :, i] + outer(difference, difference))
+        total = term if total is None else total + term
+    return centre, total
+
+
+def log_probabilities(probabilities: Array) -> Array:
+    """Logarithm of probabilities, with a floor of 1e-300 in place of minus infinity."""
+    return namespace(probabilities).log(namespace(probabilities).clip(probabilities, 1e-300, None))
+
+
+def normalised_exponential(logarithms: Array) -> Array:
+    """Probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
+    xp = namespace(logarithms)
+    scaled = xp.exp(logarithms - xp.max(logarithms, axis=0))
+    total = scaled[0]
+    for j in range(1, scaled.shape[0]):
+        total = total + scaled[j]
+    return scaled / total
+
+
+def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:
+    """Posterior mode probabilities, equations (12) and (14), in logarithms.
+
+    Working in logarithms, probabilities survive likelihoods that underflow (an innovation of 500 sigma).
+
+    Args:
+        log_predicted: logarithm of the predicted probabilities, ``(M, N)``.
+        log_likelihood: ``log Lambda_j`` (11), ``(M, N)``.
+    """
+    return normalised_exponential(log_predicted + log_likelihood)

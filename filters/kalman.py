@@ -1,0 +1,117 @@
+r"""The discrete Kalman filter on batches of small systems.
+
+    prediction  x' = F x + b,  P' = F P F^T + Q
+    update      nu = z - H x', S = H P' H^T + R, K = P' H^T S^-1,
+                x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T   (Joseph form)
+
+Arrays have the batch last; a matrix shared by the whole batch is ``(n, n)``. Bar-Shalom, Li and Kirubarajan,
+Estimation with Applications to Tracking and Navigation (2001), chapter 5.
+"""
+
+from typing import NamedTuple
+
+from .array_namespace import Array, namespace
+from .gaussian import log_density
+from .small_matrices import apply, cholesky, product, solve_lower, transpose
+
+
+class Update(NamedTuple):
+    """Result of a measurement update."""
+
+    mean: Array
+    """``(n, N)``."""
+    covariance: Array
+    """``(n, n, N)``."""
+    log_likelihood: Array
+    """Log-density of the measurement given the prediction, ``(N,)``."""
+    squared_distance: Array
+    """Normalised innovation squared (NIS), ``(N,)``."""
+
+
+def _batched(matrix: Array) -> Array:
+    """Give a matrix shared by the batch a batch axis of one."""
+    return matrix[..., None] if matrix.ndim == 2 else matrix
+
+
+def predict(
+    mean: Array, covariance: Array, F: Array, Q: Array, offset: Array | None = None
+) -> tuple[Array, Array]:
+    """Time update.
+
+    Args:
+        mean: ``(n, N)``.
+        covariance: ``(n, n, N)``.
+        F: transition matrix, ``(n, n)`` or ``(n, n, N)``.
+        Q: covariance of the process noise, ``(n, n)`` or ``(n, n, N)``.
+        offset: known input, ``(n, N)`` or None.
+    """
+    F, Q = _batched(F), _batched(Q)
+    moved = apply(F, mean)
+    if offset is not None:
+        moved = moved + offset
+    return moved, product(product(F, covariance), transpose(F)) + Q
+
+
+def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Update:
+    """Measurement update in Joseph form, with the log-likelihood of the measurement.
+
+    Args:
+        mean: predicted, ``(n, N)``.
+        covariance: predicted, ``(n, n, N)``.
+        z: measurement, ``(m, N)``.
+        H: measurement matrix, ``(m, n)`` or ``(m, n, N)``.
+        R: covariance of the measurement noise, ``(m, m)`` or ``(m, m, N)``.
+    """
+    xp = namespace(mean)
+    H, R = _batched(H), _batched(R)
+    innovation = z - apply(H, mean)
+    HP = product(H, covariance)
+    S = product(HP, transpose(H)) + R
+    K = transpose(_solve(S, HP))
+    n = mean.shape[0]
+    identity = xp.eye(n, dtype=mean.dtype, device=mean.device)[..., None]
+    rest = identity - product(K, H)
+    joseph = product(product(rest, covariance), transpose(rest)) + product(product(K, R), transpose(K))
+    log_likelihood, squared_distance = log_density(innovation, S)
+    return Update(mean + apply(K, innovation), joseph, log_likelihood, squared_distance)
+
+
+def _solve(S: Array, B: Array) -> Array:
+    """Solve ``S X = B`` for symmetric positive definite ``S``, both with the batch last."""
+    xp = namespace(B)
+    L = cholesky(S)
+    y = solve_lower(L, B)
+    m = len(L)
+    x: list[Array] = [None] * m
+    for i in reversed(range(m)):
+        entry = y[i]
+        for j in range(i + 1, m):
+            entry = entry - L[j][i] * x[j]
+        x[i] = entry / L[i][i]
+    return xp.stack(x, axis=0)
+
+
+def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list[float]], list[list[float]]]:
+    """Constant-velocity model with an acceleration that is constant and independent in every interval.
+
+    ``F = [[I, T I], [0, I]]``, ``Q = sigma^2 [[T^4/4 I, T^3/2 I], [T^3/2 I, T^2 I]]`` for the state
+    (positions, velocities); ``B = [T^2/2, T]`` of the IMM paper with ``w ~ N(0, sigma^2)``.
+
+    Args:
+        T: sampling interval, s.
+        sigma: standard deviation of the acceleration, m/s^2.
+        axes: number of coordinates.
+
+    Returns:
+        F and Q as nested lists.
+    """
+    n = 2 * axes
+    F = [[1.0 if i == j else T if j == i + axes else 0.0 for j in range(n)] for i in range(n)]
+    g = [T**2 / 2, T]
+    Q = [
+        [sigma**2 * g[i // axes] * g[j // axes] if i % axes == j % axes else 0.0 for j in range(n)]
+        for i in range(n)
+    ]
+    return F, Q
+
+

@@ -1,0 +1,27 @@
+"""Errors of a range-and-azimuth radar seen along Cartesian axes."""
+
+from .array_namespace import Array, namespace
+
+SMALLEST_RANGE = 1.0
+"""Metres; nearer than this the azimuth is undefined and the variances are evaluated here."""
+
+
+def cartesian_variances(position: Array, range_sigma: float, bearing_sigma: float) -> Array:
+    """Variances along x and y of a polar measurement, equations (22) and (23) of the IMM paper.
+
+    ``sigma_x^2 = cos^2(b) sigma_r^2 + r^2 sin^2(b) sigma_b^2`` and the same with sine and cosine exchanged
+    for y, where ``cos(b) = x / r``. The covariance of x and y is not part of the paper's model.
+
+    Args:
+        position: x and y where the variances are evaluated, ``(2, ...)``, m.
+        range_sigma: standard deviation of the range, m.
+        bearing_sigma: standard deviation of the azimuth, rad.
+
+    Returns:
+        ``(2, ...)``, m^2.
+    """
+    xp = namespace(position)
+    squares = position * position
+    squared_range = xp.clip(squares[0] + squares[1], SMALLEST_RANGE**2, None)
+    along = squares * (range_sigma**2 / squared_range)
+    return along + (squared_range - squares) * bearing_sigma**2
