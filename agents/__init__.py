@@ -1,0 +1,1 @@
+"""Reinforcement learning on top of the environments."""

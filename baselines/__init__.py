@@ -1,0 +1,1 @@
+"""The papers' algorithms as policies, reference estimators and bounds, and Monte Carlo evaluation."""

@@ -1,0 +1,1 @@
+"""One module for each environment: its policies, reference estimators and bounds."""

@@ -1,0 +1,1 @@
+"""One module for each environment: its immutable table of scenarios, ``SCENARIOS``."""

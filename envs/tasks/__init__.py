@@ -1,0 +1,1 @@
+"""One module for each environment: its mathematics as a :class:`~filtergym.envs.task.Task`."""
