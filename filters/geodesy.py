@@ -1,0 +1,64 @@
+r"""The WGS-84 ellipsoid: Earth-fixed coordinates of a site, and the east-north-up frame that stands on it.
+
+    r = [(n + h) cos(B) cos(L), (n + h) cos(B) sin(L), (n (1 - e^2) + h) sin(B)]^T,
+    n = a / sqrt(1 - e^2 sin^2(B)),   e^2 = f (2 - f)
+
+with latitude B, longitude L and ellipsoidal height h; a and f are the defining constants of WGS-84
+(NIMA TR8350.2, 2000). A vector d of the Earth-fixed frame has east, north and up components
+``E d`` with the rotation E of :func:`east_north_up`.
+
+Plain NumPy on angles in radians: sites are constants of an experiment.
+"""
+
+import numpy
+
+from .array_namespace import Array
+
+SEMI_MAJOR_AXIS = 6378137.0
+"""Metres, WGS-84."""
+FLATTENING = 1.0 / 298.257223563
+"""WGS-84."""
+ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
+"""Square of the first eccentricity, WGS-84."""
+EARTH_RATE = 7.2921150e-5
+"""Rotation of the Earth, rad/s."""
+GRAVITATIONAL_PARAMETER = 3.986004418e14
+"""Geocentric gravitational constant, m^3/s^2."""
+
+
+def earth_fixed(latitude: float, longitude: float, height: float) -> Array:
+    """Earth-fixed Cartesian coordinates of a site, ``(3,)``, m.
+
+    Args:
+        latitude: geodetic latitude, rad.
+        longitude: rad, positive to the east.
+        height: above the ellipsoid, m.
+    """
+    sine = numpy.sin(latitude)
+    n = SEMI_MAJOR_AXIS / numpy.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
+    across = (n + height) * numpy.cos(latitude)
+    return numpy.array(
+        [
+            across * numpy.cos(longitude),
+            across * numpy.sin(longitude),
+            (n * (1.0 - ECCENTRICITY_SQUARED) + height) * sine,
+        ]
+    )
+
+
+def east_north_up(latitude: float, longitude: float) -> Array:
+    """Rotation from the Earth-fixed frame to east, north, up at a site, ``(3, 3)``.
+
+    Args:
+        latitude: geodetic latitude, rad.
+        longitude: rad.
+    """
+    sin_b, cos_b = numpy.sin(latitude), numpy.cos(latitude)
+    sin_l, cos_l = numpy.sin(longitude), numpy.cos(longitude)
+    return numpy.array(
+        [
+            [-sin_l, cos_l, 0.0],
+            [-sin_b * cos_l, -sin_b * sin_l, cos_b],
+            [cos_b * cos_l, cos_b * sin_l, sin_b],
+        ]
+    )
