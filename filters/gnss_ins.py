@@ -1,0 +1,394 @@
+r"""A user, its receiver clock and the attitude errors of its INS: 17 states, seen by GNSS and inertial sensors.
+
+State (ENU frame fixed to the Earth at the site), Moroz's lambda:
+
+    [X (3), D', V (3), V', A (3), eps (3), V_eps (3)]
+
+position m, clock bias m, velocity m/s, clock drift m/s, acceleration m/s^2, errors of the angles (heading,
+pitch, roll) rad, their rates rad/s. One step of length T:
+
+    user      a linear model of each axis on (x, v, a), one for each hypothesis on the motion
+    clock     D' += T V' + w,  V' += w,   white frequency and random-walk frequency noise
+    attitude  eps += T V_eps + w,  V_eps = exp(-T / tau) V_eps + w
+
+Observations, S satellites at s_j with velocities w_j, u_j = (s_j - X) / |s_j - X|:
+
+    pseudorange        rho_j  = |s_j - X| + D'
+    pseudorange rate   rho'_j = u_j^T (w_j - V) + V'
+    accelerometers     f      = C(phi_INS - eps) (A + [0, 0, g]^T)          (body axes forward, right, down)
+    attitude           y_eps  = eps
+
+with C = R_1(roll) R_2(pitch) R_3(heading) N, N: ENU -> NED, and phi_INS, the angles that the INS shows
+(true angle plus error), a known input. Jacobians:
+
+    drho/dX = -u^T,  drho'/dV = -u^T,  drho'/dX = -(w - V - u u^T (w - V))^T / |s - X|,
+    df/dA = C,       df/deps = -[dC/dheading, dC/dpitch, dC/droll] (A + g)
+
+Reading: the paper names these observations and gives no formulas. Angles alone do not show their own error,
+so phi_INS enters through C, and y_eps is the difference between the INS and an independent attitude
+reference: without it the heading error would not be observable at rest. Attitude errors are small angles;
+their differences need no wrapping.
+
+Reading: the motion models of the hypotheses are not given. Rest: X stays, V and A are reset to zero.
+Constant velocity: ``X += T V``, A reset to zero, a velocity increment with input [T/2, 1]^T. Manoeuvre:
+Singer's model (1970), ``a' = -alpha a + white noise``.
+
+Shapes: states ``(17, ...)``, covariances ``(17, 17, ...)``; the trailing axes are the batch, or hypotheses
+and batch.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy
+
+from .array_namespace import Array, namespace
+from .extended_kalman import JacobianRow
+
+POSITION = slice(0, 3)
+CLOCK_BIAS = 3
+VELOCITY = slice(4, 7)
+CLOCK_DRIFT = 7
+ACCELERATION = slice(8, 11)
+ATTITUDE_ERROR = slice(11, 14)
+ATTITUDE_RATE = slice(14, 17)
+SIZE = 17
+"""Number of states."""
+
+
+def singer_transition(alpha: float, T: float) -> Array:
+    """Transition matrix of Singer's model on (x, v, a), ``(3, 3)``.
+
+    ``[[1, T, (aT - 1 + e^-aT) / a^2], [0, 1, (1 - e^-aT) / a], [0, 0, e^-aT]]`` for alpha = a > 0; the first
+    row by its series, because the closed form cancels for small alpha T.
+
+    Args:
+        alpha: reciprocal of the correlation time of the acceleration, 1/s.
+        T: interval, s.
+    """
+    position, velocity, acceleration = singer_impulse_response(alpha, numpy.array(T))
+    return numpy.array([[1.0, T, position], [0.0, 1.0, velocity], [0.0, 0.0, acceleration]])
+
+
+def singer_impulse_response(alpha: float, time: Array) -> Array:
+    """Position, velocity and acceleration a time after a unit acceleration, ``(3, ...)``."""
+    y = alpha * time
+    term = y**2 / 2.0
+    series = term
+    for n in range(3, 25):
+        term = -term * y / n
+        series = series + term
+    position = numpy.where(y < 1.0, series, y + numpy.expm1(-y)) / alpha**2
+    return numpy.stack([position, -numpy.expm1(-y) / alpha, numpy.exp(-y)])
+
+
+def singer_process_noise(alpha: float, sigma: float, T: float) -> Array:
+    """Covariance of Singer's model over one interval on (x, v, a), ``(3, 3)``.
+
+    ``Q = 2 alpha sigma^2 int_0^T g(s) g(s)^T ds`` with the impulse response g, by Gauss-Legendre quadrature:
+    every term is positive, so nothing cancels, where the closed form loses all digits for small alpha T.
+
+    Args:
+        alpha: reciprocal of the correlation time of the acceleration, 1/s.
+        sigma: stationary standard deviation of the acceleration, m/s^2.
+        T: interval, s.
+    """
+    nodes, weights = numpy.polynomial.legendre.leggauss(24)
+    g = singer_impulse_response(alpha, 0.5 * T * (nodes + 1.0))
+    return alpha * sigma**2 * T * (g * weights) @ g.T
+
+
+class AxisModel(NamedTuple):
+    """Motion of one axis of the user on (x, v, a) over one step."""
+
+    transition: Array
+    """``(3, 3)``, upper triangular with one in the first place."""
+    noise: Array
+    """Covariance, ``(3, 3)``."""
+
+
+def rest_model(T: float, velocity_sigma: float, acceleration_sigma: float) -> AxisModel:
+    """Hypothesis 1: the position stays, velocity and acceleration are reset to zero.
+
+    Args:
+        T: step, s.
+        velocity_sigma: of the regularising noise, m/s; the position takes T times as much.
+        acceleration_sigma: of the regularising noise, m/s^2.
+    """
+    sigmas = numpy.array([velocity_sigma * T, velocity_sigma, acceleration_sigma])
+    return AxisModel(numpy.diag([1.0, 0.0, 0.0]), numpy.diag(sigmas**2))
+
+
+def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma: float) -> AxisModel:
+    """Hypothesis 2: constant velocity with a random increment; the acceleration is reset to zero.
+
+    Args:
+        T: step, s.
+        increment_sigma: of the velocity increment of one step, m/s; its input is ``[T/2, 1]^T``.
+        acceleration_sigma: of the regularising noise, m/s^2.
+    """
+    transition = numpy.array([[1.0, T, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    entry = increment_sigma * numpy.array([T / 2.0, 1.0, 0.0])
+    return AxisModel(transition, numpy.outer(entry, entry) + numpy.diag([0.0, 0.0, acceleration_sigma**2]))
+
+
+def singer_model(T: float, alpha: float, sigma: float) -> AxisModel:
+    """Hypothesis 3: Singer's manoeuvre; see :func:`singer_transition` and :func:`singer_process_noise`."""
+    return AxisModel(singer_transition(alpha, T), singer_process_noise(alpha, sigma, T))
+
+
+def singer_sigma(largest: float, probability_largest: float, probability_zero: float) -> float:
+    """Standard deviation of a manoeuvre by Singer's rule, ``sqrt(A^2 (1 + 4 P_max - P_0) / 3)``, m/s^2.
+
+    Args:
+        largest: largest acceleration A, m/s^2.
+        probability_largest: probability of +A, and of -A.
+        probability_zero: probability of no acceleration.
+    """
+    return float(largest * numpy.sqrt((1.0 + 4.0 * probability_largest - probability_zero) / 3.0))
+
+
+class CommonModel(NamedTuple):
+    """Clock and attitude errors, which move alike under every hypothesis."""
+
+    T: float
+    """Step, s."""
+    decay: float
+    """Factor of the attitude rates over one step."""
+    clock_noise: Array
+    """Covariance on (D', V'), ``(2, 2)``: m^2, m^2/s, m^2/s^2."""
+    attitude_variance: float
+    """Of the random walk of each angle in one step, rad^2."""
+    attitude_rate_variance: float
+    """Driving noise of each rate in one step, (rad/s)^2."""
+
+
+def common_model(
+    T: float,
+    frequency_density: float,
+    frequency_walk_density: float,
+    angle_walk: float,
+    rate_sigma: float,
+    rate_time: float,
+) -> CommonModel:
+    """Discretise the clock and the attitude errors.
+
+    The clock is the usual two-state model (Brown and Hwang, Introduction to Random Signals and Applied Kalman
+    Filtering, 2012, section 9.3): ``q_DD = S_f T + S_g T^3 / 3``, ``q_DV = S_g T^2 / 2``, ``q_VV = S_g T``;
+    the covariance of bias and drift is kept.
+
+    Args:
+        T: step, s.
+        frequency_density: S_f, white frequency noise, m^2/s.
+        frequency_walk_density: S_g, random-walk frequency noise, m^2/s^3.
+        angle_walk: random walk of each angle, rad/sqrt(s).
+        rate_sigma: stationary standard deviation of each rate, rad/s.
+        rate_time: correlation time of the rates, s.
+    """
+    cross = frequency_walk_density * T**2 / 2.0
+    clock = numpy.array(
+        [
+            [frequency_density * T + frequency_walk_density * T**3 / 3.0, cross],
+            [cross, frequency_walk_density * T],
+        ]
+    )
+    return CommonModel(
+        T,
+        float(numpy.exp(-T / rate_time)),
+        clock,
+        angle_walk**2 * T,
+        float(-(rate_sigma**2) * numpy.expm1(-2.0 * T / rate_time)),
+    )
+
+
+def process_noise(axis: AxisModel, common: CommonModel) -> Array:
+    """Covariance of the process noise of one hypothesis, ``(17, 17)``."""
+    Q = numpy.zeros((SIZE, SIZE))
+    x, v, a = (list(range(SIZE))[part] for part in (POSITION, VELOCITY, ACCELERATION))
+    for i in range(3):
+        places = [x[i], v[i], a[i]]
+        Q[numpy.ix_(places, places)] = axis.noise
+    clock = [CLOCK_BIAS, CLOCK_DRIFT]
+    Q[numpy.ix_(clock, clock)] = common.clock_noise
+    numpy.fill_diagonal(Q[ATTITUDE_ERROR, ATTITUDE_ERROR], common.attitude_variance)
+    numpy.fill_diagonal(Q[ATTITUDE_RATE, ATTITUDE_RATE], common.attitude_rate_variance)
+    return Q
+
+
+def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
+    """Multiply by the transition matrix from the left, ``F x`` or ``F P``, without its zeros.
+
+    Args:
+        state: ``(17, ...)``.
+        axis: transition of (x, v, a), ``(3, 3, ...)`` with trailing axes that broadcast, such as ``(3, 3, M, 1)``
+            for M hypotheses; upper triangular with one in the first place.
+        T: step, s.
+        decay: factor of the attitude rates.
+    """
+    velocity, acceleration = state[VELOCITY], state[ACCELERATION]
+    return namespace(state).concat(
+        [
+            state[POSITION] + axis[0, 1] * velocity + axis[0, 2] * acceleration,
+            state[CLOCK_BIAS : CLOCK_BIAS + 1] + T * state[CLOCK_DRIFT : CLOCK_DRIFT + 1],
+            axis[1, 1] * velocity + axis[1, 2] * acceleration,
+            state[CLOCK_DRIFT : CLOCK_DRIFT + 1],
+            axis[2, 2] * acceleration,
+            state[ATTITUDE_ERROR] + T * state[ATTITUDE_RATE],
+            decay * state[ATTITUDE_RATE],
+        ],
+        axis=0,
+    )
+
+
+def predict(
+    mean: Array, covariance: Array, axis: Array, T: float, decay: float, Q: Array
+) -> tuple[Array, Array]:
+    """Time update of a bank, step 4: ``F x`` and ``F P F^T + Q``.
+
+    Args:
+        mean: ``(17, M, N)``.
+        covariance: ``(17, 17, M, N)``.
+        axis: ``(3, 3, M, 1)``, see :func:`advance`.
+        T: step, s.
+        decay: factor of the attitude rates.
+        Q: covariance of the process noise, ``(17, 17, M, 1)``.
+    """
+    xp = namespace(mean)
+    moved = advance(covariance, axis, T, decay)
+    both = advance(xp.moveaxis(moved, 0, 1), axis, T, decay)
+    return advance(mean, axis, T, decay), both + Q
+
+
+class Geometry(NamedTuple):
+    """Where the satellites stand, relative to a user."""
+
+    distance: Array
+    """|s - X|, ``(S, ...)``, m."""
+    unit: Array
+    """From the user to the satellite, ``(3, S, ...)``."""
+    relative_velocity: Array
+    """w - V, ``(3, S, ...)``, m/s."""
+    range_rate: Array
+    """u^T (w - V), ``(S, ...)``, m/s."""
+
+
+def geometry(state: Array, satellite_position: Array, satellite_velocity: Array) -> Geometry:
+    """Distances, directions and range rates of S satellites.
+
+    Args:
+        state: ``(17, ...)``.
+        satellite_position: ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
+        satellite_velocity: ``(3, S, ...)``, m/s.
+    """
+    d = satellite_position - state[POSITION][:, None]
+    distance = namespace(state).sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    unit = d / distance
+    w = satellite_velocity - state[VELOCITY][:, None]
+    return Geometry(distance, unit, w, unit[0] * w[0] + unit[1] * w[1] + unit[2] * w[2])
+
+
+def ranges(state: Array, seen: Geometry) -> tuple[Array, Array]:
+    """Pseudoranges, m, and pseudorange rates, m/s, each ``(S, ...)``."""
+    return seen.distance + state[CLOCK_BIAS], seen.range_rate + state[CLOCK_DRIFT]
+
+
+def range_jacobian(seen: Geometry) -> list[JacobianRow]:
+    """Rows of the Jacobian of S pseudoranges and then of S pseudorange rates."""
+    x, v = range(0, 3), range(4, 7)
+    across = (seen.relative_velocity - seen.unit * seen.range_rate) / seen.distance
+    count = seen.distance.shape[0]
+    ranges_rows = [
+        JacobianRow((*x, CLOCK_BIAS), (*(-seen.unit[i, j] for i in range(3)), 1.0)) for j in range(count)
+    ]
+    rate_rows = [
+        JacobianRow(
+            (*x, *v, CLOCK_DRIFT),
+            (*(-across[i, j] for i in range(3)), *(-seen.unit[i, j] for i in range(3)), 1.0),
+        )
+        for j in range(count)
+    ]
+    return ranges_rows + rate_rows
+
+
+def body_axes(angles: Array) -> tuple[tuple[Array, Array, Array], ...]:
+    """Rotation from east-north-up to body axes (forward, right, down), as three rows of three arrays.
+
+    ``C = R_1(roll) R_2(pitch) R_3(heading) N``.
+
+    Args:
+        angles: heading, pitch, roll, ``(3, ...)``, rad.
+    """
+    xp = namespace(angles)
+    sine, cosine = xp.sin(angles), xp.cos(angles)
+    sh, sp, sr = sine[0], sine[1], sine[2]
+    ch, cp, cr = cosine[0], cosine[1], cosine[2]
+    return (
+        (cp * sh, cp * ch, sp),
+        (sr * sp * sh + cr * ch, sr * sp * ch - cr * sh, -sr * cp),
+        (cr * sp * sh - sr * ch, cr * sp * ch + sr * sh, -cr * cp),
+    )
+
+
+def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Array, list[JacobianRow]]:
+    """Accelerometer readings, ``(3, ...)``, m/s^2, and the rows of their Jacobian.
+
+    The derivatives of C by its own angles are combinations of the readings themselves, for example
+    ``df/droll = [0, f_down, -f_right]``.
+
+    Args:
+        state: ``(17, ...)``.
+        ins_angles: heading, pitch and roll shown by the INS, ``(3, ...)``, rad; trailing axes broadcast.
+        gravity: m/s^2.
+    """
+    xp = namespace(state)
+    angles = ins_angles - state[ATTITUDE_ERROR]
+    C = body_axes(angles)
+    a = state[ACCELERATION]
+    up = a[2] + gravity
+    f = [row[0] * a[0] + row[1] * a[1] + row[2] * up for row in C]
+    sr, cr = xp.sin(angles[2]), xp.cos(angles[2])
+    # dC/dheading takes (east, north, up) to C (-north, east, 0).
+    by_heading = [row[1] * a[0] - row[0] * a[1] for row in C]
+    by_pitch = [-(sr * f[1] + cr * f[2]), sr * f[0], cr * f[0]]
+    by_roll: list[Array | float] = [0.0, f[2], -f[1]]
+    columns = (*range(8, 11), *range(11, 14))
+    rows = [
+        JacobianRow(columns, (*C[i], -by_heading[i], -by_pitch[i], -by_roll[i])) for i in range(3)
+    ]
+    return xp.stack(f), rows
+
+
+def attitude_jacobian() -> list[JacobianRow]:
+    """Rows of the Jacobian of the three attitude errors: each shows itself."""
+    return [JacobianRow((column,), (1.0,)) for column in range(11, 14)]
+
+
+def observe(
+    state: Array, satellite_position: Array, satellite_velocity: Array, ins_angles: Array, gravity: float
+) -> tuple[Array, list[JacobianRow]]:
+    """Observations of a state, ``(2 S + 6, ...)``, and the rows of their Jacobian there.
+
+    In this order: S pseudoranges, S pseudorange rates, three accelerometers, three attitude errors.
+
+    Args:
+        state: ``(17, ...)``.
+        satellite_position: ``(3, S, ...)``, m; trailing axes broadcast against those of ``state``.
+        satellite_velocity: ``(3, S, ...)``, m/s.
+        ins_angles: ``(3, ...)``, rad.
+        gravity: m/s^2.
+    """
+    seen = geometry(state, satellite_position, satellite_velocity)
+    pseudoranges, rates = ranges(state, seen)
+    force, force_rows = specific_force(state, ins_angles, gravity)
+    observation = namespace(state).concat([pseudoranges, rates, force, state[ATTITUDE_ERROR]], axis=0)
+    return observation, [*range_jacobian(seen), *force_rows, *attitude_jacobian()]
+
+
+def sensor_groups(satellites: int) -> Sequence[slice]:
+    """Where pseudoranges, rates, accelerometers and attitude stand among the observations."""
+    return (
+        slice(0, satellites),
+        slice(satellites, 2 * satellites),
+        slice(2 * satellites, 2 * satellites + 3),
+        slice(2 * satellites + 3, 2 * satellites + 6),
+    )
