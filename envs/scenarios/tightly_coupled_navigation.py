@@ -1,0 +1,88 @@
+"""Scenarios of tightly coupled navigation."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from ..task import Scenario
+
+WINDOWS = MappingProxyType(
+    {"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000), "all": (1, 3000)}
+)
+"""Steady parts of the three legs of the paper's experiment."""
+RANDOM_WINDOWS = MappingProxyType({"all": (1, 600), "settled": (100, 600)})
+
+EXPERIMENT: Mapping[str, Any] = MappingProxyType(
+    {
+        "horizon": 3000,
+        "decision_interval": 1,
+        "increment_sigma": 0.3,
+        "rate_fault_probability": 0.0,
+        "stick_probability": 0.0,
+        "aperture": True,
+    }
+)
+"""The paper's experiment: no faults, tracking loops steered by the filter."""
+
+HEALTHY: Mapping[str, Any] = MappingProxyType({"rate_fault_probability": 0.0, "stick_probability": 0.0})
+
+SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
+    {
+        scenario.name: scenario
+        for scenario in (
+            Scenario(
+                "paper",
+                "Rest, velocity growing by 0.3 m/s per step while the accelerometers show nothing (stuck at "
+                "zero), then a jump to 30 m/s^2 and Singer flight; 3000 steps.",
+                {**EXPERIMENT, "course": "increment"},
+                WINDOWS,
+            ),
+            Scenario(
+                "kinematic",
+                "As paper, with an acceleration of 30 m/s^2 in leg 2 that the accelerometers feel and that turns "
+                "by 90 degrees at its end.",
+                {**EXPERIMENT, "course": "kinematic"},
+                WINDOWS,
+            ),
+            Scenario(
+                "matched",
+                "Singer flight throughout: what the parallel hypotheses cost when one of them is right.",
+                {**EXPERIMENT, "course": "matched", "aperture": False},
+                WINDOWS,
+            ),
+            Scenario(
+                "random",
+                "Legs of rest, constant velocity and manoeuvre at random, with a noisy rate channel or stuck "
+                "accelerometers for a while: the training distribution.",
+                {},
+                RANDOM_WINDOWS,
+                training=True,
+            ),
+            Scenario(
+                "rates-lost",
+                "As random without faults; all pseudorange rates are lost for 2 s.",
+                {**HEALTHY, "rates_outage": 2.0},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "two-satellites",
+                "As random without faults; two of the satellites drop out for 2 s.",
+                {**HEALTHY, "satellites_outage": 2.0},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "accelerometer-failure",
+                "As random; the accelerometers stick at their last reading for 2 to 4 s.",
+                {"rate_fault_probability": 0.0, "stick_probability": 1.0, "stick_duration": (2.0, 4.0)},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "urban",
+                "A vehicle between houses: slow, gentle, pseudoranges with positive heavy-tailed errors by C/N0.",
+                {**HEALTHY, "urban": True, "strength": (0.5, 4.0), "initial_speed": (0.0, 15.0)},
+                RANDOM_WINDOWS,
+            ),
+        )
+    }
+)
+"""By name."""
