@@ -1,4 +1,4 @@
-r"""A user, its receiver clock and the attitude errors of its INS: 17 states, seen by GNSS and inertial sensors.
+r"""A user, its receiver clock and the attitude errors of its INS, seen by GNSS and inertial sensors.
 
 State (ENU frame fixed to the Earth at the site), Moroz's lambda:
 
@@ -220,8 +220,8 @@ def advance(state: Array, axis: Array, T: float, decay: float) -> Array:
 
     Args:
         state: ``(17, ...)``.
-        axis: transition of (x, v, a), ``(3, 3, ...)`` with trailing axes that broadcast, such as ``(3, 3, M, 1)``
-            for M hypotheses; upper triangular with one in the first place.
+        axis: transition of (x, v, a), ``(3, 3, ...)`` with trailing axes that broadcast, such as
+            ``(3, 3, M, 1)`` for M hypotheses; upper triangular with one in the first place.
         T: step, s.
         decay: factor of the attitude rates.
     """
@@ -352,9 +352,7 @@ def specific_force(state: Array, ins_angles: Array, gravity: float) -> tuple[Arr
     by_pitch = [-(sr * f[1] + cr * f[2]), sr * f[0], cr * f[0]]
     by_roll: list[Array | float] = [0.0, f[2], -f[1]]
     columns = (*range(8, 11), *range(11, 14))
-    rows = [
-        JacobianRow(columns, (*C[i], -by_heading[i], -by_pitch[i], -by_roll[i])) for i in range(3)
-    ]
+    rows = [JacobianRow(columns, (*C[i], -by_heading[i], -by_pitch[i], -by_roll[i])) for i in range(3)]
     return xp.stack(f), rows
 
 

@@ -155,5 +155,7 @@ def smallest_gdop(local: Array, count: int, elevation_mask: float) -> tuple[int,
     if len(visible) < count:
         raise ValueError(f"{count} satellites wanted, {len(visible)} are above the elevation mask")
     unit = local / numpy.sqrt((local**2).sum(axis=0))
-    chosen = min(combinations(visible, count), key=lambda c: dilution_of_precision(unit[:, list(c)]).geometric)
+    chosen = min(
+        combinations(visible, count), key=lambda c: dilution_of_precision(unit[:, list(c)]).geometric
+    )
     return tuple(int(i) for i in chosen)

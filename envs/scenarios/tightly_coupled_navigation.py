@@ -6,9 +6,7 @@ from typing import Any
 
 from ..task import Scenario
 
-WINDOWS = MappingProxyType(
-    {"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000), "all": (1, 3000)}
-)
+WINDOWS = MappingProxyType({"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000), "all": (1, 3000)})
 """Steady parts of the three legs of the paper's experiment."""
 RANDOM_WINDOWS = MappingProxyType({"all": (1, 600), "settled": (100, 600)})
 
@@ -39,8 +37,8 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 "kinematic",
-                "As paper, with an acceleration of 30 m/s^2 in leg 2 that the accelerometers feel and that turns "
-                "by 90 degrees at its end.",
+                "As paper, with an acceleration of 30 m/s^2 in leg 2 that the accelerometers feel and that "
+                "turns by 90 degrees at its end.",
                 {**EXPERIMENT, "course": "kinematic"},
                 WINDOWS,
             ),
@@ -78,7 +76,8 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 "urban",
-                "A vehicle between houses: slow, gentle, pseudoranges with positive heavy-tailed errors by C/N0.",
+                "A vehicle between houses: slow, gentle; pseudoranges with positive heavy-tailed errors by "
+                "C/N0.",
                 {**HEALTHY, "urban": True, "strength": (0.5, 4.0), "initial_speed": (0.0, 15.0)},
                 RANDOM_WINDOWS,
             ),

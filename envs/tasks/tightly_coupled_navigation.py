@@ -27,7 +27,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy
@@ -65,8 +65,8 @@ class Parameters:
     height: float = 220.0
     """Of the site, m. Ours."""
     satellites: tuple[int, ...] = (1, 11, 19, 20)
-    """Slots of the nominal GLONASS. Paper: four; ours: the four of smallest GDOP. With fewer, the filter coasts
-    on what is left."""
+    """Slots of the nominal GLONASS. Paper: four; ours: the four of smallest GDOP. With fewer, the filter
+    coasts on what is left."""
     epoch: float = 0.0
     """Time of the constellation at the start, s. Ours."""
     elevation_mask: float = 10.0
@@ -98,7 +98,8 @@ class Parameters:
     reset_acceleration_sigma: float = 0.05
     """Regularising noise of the acceleration in hypotheses 1 and 2, m/s^2. Ours."""
     increment_sigma: float = 0.02
-    """Velocity increment in one step of hypothesis 2, m/s. Ours; 0.3, the increment of leg 2, for the paper."""
+    """Velocity increment in one step of hypothesis 2, m/s. Ours; for the paper 0.3, the increment
+    of leg 2."""
     singer_alpha: float = 0.05
     """Reciprocal correlation time of a manoeuvre, 1/s. Ours."""
     singer_sigma: float = 18.0
@@ -144,8 +145,8 @@ class Parameters:
     rest_probability: float = 0.5
     """That a random course starts at rest. Ours."""
     true_increment_sigma: float = 0.02
-    """True random velocity increment on legs of constant velocity of the random course, m/s per step. Ours: that
-    of hypothesis 2, so that the known mode is the optimum."""
+    """True random velocity increment on legs of constant velocity of the random course, m/s per step. Ours:
+    that of hypothesis 2, so that the known mode is the optimum."""
 
     rate_fault_probability: float = 0.5
     """That one satellite's rate channel is noisy for a while. Ours."""
@@ -183,8 +184,8 @@ class Parameters:
     evidence_scale: float = 10.0
     """Nats that an evidence of one adds to the log-posterior. Ours."""
     noise_scale: float = 300.0
-    """Largest factor of a sensor's standard deviation under control "gain"; its reciprocal is the smallest. Ours:
-    300 switches a sensor off for practical purposes."""
+    """Largest factor of a sensor's standard deviation under control "gain"; its reciprocal is the smallest.
+    Ours: 300 switches a sensor off for practical purposes."""
     average: float = 0.1
     """Weight of the newest value in the short averages. Ours: ten measurements."""
     position_unit: float = 7.4
@@ -280,7 +281,7 @@ class State(NamedTuple):
     stick: Array
     """First and last step with stuck accelerometers, ``(2, N)``."""
     outage: Array
-    """First and last step without rates, first and last step without two satellites, those two: ``(6, N)``."""
+    """First and last step without rates, first and last step without two satellites, those two; ``(6, N)``"""
     # Truth.
     truth: Array
     """``(17, N)``, in the order of filters.gnss_ins."""
@@ -297,6 +298,8 @@ class State(NamedTuple):
     """One where an observation reached the filter, ``(m, N)``."""
     noise_factor: Array
     """True standard deviation over the nominal one, ``(m, N)``."""
+    stuck: Array
+    """One where the accelerometers hold an old reading, ``(N,)``."""
     cn0: Array
     """``(S, N)``, dB-Hz."""
     multipath: Array
@@ -367,9 +370,9 @@ class TightlyCoupledNavigation(Task[State]):
 
     A flat `Box`; see `observation_fields` for each component, unit and scale. For every hypothesis the
     normalised innovation squared by sensor group (now, and as a short average; given the groups before it in
-    the order of the action `gain`), the log-likelihood relative to the largest, the predicted log-probability;
-    the accelerometers; the innovations of pseudoranges and rates at the combined prediction; elevation, C/N0
-    and availability of every satellite; the time; the last action.
+    the order of the action `gain`), the log-likelihood relative to the largest, the predicted
+    log-probability; the accelerometers; the innovations of pseudoranges and rates at the combined prediction;
+    elevation, C/N0 and availability of every satellite; the time; the last action.
 
     ## Rewards
 
@@ -403,8 +406,8 @@ class TightlyCoupledNavigation(Task[State]):
         "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"
     )
     controls = ("evidence", "mode", "weights", "gain")
-    Parameters = Parameters
-    scenarios: Mapping[str, Scenario] = SCENARIOS
+    Parameters: ClassVar[type] = Parameters
+    scenarios: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     components = (
         *(Component(f"position_{axis}", "m") for axis in ("east", "north", "up")),
         Component("clock_bias", "m"),
@@ -414,7 +417,7 @@ class TightlyCoupledNavigation(Task[State]):
         *(Component(f"{angle}_error", "rad") for angle in ("heading", "pitch", "roll")),
         *(Component(f"{angle}_error_rate", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
-    groups = {
+    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "position": ("position_east", "position_north", "position_up"),
         "velocity": ("velocity_east", "velocity_north", "velocity_up"),
         "acceleration": ("acceleration_east", "acceleration_north", "acceleration_up"),
@@ -422,15 +425,13 @@ class TightlyCoupledNavigation(Task[State]):
     }
     modes = HYPOTHESES
     cost_description = (
-        "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of a "
-        "single-epoch fix"
+        "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
+        "a single-epoch fix"
     )
     huber_bound = 100.0
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
-    def __init__(
-        self, parameters: Parameters, control: str, xp: ModuleType = numpy, device: Any = None
-    ) -> None:
+    def __init__(self, parameters: Any, control: str, xp: ModuleType = numpy, device: Any = None) -> None:
         """Tabulate the satellites and discretise the models."""
         super().__init__(parameters, control, xp, device)
         p = parameters
@@ -503,7 +504,9 @@ class TightlyCoupledNavigation(Task[State]):
             for h in HYPOTHESES
         ]
         fields += [
-            Field(f"average_nis_{group}_{h}", "1", f"log(1 + short average of NIS / count) of {group} under {h}")
+            Field(
+                f"average_nis_{group}_{h}", "1", f"log(1 + short average of NIS / count) of {group} under {h}"
+            )
             for group in GROUPS
             for h in HYPOTHESES
         ]
@@ -540,7 +543,7 @@ class TightlyCoupledNavigation(Task[State]):
         fields += [Field(f"last_{name}", "1", "last action") for name in names]
         return tuple(fields)
 
-    # ------------------------------------------------------------------------------------------------ episode
+    # ------------------------------------------------------------ episode
 
     def begin(self, uniforms: Array, normals: Array) -> State:
         """Draw the legs and the faults, and start every filter around the truth."""
@@ -574,7 +577,10 @@ class TightlyCoupledNavigation(Task[State]):
         known = xp.concat([ones[None]] * 3 + [zeros[None]] + [ones[None]] * 3 + [zeros[None]], axis=0)
         known = xp.concat([known, xp.stack([ones] * 3 + [zeros] * 6)], axis=0)
         moving = xp.stack(
-            [zeros] * 4 + [velocity[i] for i in range(3)] + [zeros] + [acceleration[i, 0] for i in range(3)]
+            [zeros] * 4
+            + [velocity[i] for i in range(3)]
+            + [zeros]
+            + [acceleration[i, 0] for i in range(3)]
             + [zeros] * 6
         )
         # User states start exact and are known with errors; clock and attitude errors are drawn and unknown.
@@ -606,6 +612,7 @@ class TightlyCoupledNavigation(Task[State]):
             ins_angles=self.true_angles + truth[gnss_ins.ATTITUDE_ERROR],
             available=blank,
             noise_factor=blank + 1.0,
+            stuck=zeros,
             cn0=cn0,
             multipath=blank[:S],
             hold=blank[:S],
@@ -627,7 +634,10 @@ class TightlyCoupledNavigation(Task[State]):
     def _fixed_legs(self, zeros: Array) -> tuple[Array, Array, Array, Array]:
         xp, p = self.xp, self.parameters
         heading = p.heading * DEGREE
-        along, right = (math.sin(heading), math.cos(heading), 0.0), (math.cos(heading), -math.sin(heading), 0.0)
+        along, right = (
+            (math.sin(heading), math.cos(heading), 0.0),
+            (math.cos(heading), -math.sin(heading), 0.0),
+        )
         still = (0.0, 0.0, 0.0)
         kinds = (SINGER,) * 3 if p.course == "matched" else (REST, LINE, SINGER)
         directions = (along, along, along) if p.course == "matched" else (still, along, right)
@@ -670,7 +680,7 @@ class TightlyCoupledNavigation(Task[State]):
             start = start + xp.clip(xp.round(seconds / p.T), 1.0, None)
         return xp.stack(starts), xp.stack(kinds), xp.stack(accelerations, axis=1), velocity
 
-    # ---------------------------------------------------------------------------------------------- measurement
+    # ------------------------------------------------------------ measurement
 
     def measure(self, state: State, noise: Array) -> State:
         """Move the truth, predict the bank, sense, and form residuals and likelihoods."""
@@ -725,11 +735,15 @@ class TightlyCoupledNavigation(Task[State]):
 
     def _satellites(self, state: State) -> tuple[Array, Array]:
         """Positions and velocities of the satellites at the present measurement, ``(3, S, N)`` each."""
-        take = self.xp.take
+        now = self._now(state)
         return (
-            take(self.satellite_position, state.clock, axis=2),
-            take(self.satellite_velocity, state.clock, axis=2),
+            self.xp.take(self.satellite_position, now, axis=2),
+            self.xp.take(self.satellite_velocity, now, axis=2),
         )
+
+    def _now(self, state: State) -> Array:
+        """Where the present measurement stands in the tables; an episode that is over stays at the end."""
+        return self.xp.clip(state.clock, None, self.horizon + 1)
 
     def _update(self, state: State, variance: Any) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
@@ -832,7 +846,11 @@ class TightlyCoupledNavigation(Task[State]):
             axis=0,
         )
         return state._replace(
-            measurement=measured, ins_angles=ins_angles, available=available, noise_factor=factor
+            measurement=measured,
+            ins_angles=ins_angles,
+            available=available,
+            noise_factor=factor,
+            stuck=xp.astype(stuck, noise.dtype),
         )
 
     def _multipath(self, state: State, walk: Array, normal: Array, uniform: Array) -> State:
@@ -860,7 +878,7 @@ class TightlyCoupledNavigation(Task[State]):
             hold=xp.where(ended, steps, state.hold) - 1.0,
         )
 
-    # -------------------------------------------------------------------------------------------- agent's turn
+    # ------------------------------------------------------------ agent's turn
 
     def observe(self, state: State) -> Array:
         """What the agent is shown; see the class description."""
@@ -885,8 +903,10 @@ class TightlyCoupledNavigation(Task[State]):
                 signed_logarithm(state.log_predicted, xp),
                 state.measurement[self.sensor_groups[2]] / p.gravity,
                 # What has not arrived is not shown.
-                signed_logarithm(available[: 2 * S] * state.range_innovation / self.sensor_sigma[: 2 * S], xp),
-                xp.take(self.elevation, state.clock, axis=1) / (0.5 * math.pi),
+                signed_logarithm(
+                    available[: 2 * S] * state.range_innovation / self.sensor_sigma[: 2 * S], xp
+                ),
+                xp.take(self.elevation, self._now(state), axis=1) / (0.5 * math.pi),
                 0.1 * (state.cn0 - 45.0),
                 available[: 2 * S],
                 time,
@@ -929,7 +949,7 @@ class TightlyCoupledNavigation(Task[State]):
             probabilities=probabilities, estimate=estimate, covariance=covariance, last_action=last
         )
 
-    # ------------------------------------------------------------------------------------------------- judgement
+    # ------------------------------------------------------------ judgement
 
     def cost(self, state: State) -> Array:
         """Squared position and velocity errors over those of a single-epoch fix, ``(N,)``."""
@@ -948,7 +968,7 @@ class TightlyCoupledNavigation(Task[State]):
         return state.covariance
 
     def records(self, state: State) -> dict[str, Array]:
-        """Probabilities, NIS of the combination and its degrees, true hypothesis, and whether a rate is lost."""
+        """Probabilities, NIS of the combination and its degrees, true hypothesis, rates off the aperture."""
         xp, p, S = self.xp, self.parameters, self.satellites
         nis = self._total([state.nis[i] for i in range(len(GROUPS))])
         beyond = xp.abs(state.range_innovation[S:]) > p.rate_aperture
