@@ -143,6 +143,11 @@ class Task(ABC, Generic[State]):
         self.xp = xp
         self.device = device
 
+    @classmethod
+    def scenario_from_trajectory(cls, trajectory: Any) -> Scenario:
+        """Make a scenario of a user's trajectory; only tasks whose target flies freely can."""
+        raise ValueError(f"{cls.id} does not take a trajectory as scenario")
+
     def constant(self, values: Any) -> Array:
         """Turn numbers into a float64 array of the task's namespace and device."""
         return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
