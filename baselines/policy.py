@@ -128,8 +128,8 @@ class Baselines:
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
     """Names that the quick benchmark runs, in the order of the table."""
-    describe: Mapping[str, str] = field(default_factory=dict)
-    """One line for each name."""
+    metrics: Callable[[Any, Any], list[Any]] | None = None
+    """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
 
     def kind(self, name: str) -> str:
         """Return "policy", "reference" or "bound"."""
