@@ -31,7 +31,9 @@ Progress = Callable[[int], None]
 def _all_baselines() -> dict[str, Baselines]:
     found = {}
     for module in pkgutil.iter_modules(policies.__path__):
-        task_module = importlib.import_module(f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}")
+        task_module = importlib.import_module(
+            f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}"
+        )
         found[task_module.TASK.id] = importlib.import_module(f"{policies.__name__}.{module.name}").BASELINES
     return found
 
@@ -76,6 +78,10 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
     return own
 
 
+def _applied(task: Task, action: Any) -> Callable[[Any], Any]:
+    return lambda state: task.act(state, action)
+
+
 def _run_chunk(
     task: Task, maker: Callable[[Task], Any], kind: str, seeds: Sequence[int], tick: Progress
 ) -> dict[str, numpy.ndarray]:
@@ -105,12 +111,12 @@ def _run_chunk(
         for _ in range(lanes.decisions_per_episode):
             action, memory = actor.predict(lanes.observe(), memory, start, deterministic=True)
             applied = lanes.widened(numpy.asarray(action))
-            lanes.step(lambda state, applied=applied: task.act(state, applied), record)
+            lanes.step(_applied(task, applied), record)
             start = numpy.zeros(lanes.count, dtype=bool)
             tick(lanes.count * task.decision_interval)
     else:
         memory = actor.start(lanes.state)
-        neutral = lanes.widened(numpy.zeros((lanes.count, *task.action_space.shape)))
+        neutral = lanes.widened(numpy.zeros((lanes.count, *(task.action_space.shape or ()))))
         for _ in range(lanes.decisions_per_episode):
 
             def update(state: Any) -> Any:
@@ -162,8 +168,12 @@ def evaluate(
     cls = task_class(env)
     chosen = find_scenario(cls, scenario)
     known = baselines_of(cls.id)
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
     makers: dict[str, Any] = (
-        dict(policies) if isinstance(policies, Mapping) else {name: load_policy(cls.id, name) for name in policies}
+        dict(policies)
+        if isinstance(policies, Mapping)
+        else {name: load_policy(cls.id, name) for name in policies}
     )
     if not makers:
         raise ValueError("name at least one policy")
@@ -171,9 +181,7 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: known.kind(name) for name in makers}
-    controls = {
-        name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()
-    }
+    controls = {name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     tasks = {name: make_task(cls.id, controls[name], scenario, **keywords) for name in makers}
     for name, task in tasks.items():

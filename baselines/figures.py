@@ -33,6 +33,12 @@ def _axes(rows: int = 1, width: float = 8.0, height: float = 3.6) -> Any:
     return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
 
 
+def _logarithmic(axis: Any) -> None:
+    """Label a logarithmic axis with plain numbers."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "25" else "")
+
+
 def _shade_windows(axis: Any, dataset: xarray.Dataset) -> None:
     """Name the scenario's windows along the top, except those that span everything."""
     length = dataset.sizes["time"]
@@ -40,8 +46,14 @@ def _shade_windows(axis: Any, dataset: xarray.Dataset) -> None:
         if last - first + 1 < 0.85 * length:
             axis.axvspan(first - 0.5, last + 0.5, color="0.93" if i % 2 else "0.96", zorder=0, lw=0)
             axis.text(
-                (first + last) / 2, 1.01, name, transform=axis.get_xaxis_transform(), ha="center", va="bottom",
-                fontsize=7, color="0.35",
+                (first + last) / 2,
+                1.01,
+                name,
+                transform=axis.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                fontsize=7,
+                color="0.35",
             )
 
 
@@ -61,12 +73,15 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
             axis.plot(dataset["time"], rmse[0], label=name, **style)
             axis.fill_between(dataset["time"], low, high, color=style["color"], alpha=0.18, lw=0)
         axis.set_yscale("log")
+        _logarithmic(axis.yaxis)
         axis.set_ylabel(f"RMSE of {component.replace('_', ' ')}, {units[component]}")
         axis.grid(alpha=0.25, which="both", lw=0.4)
         axis.margins(x=0.01)
     axes[-1].set_xlabel("measurement")
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
-    figure.suptitle(f"{title}: {dataset.sizes['episode']} episodes, 95 % bands", fontsize=10)
+    figure.suptitle(
+        f"{title}: {dataset.sizes['episode']} episodes, 95 % bands", fontsize=10, x=0.01, ha="left"
+    )
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
     return figure
@@ -77,24 +92,28 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
     units = reported_components(dataset)
     shown = list(dataset.attrs["groups"]) or list(units)[:3]
     figure, axes = _axes(len(shown))
-    names = [n for n in dataset["policy"].values.tolist() if str(dataset["kind"].sel(policy=n).values) != "bound"]
+    names = [
+        n for n in dataset["policy"].values.tolist() if str(dataset["kind"].sel(policy=n).values) != "bound"
+    ]
     for axis, component in zip(axes, shown, strict=True):
         for name, style in styles(names).items():
             error = numpy.sort(
-                numpy.sqrt(squared_errors(dataset.sel(policy=name), component, dataset.attrs["groups"])), axis=None
+                numpy.sqrt(squared_errors(dataset.sel(policy=name), component, dataset.attrs["groups"])),
+                axis=None,
             )
             # A few hundred quantiles draw the same curve as a million points.
             index = numpy.unique(numpy.geomspace(1, len(error), 400).astype(int))
             axis.plot(error[len(error) - index], index / len(error), label=name, **style)
         axis.set_xscale("log")
+        _logarithmic(axis.xaxis)
         axis.set_yscale("log")
-        axis.set_xlim(left=float(units and 10 ** numpy.floor(numpy.log10(max(numpy.median(error), 1e-9)) - 1)))
+        axis.set_xlim(left=float(10 ** numpy.floor(numpy.log10(max(numpy.median(error), 1e-9)) - 1)))
         axis.set_ylim(1e-4, 1.0)
         axis.set_xlabel(f"error of {component.replace('_', ' ')}, {units[component]}")
         axis.set_ylabel("share of measurements above")
         axis.grid(alpha=0.25, which="both", lw=0.4)
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
-    figure.suptitle(f"{title}: distribution of errors", fontsize=10)
+    figure.suptitle(f"{title}: distribution of errors", fontsize=10, x=0.01, ha="left")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
     return figure
@@ -121,7 +140,9 @@ def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
         axis.grid(alpha=0.25, lw=0.4)
         axis.margins(x=0.01)
     axes[-1].set_xlabel("measurement")
-    figure.suptitle("Mode probabilities: mean and 10-90 % range over episodes", fontsize=10)
+    figure.suptitle(
+        "Mode probabilities: mean and 10-90 % range over episodes", fontsize=10, x=0.01, ha="left"
+    )
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
     return figure

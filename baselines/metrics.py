@@ -50,7 +50,7 @@ class Measure(NamedTuple):
 
 
 def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[str, ...]]) -> numpy.ndarray:
-    """Squared error of one component or group of one policy, ``(episodes, time)``; of a bound, its mean square."""
+    """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
         return run["mean_square"].sel(component=parts).sum("component").values
@@ -87,7 +87,13 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         if metric in run and not numpy.isnan(run[metric].values).all():
             for window, times in slices.items():
                 values = run[metric].values[:, times].mean(axis=1)
-                yield Measure(metric, "state" if metric == "nees" else "measurement", window, bootstrap.estimate(values), "1")
+                yield Measure(
+                    metric,
+                    "state" if metric == "nees" else "measurement",
+                    window,
+                    bootstrap.estimate(values),
+                    "1",
+                )
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             probability = run["mode_probability"].sel(mode=mode).values

@@ -80,7 +80,7 @@ class RandomPolicy(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Draw from the action space with a generator of the policy's own."""
         generator = numpy.random.default_rng(self.seed) if state is None else state
-        space = self.task.action_space
+        space: Any = self.task.action_space
         if hasattr(space, "n"):
             return generator.integers(0, space.n, len(observation)), generator
         return generator.uniform(space.low, space.high, (len(observation), *space.shape)), generator
@@ -119,9 +119,9 @@ class Bound(Protocol):
 class Baselines:
     """What an environment is compared with: the table at the end of each module in :mod:`.policies`."""
 
-    policies: Mapping[str, Callable[[Task], Policy]]
-    references: Mapping[str, Callable[[Task], Any]] = field(default_factory=dict)
-    bounds: Mapping[str, Callable[[Task], Any]] = field(default_factory=dict)
+    policies: Mapping[str, Callable[[Any], Policy]]
+    references: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    bounds: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
     score_paper: str = ""
     """The policy whose score is 0."""
     score_bound: str = ""

@@ -24,7 +24,9 @@ from .trajectory import Trajectory
 @functools.cache
 def catalogue() -> dict[str, type[Task]]:
     """Return every environment: Gymnasium id -> task class."""
-    modules = (importlib.import_module(f"{tasks.__name__}.{m.name}") for m in pkgutil.iter_modules(tasks.__path__))
+    modules = (
+        importlib.import_module(f"{tasks.__name__}.{m.name}") for m in pkgutil.iter_modules(tasks.__path__)
+    )
     return {module.TASK.id: module.TASK for module in modules}
 
 

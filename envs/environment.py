@@ -1,7 +1,7 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy
@@ -97,7 +97,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         ValueError: for an unknown name or a value out of its limits.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gymnasium.Env)
 
     def __init__(
         self,
@@ -147,7 +147,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         scenario: name of a scenario, or a trajectory.
         reward: "cost" (default), "log-likelihood" or "relative".
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
-        max_episode_steps: truncate earlier than the task's horizon (Gymnasium passes it on from ``make_vec``).
+        max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
         detailed_info: whether ``info`` carries truth error, cost and what an evaluation records.
         **keywords: parameters of the task.
 
@@ -187,7 +187,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             seeds = list(seed)
             if len(seeds) != self.num_envs:
-                raise ValueError(f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}")
+                raise ValueError(
+                    f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}"
+                )
         unseeded = not self.lanes.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
@@ -208,8 +210,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 or not mask.any()
             ):
                 raise ValueError(
-                    f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with at least "
-                    f"one True, got {mask!r}"
+                    f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
+                    f"at least one True, got {mask!r}"
                 )
             if self.lanes.state is None and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
@@ -263,4 +265,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         final_info = {}
         for name, values in info.items():
             final_info[name], final_info[f"_{name}"] = values, mask
-        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+        return {
+            "final_obs": final_obs,
+            "_final_obs": mask,
+            "final_info": final_info,
+            "_final_info": mask.copy(),
+        }

@@ -50,7 +50,7 @@ class Lanes:
     Args:
         task: the estimation problem; its namespace decides where arrays live.
         count: number of lanes.
-        paper: the same task under the control of the paper's algorithm, to be run on the same noise beside it.
+        paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
 
     Attributes:
         state: the task's state after the last measurement, lanes padded to a multiple of eight.
@@ -204,8 +204,8 @@ class Lanes:
     def _advance(self, posterior: Any, paper_posterior: Any) -> None:
         self._clock += 1
         if self._in_blocks:
-            due = numpy.flatnonzero((self._clock - self._started) % self._slots == 0)
-            if len(due):
+            due = numpy.flatnonzero((self._clock - self._started) % self._slots == 0).tolist()
+            if due:
                 self._store(self._rows(due, [self._children[lane] for lane in due]), due)
         row = self._ring[self._clock % self._slots]
         self.state = self.task.measure(posterior, row)

@@ -101,7 +101,7 @@ def flown_legs(
     """
     # Complex numbers carry a turn as one factor: v(t) = v e^{i w t}, and its integral is exact.
     place, rate = complex(*position), complex(*velocity)
-    states = []
+    states: list[tuple[complex, complex]] = []
     begin = 0.0
     for duration, degrees in [*legs, (math.inf, 0.0)]:
         turn = math.radians(degrees)

@@ -117,7 +117,13 @@ class ErrorMoments(NamedTuple):
 
 
 def propagate_error(
-    moments: ErrorMoments, displacement: Array, increment: Array, R: Array, alpha: Array, beta: Array, T: float
+    moments: ErrorMoments,
+    displacement: Array,
+    increment: Array,
+    R: Array,
+    alpha: Array,
+    beta: Array,
+    T: float,
 ) -> ErrorMoments:
     """Exact moments of the error over one scan, known gains, known manoeuvre of the target.
 
@@ -172,6 +178,7 @@ def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: fl
     noise = [alpha * alpha * R, alpha * rate * R, rate * rate * R]
     zero = xp.zeros_like(noise[0][0])
     gained = [
-        [noise[i // d + j // d][i % d] if i % d == j % d else zero for j in range(2 * d)] for i in range(2 * d)
+        [noise[i // d + j // d][i % d] if i % d == j % d else zero for j in range(2 * d)]
+        for i in range(2 * d)
     ]
     return moved + xp.stack([xp.stack(row, axis=0) for row in gained], axis=0)

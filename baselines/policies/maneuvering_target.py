@@ -16,7 +16,7 @@ from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy
 
 
 class InteractingMultipleModel(Policy):
-    """The paper's algorithm: weights by Bayes' rule from likelihoods and predicted probabilities, (12)-(14)."""
+    """The paper's algorithm: weights by Bayes' rule, equations (12)-(14)."""
 
     control = "weights"
 
@@ -232,9 +232,7 @@ class KalmanInteractingMultipleModel(_KalmanReference):
         task, xp = self.task, self.task.xp
         track = _started(task, state)
         half = 0.5 + 0.0 * track.mean[:2]
-        return KalmanBank(
-            xp.stack([track.mean] * 2, axis=1), xp.stack([track.covariance] * 2, axis=2), half
-        )
+        return KalmanBank(xp.stack([track.mean] * 2, axis=1), xp.stack([track.covariance] * 2, axis=2), half)
 
     def update(self, state: State, memory: KalmanBank) -> tuple[State, KalmanBank]:
         """One IMM cycle."""

@@ -282,7 +282,6 @@ class ManeuveringTarget(Task[State]):
         Component("velocity_y", "m/s"),
     )
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
-    modes = ("mode_1", "mode_2")
     cost_description = "squared position error over the squared range sigma"
     huber_bound = 60.0
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))
@@ -290,7 +289,11 @@ class ManeuveringTarget(Task[State]):
     parameters: ManeuveringTargetParameters
 
     def __init__(
-        self, parameters: ManeuveringTargetParameters, control: str, xp: ModuleType = numpy, device: Any = None
+        self,
+        parameters: ManeuveringTargetParameters,
+        control: str,
+        xp: ModuleType = numpy,
+        device: Any = None,
     ) -> None:
         super().__init__(parameters, control, xp, device)
         p = parameters
@@ -386,7 +389,9 @@ class ManeuveringTarget(Task[State]):
         relative = estimator.log_likelihood - xp.max(estimator.log_likelihood, axis=0)
         normalised, average = estimator.innovation / sigma, estimator.average_innovation
         compressed = signed_logarithm(
-            xp.concat([normalised[0], normalised[1], average[0], average[1], relative, estimator.log_predicted]),
+            xp.concat(
+                [normalised[0], normalised[1], average[0], average[1], relative, estimator.log_predicted]
+            ),
             xp,
         )
         m = len(self.modes)
@@ -444,9 +449,7 @@ class ManeuveringTarget(Task[State]):
         if self.control == "gain":
             covariance = alpha_beta.Covariance(variance, zero, velocity_variance)
             alpha = sum(self.parameters.alpha_range) / 2.0 * ones
-            return AlphaBeta(
-                position, velocity, covariance, zero, variance, zero, zero[0], zero[0], alpha
-            )
+            return AlphaBeta(position, velocity, covariance, zero, variance, zero, zero[0], zero[0], alpha)
         m = len(self.modes)
         mean = xp.concat([position, velocity])
         diagonal = xp.concat([variance, velocity_variance])
@@ -487,8 +490,8 @@ class ManeuveringTarget(Task[State]):
         duration = xp.where(flown, drawn_integer(p.maneuver_duration, draws[0]), 0.0)
         # Sorted starts within the time that the manoeuvres leave free, each moved on by those before it.
         order = xp.sort(xp.where(flown, draws[1], 2.0), axis=0)
-        busy = duration[0] if self.slots else None
-        for m in range(1, self.slots):
+        busy = 0.0 * count
+        for m in range(self.slots):
             busy = busy + duration[m]
         acceleration = between(p.maneuver_acceleration, draws[2])
         direction = 2.0 * math.pi * draws[3]
@@ -525,7 +528,7 @@ class ManeuveringTarget(Task[State]):
             now = turned + (T * duration[m]) * vector
         if not columns:
             empty = xp.reshape(uniforms[:0], (0, uniforms.shape[-1]))
-            return position, velocity, Maneuvers(*[empty] * 6, xp.stack([empty, empty]))
+            return position, velocity, Maneuvers(*[empty] * 6, xp.stack([empty, empty]))  # type: ignore[call-arg]
         parts = [xp.stack([column[i] for column in columns], axis=-2) for i in range(7)]
         return position, velocity, Maneuvers(*parts)
 
@@ -533,7 +536,8 @@ class ManeuveringTarget(Task[State]):
         """True position and velocity at the next scan."""
         xp, T = self.xp, self.T
         if state.maneuvers is None:
-            row = xp.clip(xp.astype(scan, xp.int64), None, self.table.shape[1] - 1)
+            last = int(self.table.shape[1]) - 1
+            row = xp.clip(xp.astype(scan, xp.int64), None, last)
             return self.table[:2, row], self.table[2:, row]
         m = state.maneuvers
         position, velocity = state.position + T * state.velocity, state.velocity
