@@ -118,7 +118,7 @@ class Task(ABC, Generic[State]):
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
     """What :meth:`error` returns. This and the four attributes below may be set for each instance."""
-    groups: Mapping[str, tuple[str, ...]] = {}  # noqa: RUF012 (immutable by type)
+    groups: Mapping[str, tuple[str, ...]] = {}
     """Names for several components taken together, such as ``position``: the root of their summed squares."""
     modes: tuple[str, ...] = ()
     """Names of the hypotheses of the bank; their probabilities are recorded when a state reports them."""
