@@ -67,7 +67,8 @@ class _Face:
             rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
             if self.detailed_info:
                 batch_last = {"error": task.error(state), "cost": task.cost(state), **task.records(state)}
-                info.update({name: values.T for name, values in batch_last.items()})
+                # A copy: some of these arrays are the state's own, and the caller may overwrite them.
+                info.update({name: task.xp.asarray(v.T, copy=True) for name, v in batch_last.items()})
 
         self.lanes.step(lambda state: task.act(state, action), record)
         total = rewards[0]
@@ -235,39 +236,38 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         array = self._actions(actions)
         info: dict[str, Any] = {}
         paid = self._pay(self.lanes.widened(array), info)[: self.num_envs]
-        if self.detailed_info:
-            info = {name: values[: self.num_envs] for name, values in info.items()}
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self.lanes.restart(numpy.flatnonzero(waiting).tolist())
             paid = self.task.xp.where(self.task.xp.asarray(waiting, device=self.task.device), 0.0, paid)
         finished = self.lanes.decisions >= self.last_decision
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
+            final_obs = numpy.full(self.num_envs, None, dtype=object)
             last = self.lanes.observe()
             done = numpy.flatnonzero(finished)
-            info = self._final_info(info, last, done)
+            for lane in done:
+                final_obs[lane] = last[lane]
+            info = self._masked(info, ~finished) | {
+                "final_obs": final_obs,
+                "_final_obs": finished.copy(),
+                "final_info": self._masked(info, finished),
+                "_final_info": finished.copy(),
+            }
             self.lanes.restart(done.tolist())
             self._finished = self._never
         else:
+            info = self._masked(info, ~waiting)
             self._finished = finished
-        return self.lanes.observe(), paid, self._never.copy(), finished, info
+        return self.lanes.observe(), paid, self._never.copy(), finished.copy(), info
+
+    def _masked(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
+        """Gymnasium's form of what some sub-environments report: a mask beside every key."""
+        if not mask.any():
+            return {}
+        masked = {}
+        for name, values in info.items():
+            masked[name], masked[f"_{name}"] = values[: self.num_envs], mask.copy()
+        return masked
 
     def _actions(self, actions: Any) -> Array:
         return _checked_action(self.single_action_space, actions, self.num_envs)
-
-    def _final_info(self, info: dict[str, Any], last: Array, done: numpy.ndarray) -> dict[str, Any]:
-        """Gymnasium's form: objects for the finished ones, None elsewhere, and a mask beside every key."""
-        mask = numpy.zeros(self.num_envs, dtype=bool)
-        mask[done] = True
-        final_obs = numpy.full(self.num_envs, None, dtype=object)
-        for lane in done:
-            final_obs[lane] = last[lane]
-        final_info = {}
-        for name, values in info.items():
-            final_info[name], final_info[f"_{name}"] = values, mask
-        return {
-            "final_obs": final_obs,
-            "_final_obs": mask,
-            "final_info": final_info,
-            "_final_info": mask.copy(),
-        }
