@@ -38,8 +38,9 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     if isinstance(old, tuple):
         parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one.
-    merged = old.copy() if isinstance(old, numpy.ndarray) else old.clone()
+    # A copy, because states are never changed in place: someone may still hold the old one. In the type of
+    # the new one: float32 actions leave float32 in a state, and a fresh lane must not be rounded to it.
+    merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
     merged[..., lanes] = new[..., : len(lanes)]
     return merged
 
