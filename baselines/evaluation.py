@@ -166,9 +166,13 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: known.kind(name) for name in makers}
-    controls = {name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()}
+    controls: dict[str, str] = {}
+    tasks: dict[str, Task] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
-    tasks = {name: make_task(cls.id, controls[name], scenario, **keywords) for name in makers}
+    for name, maker in makers.items():
+        tuned_keywords = getattr(maker, "task_keywords", {})
+        controls[name] = _control_of(maker, kinds[name], control, cls, name)
+        tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
     for name, task in tasks.items():
         if getattr(makers[name], "control", task.control) != task.control:
             raise ValueError(f"policy {name!r} does not fit control {task.control!r}")
