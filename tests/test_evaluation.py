@@ -3,7 +3,6 @@
 import json
 import math
 
-import filtergym
 import gymnasium
 import numpy as np
 import pytest
@@ -12,7 +11,9 @@ from filtergym.baselines import evaluate, tidy_records
 from filtergym.baselines.evaluation import baselines_of
 from filtergym.baselines.policy import Policy
 from filtergym.baselines.seeds import episode_seeds
-from filtergym.baselines.tuning import merged_table, mean_cost, stored_values, tune
+from filtergym.baselines.tuning import mean_cost, merged_table, stored_values, tune
+
+import filtergym
 
 ENV = "filtergym/ManeuveringTarget-v0"
 assert filtergym
