@@ -127,10 +127,10 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         """What keeps and draws the episode; None without a render mode."""
         if render_mode is not None:
             # Only here: matplotlib takes longer to import than an episode takes to run.
-            from .rendering import EpisodePicture
+            from . import rendering
 
             name = find_scenario(type(self.task), scenario).name
-            self.picture = EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
+            self.picture = rendering.EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
         self.observation_space = _observation_space(self.task)
         self.action_space = self.task.action_space
 
@@ -248,7 +248,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             seeds = list(seed)
             if len(seeds) != self.num_envs:
-                raise ValueError(f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}")
+                raise ValueError(
+                    f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}"
+                )
         unseeded = not self.lanes.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
@@ -324,4 +326,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         final_info = {}
         for name, values in info.items():
             final_info[name], final_info[f"_{name}"] = values, mask
-        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}
+        return {
+            "final_obs": final_obs,
+            "_final_obs": mask,
+            "final_info": final_info,
+            "_final_info": mask.copy(),
+        }

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import matplotlib
 import numpy
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -61,6 +62,8 @@ class Strip(NamedTuple):
     """Series of the reported standard deviation: a shaded band of plus and minus two of it."""
     guides: tuple[float, ...] = ()
     """Levels of thin lines."""
+    steps: bool = False
+    """Whether values hold for their measurement and jump to the next, as choices do."""
 
 
 def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
@@ -69,21 +72,15 @@ def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, 
     # A value on the far side of a limit at zero cannot be reached by stretching, and is cut off.
     needed = max(
         [1.0]
-        + [value / limit for value, limit in ((low, lowest), (high, highest)) if limit and math.isfinite(value)]
+        + [
+            value / limit
+            for value, limit in ((low, lowest), (high, highest))
+            if limit and math.isfinite(value)
+        ]
     )
     decade = 10.0 ** math.floor(math.log10(needed))
     factor = decade * next((step for step in LADDER if step * decade >= needed * (1.0 - 1e-9)), 10.0)
     return lowest * factor, highest * factor
-
-
-def grow(axes: Axes, which: str, low: float, high: float) -> bool:
-    """Stretch the limits of axis "x" or "y" where something leaves them; say whether they changed."""
-    old = getattr(axes, f"get_{which}lim")()
-    if low >= old[0] and high <= old[1]:
-        return False
-    new = grown(old, low, high)
-    getattr(axes, f"set_{which}lim")(*new)
-    return new != old
 
 
 class Picture:
@@ -125,6 +122,7 @@ class Picture:
             for component in shown
         ]
         space = self.task.action_space
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
         if isinstance(space, gymnasium.spaces.Discrete):
             count, limits = 1, (-0.2, float(space.n) - 0.8)
         else:
@@ -133,7 +131,7 @@ class Picture:
             margin = 0.05 * float(space.high.max() - space.low.min())
             limits = float(space.low.min()) - margin, float(space.high.max()) + margin
         named = {f"{i + 1}" if count > 1 else "action": f"action.{i}" for i in range(min(count, len(CURVES)))}
-        return [*errors, Strip(f"action, {self.task.control}", named, limits)]
+        return [*errors, Strip(f"action, {self.task.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
         """Whether a last strip shows every component of the observation as a colour."""
@@ -162,7 +160,7 @@ class Picture:
 
 
 def picture_of(task: Task) -> Picture:
-    """Return the picture made for a task: the module of its own name in :mod:`.pictures`, or the general one."""
+    """Return the picture made for a task, by the name of its module, or the general one."""
     package = f"{__package__}.pictures"
     name = f"{package}.{type(task).__module__.rpartition('.')[2]}"
     importlib.import_module(package)
@@ -183,14 +181,17 @@ class _StripPanel:
         if strip.band is not None:
             self.band = axes.fill_between([0.0], 0.0, 0.0, color=SKY, alpha=0.4, linewidth=0.0, zorder=2)
             self.band.set_label(f"±{BAND_SIGMAS:g}σ reported")
+        drawstyle = "steps-mid" if strip.steps else "default"
         self.lines = [
-            axes.plot([], [], color=color, linestyle=style, linewidth=1.4, label=name, zorder=3)[0]
+            axes.plot(
+                [], [], color=color, linestyle=style, linewidth=1.4, label=name, zorder=3, drawstyle=drawstyle
+            )[0]
             for name, (color, style) in zip(strip.curves, CURVES, strict=False)
         ]
         if self.band is not None or len(self.lines) > 1:
             # Above the axes, where no curve can run beneath it.
             axes.legend(
-                loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(CURVES), fontsize=8, frameon=False,
+                loc="lower right", bbox_to_anchor=(1.0, 1.005), ncols=len(CURVES), fontsize=8, frameon=False,
                 borderpad=0.0, borderaxespad=0.2, handlelength=1.6, columnspacing=1.0, handletextpad=0.4,
             )  # fmt: skip
 
@@ -208,7 +209,7 @@ class _StripPanel:
             self.band.set_data(times[: len(half)], -half, half)
         # The band alone does not stretch the limits: at the start it is far wider than all that follows.
         if low <= high:
-            grow(self.axes, "y", low, high)
+            self.axes.set_ylim(*grown(self.strip.limits, low, high))
 
 
 class _ObservationPanel:
@@ -218,8 +219,8 @@ class _ObservationPanel:
         self.axes = axes
         self.values = numpy.full((fields, horizon), numpy.nan)
         self.image = axes.imshow(
-            self.values, aspect="auto", origin="upper", interpolation="nearest", cmap="PuOr_r", vmin=-3.0, vmax=3.0,
-            extent=(0.5, horizon + 0.5, fields + 0.5, 0.5),
+            self.values, aspect="auto", origin="upper", interpolation="nearest", cmap="PuOr_r",
+            vmin=-3.0, vmax=3.0, extent=(0.5, horizon + 0.5, fields + 0.5, 0.5),
         )  # fmt: skip
         axes.set_title("observation by component (colour: -3 to 3)", loc="left", fontsize=9, pad=4)
         axes.yaxis.get_major_locator().set_params(integer=True)
@@ -254,6 +255,8 @@ class EpisodePicture:
         self.observations: list[numpy.ndarray] = []
         self.count = 0
         self._figure: Figure | None = None
+        self._limits: list[list[float]] = []
+        self._ground: Any = None
         self._fresh = True
         self._last_shown = 0.0
         if mode == "human":
@@ -295,9 +298,22 @@ class EpisodePicture:
     def frame(self, state: Any) -> numpy.ndarray:
         """Draw and return the picture, ``(height, width, 3)`` bytes."""
         figure = self._drawn(state)
-        assert isinstance(figure.canvas, FigureCanvasAgg)
-        figure.canvas.draw()
-        return numpy.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()
+        canvas = figure.canvas
+        assert isinstance(canvas, FigureCanvasAgg)
+        moving = [_moving(axes) for axes in figure.axes]
+        # Frames, ticks and letters take nine tenths of the time: they are drawn again only when they change.
+        limits = [axes.viewLim.extents.tolist() for axes in figure.axes]
+        if limits != self._limits:
+            for artist in [self._title, *(artist for artists in moving for artist in artists)]:
+                artist.set_animated(True)
+            canvas.draw()
+            self._ground, self._limits = canvas.copy_from_bbox(figure.bbox), limits
+        canvas.restore_region(self._ground)
+        for axes, artists in zip(figure.axes, moving, strict=True):
+            for artist in artists:
+                axes.draw_artist(artist)
+        figure.draw_artist(self._title)
+        return numpy.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def show(self, state: Any) -> None:
         """Draw into the window, not faster than ``frames_per_second``."""
@@ -321,7 +337,7 @@ class EpisodePicture:
             from matplotlib import pyplot
 
             pyplot.close(self._figure)
-        self._figure = None
+        self._figure, self._ground, self._limits = None, None, []
         self._fresh = True
 
     def _drawn(self, state: Any) -> Figure:
@@ -361,8 +377,9 @@ class EpisodePicture:
         columns = self.picture.strip_columns or -(-cells // 4)
         rows = -(-cells // columns)
         grid = figure.add_gridspec(
-            rows, columns, left=self.picture.strips_left, right=0.985, bottom=0.075, top=0.885, hspace=0.42, wspace=0.2
-        )
+            rows, columns, left=self.picture.strips_left, right=0.985, bottom=0.075, top=0.9,
+            hspace=0.09 * rows, wspace=0.2,
+        )  # fmt: skip
         # Column by column, so that what belongs together stands above each other.
         axes = [figure.add_subplot(grid[i % rows, i // rows]) for i in range(cells)]
         for i, one in enumerate(axes):
@@ -392,6 +409,13 @@ class EpisodePicture:
         self.picture.arrange()
 
 
+def _moving(axes: Axes) -> list[Artist]:
+    """Everything inside the axes, in the order of drawing."""
+    return sorted(
+        [*axes.images, *axes.collections, *axes.patches, *axes.lines], key=lambda artist: artist.get_zorder()
+    )
+
+
 def _require_window() -> None:
     """Say so where matplotlib has no way to open a window."""
     from matplotlib.backends import BackendFilter, backend_registry
@@ -400,8 +424,8 @@ def _require_window() -> None:
     windowed = [name.lower() for name in backend_registry.list_builtin(BackendFilter.INTERACTIVE)]
     if backend.lower() not in windowed and "ipympl" not in backend:
         raise gymnasium.error.Error(
-            f"render_mode 'human' needs a display and a matplotlib backend that opens windows, but the backend "
-            f"here is {backend!r}: install PyQt6 or tkinter, check DISPLAY and MPLBACKEND, or use "
+            "render_mode 'human' needs a display and a matplotlib backend that opens windows, but the "
+            f"backend here is {backend!r}: install PyQt6 or tkinter, check DISPLAY and MPLBACKEND, or use "
             "render_mode='rgb_array'"
         )
 
@@ -410,9 +434,12 @@ def _window(title: str) -> Figure:
     from matplotlib import pyplot
 
     try:
-        return pyplot.figure(title, figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
+        figure = pyplot.figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
     except Exception as error:  # every toolkit has exceptions of its own for a missing display
         raise gymnasium.error.Error(
-            f"render_mode 'human' cannot open a window with matplotlib's backend {matplotlib.get_backend()!r} "
+            f"render_mode 'human' cannot open a window with the backend {matplotlib.get_backend()!r} "
             f"({error}): check DISPLAY and MPLBACKEND, or use render_mode='rgb_array'"
         ) from error
+    if figure.canvas.manager is not None:
+        figure.canvas.manager.set_window_title(title)
+    return figure

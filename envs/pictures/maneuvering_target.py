@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from ...filters import imm
-from ..rendering import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILLION, History, Picture, Strip, grow
+from ..rendering import BLACK, BLUE, FIGURE_SIZE, GREEN, ORANGE, VERMILLION, History, Picture, Strip, grown
 from ..task import Task
 from ..tasks.maneuvering_target import AlphaBeta, Bank, ManeuveringTarget, State
 
@@ -19,8 +20,8 @@ RECENT = 15
 """Scans whose errors the close-up keeps."""
 CLOSE_UP_SIGMAS = 4.0
 """Half width of the close-up at the start, in the largest measurement sigma of the flight."""
-TRACK = (0.06, 0.405, 0.43, 0.47)
-CLOSE_UP = (0.06, 0.075, 0.43 * 0.53, 0.43 * 0.53 * 12.0 / 7.6)
+TRACK = (0.06, 0.475, 0.43, 0.425)
+CLOSE_UP = (0.06, 0.075, 0.19, 0.19 * FIGURE_SIZE[0] / FIGURE_SIZE[1])
 """Left, bottom, width, height of the panels as shares of the figure; the close-up is square."""
 
 
@@ -73,7 +74,6 @@ class ManeuveringTargetPicture(Picture):
             "covariance_yy": P[1, 1] / 1e6,
             "position_error": math.hypot(*error),
             "position_sigma": math.sqrt(P[0, 0] + P[1, 1]),
-            "measurement_error": math.hypot(*(measured - true)),
         }
         if isinstance(estimator, AlphaBeta):
             innovation = estimator.innovation[:, 0]
@@ -110,14 +110,14 @@ class ManeuveringTargetPicture(Picture):
     def strips(self) -> Sequence[Strip]:
         """Innovation, what is steered, error."""
         if self.task.control == "gain":
-            steered = Strip("position gain alpha, 1", {"alpha": "alpha"}, (0.0, 1.0))
+            steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
         else:
             gains = self.task.parameters.gains
             named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}
-            steered = Strip("weights, 1", named, (-0.04, 1.04))
+            steered = Strip("weights", named, (-0.04, 1.04))
         return [
             Strip(
-                "innovation over predicted σ, 1",
+                "innovation over predicted σ",
                 {"x": "innovation_x", "y": "innovation_y"},
                 (-4.0, 4.0),
                 guides=(-2.0, 0.0, 2.0),
@@ -125,7 +125,7 @@ class ManeuveringTargetPicture(Picture):
             steered,
             Strip(
                 "position error, m",
-                {"estimate": "position_error", "reported σ": "position_sigma", "measurement": "measurement_error"},
+                {"estimate": "position_error", "reported σ": "position_sigma"},
                 (0.0, 500.0),
             ),
         ]
@@ -159,14 +159,22 @@ class ManeuveringTargetPicture(Picture):
         dot = {"linestyle": "", "marker": "o", "color": BLUE}
         (self.true,) = track.plot([], [], color=BLACK, linewidth=1.2, zorder=2)
         (self.measured,) = track.plot([], [], **cross, markersize=4, markeredgewidth=0.9, zorder=3)
-        (self.estimated,) = track.plot([], [], color=BLUE, marker="o", markersize=2.6, linewidth=1.0, zorder=4)
-        (self.target,) = track.plot([], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=5)
+        (self.estimated,) = track.plot(
+            [], [], color=BLUE, marker="o", markersize=2.6, linewidth=1.0, zorder=4
+        )
+        (self.target,) = track.plot(
+            [], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=5
+        )
         (self.arrived,) = track.plot(
             [], [], linestyle="", marker="s", markersize=7, markerfacecolor="none", markeredgewidth=1.4,
             color=VERMILLION, zorder=6,
         )  # fmt: skip
-        (self.radar,) = track.plot([0.0], [0.0], linestyle="", marker="^", markersize=8, color=GREEN, zorder=5)
-        self.ellipses = [Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3) for _ in range(2)]
+        (self.radar,) = track.plot(
+            [0.0], [0.0], linestyle="", marker="^", markersize=8, color=GREEN, zorder=5
+        )
+        self.ellipses = [
+            Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3) for _ in range(2)
+        ]
         track.add_patch(self.ellipses[0])
         close_up.add_patch(self.ellipses[1])
         (self.past_measured,) = close_up.plot([], [], **cross, alpha=0.35, markersize=4, zorder=2)
@@ -174,21 +182,20 @@ class ManeuveringTargetPicture(Picture):
         (self.last_measured,) = close_up.plot([], [], **cross, markersize=8, markeredgewidth=1.8, zorder=4)
         (self.last_estimated,) = close_up.plot([], [], **dot, markersize=6, zorder=5)
         close_up.plot([0.0], [0.0], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=6)
-        (legend_ellipse,) = figure.gca().plot(
-            [], [], linestyle="", marker="o", markersize=10, markerfacecolor="none", color=BLUE
-        )
-        (legend_shade,) = figure.gca().plot([], [], linestyle="", marker="s", markersize=10, color="#DCDCDC")
-        (legend_past,) = figure.gca().plot([], [], linestyle="", marker="o", markersize=4, color=GREY)
+        ring = Line2D([], [], linestyle="", marker="o", markersize=10, markerfacecolor="none", color=BLUE)
+        ground = Line2D([], [], linestyle="", marker="s", markersize=10, color="#DCDCDC")
+        pale = Line2D([], [], linestyle="", marker="o", markersize=4, color=BLUE, alpha=0.3)
         figure.legend(
             [
-                self.true, self.target, self.last_measured, self.arrived, self.estimated, legend_ellipse,
-                legend_past, self.radar, legend_shade,
+                self.true, self.target, self.last_measured, self.arrived, self.estimated, ring, pale,
+                self.radar, ground,
             ],
             [
                 "true path", "target now", "measurement", "next measurement,\nnot yet used", "estimate",
-                f"{ELLIPSE_SIGMAS:g}σ covariance", f"pale: the last {RECENT} scans", "radar", "manoeuvre (strips)",
+                f"{ELLIPSE_SIGMAS:g}σ covariance", f"pale: {RECENT} scans before", "radar", "manoeuvre",
             ],
-            loc="upper left", bbox_to_anchor=(CLOSE_UP[0] + CLOSE_UP[2] + 0.012, CLOSE_UP[1] + CLOSE_UP[3] + 0.012),
+            loc="upper left",
+            bbox_to_anchor=(CLOSE_UP[0] + CLOSE_UP[2] + 0.012, CLOSE_UP[1] + CLOSE_UP[3] + 0.012),
             fontsize=8, frameon=False, labelspacing=0.65,
         )  # fmt: skip
 
@@ -202,7 +209,11 @@ class ManeuveringTargetPicture(Picture):
         half = 0.5 * kilometres_per_inch * numpy.array([width, height])
         self.track.set_xlim(middle[0] - half[0], middle[0] + half[0])
         self.track.set_ylim(middle[1] - half[1], middle[1] + half[1])
-        reach = math.ceil(CLOSE_UP_SIGMAS * self.largest_sigma * 10.0) / 10.0
+        self.reach = math.ceil(CLOSE_UP_SIGMAS * self.largest_sigma * 10.0) / 10.0
+        self._set_reach(self.reach)
+
+    def _set_reach(self, reach: float) -> None:
+        # Both axes together, so that the close-up stays square.
         self.close_up.set_xlim(-reach, reach)
         self.close_up.set_ylim(-reach, reach)
 
@@ -232,10 +243,7 @@ class ManeuveringTargetPicture(Picture):
             ellipse.set_width(2.0 * ELLIPSE_SIGMAS * large)
             ellipse.set_height(2.0 * ELLIPSE_SIGMAS * small)
             ellipse.set_angle(direction)
-        # Both axes together, so that the close-up stays square.
-        reach = float(numpy.abs(error).max())
-        for axis in "xy":
-            grow(self.close_up, axis, -reach, reach)
+        self._set_reach(grown((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
 
 
 def _pair(history: Mapping[str, Any], name: str) -> numpy.ndarray:
