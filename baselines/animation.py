@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
+import numpy
 import typer
 from PIL import Image
 
@@ -15,8 +16,8 @@ from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
 from .evaluation import baselines_of, load_policy
 
-COLOURS = 48
-"""Of the palette: enough for lines and their smooth edges, and a third of the bytes of 256."""
+SHADES = 7
+"""Steps from a colour of the figure to white, for smooth edges."""
 
 
 def episode_frames(
@@ -65,6 +66,26 @@ def _frame(world: TaskEnv) -> Any:
     return frame
 
 
+def _palette() -> Image.Image:
+    """Colours of the figures and their shades: one palette for all frames, or colours would flicker.
+
+    A palette chosen from the pixels would drop what is small, such as the radar's mark.
+    """
+    from matplotlib.colors import to_rgb
+
+    # Imported here for the same reason as in the environment.
+    from ..envs import rendering
+
+    white = numpy.ones(3)
+    share = numpy.arange(SHADES)[:, None] / SHADES
+    shades = [(1.0 - share) * to_rgb(colour) + share * white for colour in rendering.COLOURS]
+    image = Image.new("P", (1, 1))
+    image.putpalette(
+        numpy.rint(255.0 * numpy.concatenate([white[None], *shades])).astype(int).ravel().tolist()
+    )
+    return image
+
+
 def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
     """Write frames as an endless GIF whose last frame stays for two seconds.
 
@@ -73,8 +94,7 @@ def write_animation(frames: list[Image.Image], path: Path, frames_per_second: fl
         path: of the file, which is complete or not there.
         frames_per_second: speed.
     """
-    # One palette for all, taken from the fullest frame: colours must not flicker.
-    palette = frames[-1].quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
+    palette = _palette()
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -169,7 +169,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         if self.picture is not None and self.render_mode == "human":
             self.picture.show(self.lanes.state)
 
-    def render(self) -> numpy.ndarray | None:  # type: ignore[override]
+    def render(self) -> numpy.ndarray | None:
         """Draw the episode so far.
 
         Returns:
@@ -248,9 +248,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             seeds = list(seed)
             if len(seeds) != self.num_envs:
-                raise ValueError(
-                    f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}"
-                )
+                raise ValueError(f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}")
         unseeded = not self.lanes.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
@@ -326,9 +324,4 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         final_info = {}
         for name, values in info.items():
             final_info[name], final_info[f"_{name}"] = values, mask
-        return {
-            "final_obs": final_obs,
-            "_final_obs": mask,
-            "final_info": final_info,
-            "_final_info": mask.copy(),
-        }
+        return {"final_obs": final_obs, "_final_obs": mask, "final_info": final_info, "_final_info": mask.copy()}

@@ -25,6 +25,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from .task import Task
 
@@ -32,6 +33,10 @@ BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
     "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#E69F00", "#CC79A7", "#000000", "#8A8A8A",
 )  # fmt: skip
 """Colours that stay apart for colour-blind readers (Okabe and Ito, 2008), and a grey."""
+PALE = "#EBEBEB"
+"""Ground of marked stretches, and lines of a grid."""
+COLOURS = (BLACK, BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, PALE)
+"""All that a picture should be drawn in: animations have these and their shades."""
 CURVES = ((BLUE, "-"), (VERMILLION, "--"), (GREEN, "-."), (PURPLE, ":"), (ORANGE, "-"), (SKY, "--"))
 """Colour and line style of the curves of a strip: two ways to tell them apart."""
 FIGURE_SIZE = (12.0, 7.6)
@@ -184,7 +189,17 @@ class _StripPanel:
         drawstyle = "steps-mid" if strip.steps else "default"
         self.lines = [
             axes.plot(
-                [], [], color=color, linestyle=style, linewidth=1.4, label=name, zorder=3, drawstyle=drawstyle
+                [],
+                [],
+                color=color,
+                linestyle=style,
+                linewidth=1.4,
+                label=name,
+                zorder=3,
+                drawstyle=drawstyle,
+                marker="o",
+                markersize=3.5,
+                markevery=slice(-1, None),
             )[0]
             for name, (color, style) in zip(strip.curves, CURVES, strict=False)
         ]
@@ -192,7 +207,7 @@ class _StripPanel:
             # Above the axes, where no curve can run beneath it.
             axes.legend(
                 loc="lower right", bbox_to_anchor=(1.0, 1.005), ncols=len(CURVES), fontsize=8, frameon=False,
-                borderpad=0.0, borderaxespad=0.2, handlelength=1.6, columnspacing=1.0, handletextpad=0.4,
+                borderpad=0.0, borderaxespad=0.2, handlelength=2.8, columnspacing=1.0, handletextpad=0.4,
             )  # fmt: skip
 
     def draw(self, history: History, count: int) -> None:
@@ -223,7 +238,7 @@ class _ObservationPanel:
             vmin=-3.0, vmax=3.0, extent=(0.5, horizon + 0.5, fields + 0.5, 0.5),
         )  # fmt: skip
         axes.set_title("observation by component (colour: -3 to 3)", loc="left", fontsize=9, pad=4)
-        axes.yaxis.get_major_locator().set_params(integer=True)
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
 
     def draw(self, observations: Sequence[numpy.ndarray]) -> None:
         self.values[:] = numpy.nan
@@ -255,7 +270,7 @@ class EpisodePicture:
         self.observations: list[numpy.ndarray] = []
         self.count = 0
         self._figure: Figure | None = None
-        self._limits: list[list[float]] = []
+        self._limits: list[tuple[float, ...]] = []
         self._ground: Any = None
         self._fresh = True
         self._last_shown = 0.0
@@ -302,7 +317,7 @@ class EpisodePicture:
         assert isinstance(canvas, FigureCanvasAgg)
         moving = [_moving(axes) for axes in figure.axes]
         # Frames, ticks and letters take nine tenths of the time: they are drawn again only when they change.
-        limits = [axes.viewLim.extents.tolist() for axes in figure.axes]
+        limits = [tuple(axes.viewLim.extents) for axes in figure.axes]
         if limits != self._limits:
             for artist in [self._title, *(artist for artists in moving for artist in artists)]:
                 artist.set_animated(True)
@@ -323,7 +338,7 @@ class EpisodePicture:
         figure = self._drawn(state)
         if not opened:
             figure.show()
-        elif not pyplot.fignum_exists(figure.number):  # type: ignore[attr-defined]
+        elif not pyplot.fignum_exists(figure.number):
             return  # the user has closed the window: the episode goes on unseen
         figure.canvas.draw_idle()
         due = self._last_shown + 1.0 / self.frames_per_second
@@ -405,7 +420,7 @@ class EpisodePicture:
             panel.axes.set_xlim(0.5, self.task.horizon + 0.5)
             panel.axes.set_ylim(*panel.strip.limits)
             for first, last in self.picture.shaded():
-                self._shades.append(panel.axes.axvspan(first, last, color="#EBEBEB", linewidth=0.0, zorder=0))
+                self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
         self.picture.arrange()
 
 

@@ -10,7 +10,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from ...filters import imm
-from ..rendering import BLACK, BLUE, FIGURE_SIZE, GREEN, ORANGE, VERMILLION, History, Picture, Strip, grown
+from ..rendering import (
+    BLACK,
+    BLUE,
+    FIGURE_SIZE,
+    GREEN,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    History,
+    Picture,
+    Strip,
+    grown,
+)
 from ..task import Task
 from ..tasks.maneuvering_target import AlphaBeta, Bank, ManeuveringTarget, State
 
@@ -147,7 +159,7 @@ class ManeuveringTargetPicture(Picture):
         for axes in (track, close_up):
             axes.set_aspect("equal", adjustable="box")
             axes.tick_params(labelsize=8)
-            axes.grid(color="#E6E6E6", linewidth=0.6)
+            axes.grid(color=PALE, linewidth=0.6)
             axes.set_axisbelow(True)
         track.set_title("track", loc="left", fontsize=9, pad=4)
         track.set_xlabel("x, km", fontsize=9, labelpad=1)
@@ -155,8 +167,8 @@ class ManeuveringTargetPicture(Picture):
         close_up.set_title("close-up: errors at the last scan", loc="left", fontsize=9, pad=4)
         close_up.set_xlabel("x minus true x, km", fontsize=9, labelpad=1)
         close_up.set_ylabel("y minus true y, km", fontsize=9, labelpad=1)
-        cross = {"linestyle": "", "marker": "x", "color": ORANGE}
-        dot = {"linestyle": "", "marker": "o", "color": BLUE}
+        cross: dict[str, Any] = {"linestyle": "", "marker": "x", "color": ORANGE}
+        dot: dict[str, Any] = {"linestyle": "", "marker": "o", "color": BLUE}
         (self.true,) = track.plot([], [], color=BLACK, linewidth=1.2, zorder=2)
         (self.measured,) = track.plot([], [], **cross, markersize=4, markeredgewidth=0.9, zorder=3)
         (self.estimated,) = track.plot(
@@ -183,7 +195,7 @@ class ManeuveringTargetPicture(Picture):
         (self.last_estimated,) = close_up.plot([], [], **dot, markersize=6, zorder=5)
         close_up.plot([0.0], [0.0], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=6)
         ring = Line2D([], [], linestyle="", marker="o", markersize=10, markerfacecolor="none", color=BLUE)
-        ground = Line2D([], [], linestyle="", marker="s", markersize=10, color="#DCDCDC")
+        ground = Line2D([], [], linestyle="", marker="s", markersize=10, color=PALE)
         pale = Line2D([], [], linestyle="", marker="o", markersize=4, color=BLUE, alpha=0.3)
         figure.legend(
             [
@@ -202,8 +214,7 @@ class ManeuveringTargetPicture(Picture):
     def arrange(self) -> None:
         """Limits that hold the flight of this episode, in the shape of the panel."""
         low, high = self.flight.min(axis=1), self.flight.max(axis=1)
-        figure = self.track.figure
-        width, height = figure.get_size_inches() * (TRACK[2], TRACK[3])
+        width, height = FIGURE_SIZE[0] * TRACK[2], FIGURE_SIZE[1] * TRACK[3]
         middle, half = 0.5 * (low + high), 0.5 * (high - low) + CLOSE_UP_SIGMAS * self.largest_sigma
         kilometres_per_inch = 2.0 * max(half[0] / width, half[1] / height) * 1.04
         half = 0.5 * kilometres_per_inch * numpy.array([width, height])
