@@ -1,8 +1,8 @@
 """Exact errors of one alpha-beta filter whose gains follow a schedule fixed beforehand.
 
-With gains that do not depend on the data the error is linear in the noise, so its mean square follows without
-Monte Carlo from :func:`~filtergym.filters.alpha_beta.propagate_error`: for constant gains, for the ramp of the
-paper's adaptive filter when the scan of the detection is given, and for the best schedule there is.
+With gains that do not depend on the data the error is linear in the noise, so its mean square follows
+without Monte Carlo from :func:`~filtergym.filters.alpha_beta.propagate_error`: for constant gains, for the
+ramp of the paper's adaptive filter when the scan of the detection is given, and for the best schedule.
 """
 
 import math
@@ -28,7 +28,7 @@ class Flight(NamedTuple):
 
 
 def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
-    """x coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
+    """X coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
     p, T = parameters, parameters.sampling_interval
     first, last = p.maneuver_steps
     scans = numpy.arange(1, p.horizon + 1)
@@ -114,7 +114,9 @@ def best_schedule(flight: Flight) -> numpy.ndarray:
 
     def objective(alpha: numpy.ndarray) -> tuple[float, numpy.ndarray]:
         # All central differences side by side cost as much as a few schedules one by one.
-        schedules = numpy.concatenate([alpha[:, None], alpha[:, None] + shifts, alpha[:, None] - shifts], axis=1)
+        schedules = numpy.concatenate(
+            [alpha[:, None], alpha[:, None] + shifts, alpha[:, None] - shifts], axis=1
+        )
         total = mean_square_errors(flight, schedules).position.sum(axis=0) / nominal
         return float(total[0]), (total[1 : scans + 1] - total[scans + 1 :]) / (2.0 * step)
 

@@ -62,7 +62,7 @@ STEPS = (
     len(MAIN)
     + len(BOX_PAIRS) * len(COMPARED)
     + 2 * len(COMPARED)
-    + len(LIKELIHOODS)  # readings of the covariance but the canonical one, and one IMM per axis
+    + len(LIKELIHOODS)  # the canonical one is in MAIN; one IMM for each axis takes its place
     + len(STAYS)
     + len(LIKELIHOODS) * len(LOW_GAINS)
 )
@@ -211,7 +211,12 @@ def box_verdict(findings: Sequence[GridFinding]) -> Verdict:
 
 
 def dominance_verdict(straight: Sequence[Estimate], turn: Estimate) -> Verdict:
-    """Verdict on "mode 1 dominates on the straight legs, mode 2 in the turn", from mean probabilities of mode 1."""
+    """Verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
+
+    Args:
+        straight: mean probability of mode 1 on each straight window.
+        turn: the same in the turn.
+    """
     holds = [mean.low > 0.5 for mean in straight] + [turn.high < 0.5]
     return "reproduced" if all(holds) else "reproduced in part" if any(holds) else "not reproduced"
 
@@ -424,8 +429,8 @@ def mean_probability(run: Run, window: tuple[int, int], bootstrap: Bootstrap) ->
     return bootstrap.estimate(run.probability[:, window[0] - 1 : window[1]].mean(axis=1))
 
 
-def first_alarms(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
-    """Scans at which the adaptive filter went back to its high gain after the start, ``(episodes, K)``."""
+def ramps_begun(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
+    """Scans at which the adaptive filter began a ramp after the first one, ``(episodes, K)`` booleans."""
     alarms = numpy.abs(alpha - high) < 1e-9
     alarms[:, 0] = False
     return alarms
@@ -526,8 +531,8 @@ def claims(r: Results) -> list[Claim]:
             "Mode 1 dominates on the straight legs, mode 2 during the turn.",
             f"mean probability of mode 1: {_bracket(straight[0], 3)} before the turn, {_bracket(turn, 3)} in "
             f"it, {_bracket(straight[1], 3)} after it; {_handover(mean)}",
-            f"{r.episodes} episodes, mean over the windows, 95 % bootstrap intervals; reproduced if certainly "
-            f"above 0.5 on both straight windows and below in the turn",
+            f"{r.episodes} episodes, mean over the windows, 95 % bootstrap intervals; reproduced if "
+            f"certainly above 0.5 on both straight windows and below in the turn",
             dominance_verdict(straight, turn),
         )
     )
@@ -535,7 +540,7 @@ def claims(r: Results) -> list[Claim]:
 
 
 def _handover(mean: numpy.ndarray) -> str:
-    """When the mean probability of mode 1, ``(K,)``, falls below one half after the turn begins, and returns."""
+    """When the mean probability of mode 1, ``(K,)``, falls below one half in the turn, and comes back."""
     first = WINDOWS["turn"][0]
     scans = numpy.arange(1, len(mean) + 1)
     below = scans[(scans >= first) & (mean < 0.5)]
@@ -545,8 +550,8 @@ def _handover(mean: numpy.ndarray) -> str:
     returns = f"is back above it at scan {back[0]}" if len(back) else "does not come back above it"
     early = int((mean[: first - 1] < 0.5).sum())
     return (
-        f"it falls below 0.5 at scan {below[0]} and {returns}; at the start it is below 0.5 for {early} scans; "
-        f"it never exceeds {mean.max():.2f}"
+        f"it falls below 0.5 at scan {below[0]} and {returns}; at the start it is below 0.5 for {early} "
+        f"scans; it never exceeds {mean.max():.2f}"
     )
 
 
@@ -556,24 +561,25 @@ def _silent(
     """What the paper does not mention."""
     silent: Verdict = "paper is silent"
     imm, adaptive = r.main["imm"].curves, r.main["adaptive"].curves
-    straight = "; ".join(
-        f"scans {WINDOWS[w][0]}-{WINDOWS[w][1]}: "
-        + ", ".join(
-            f"{name} {with_error(rms(a, WINDOWS[w]), digits)} against {with_error(rms(b, WINDOWS[w]), digits)} "
-            f"{unit} ({percent(relative_change(a, b, WINDOWS[w], r.bootstrap))})"
-            for a, b, (name, unit), digits in zip(imm, adaptive, COMPONENTS, (1, 2), strict=True)
-        )
-        for w in ("pre", "post")
-    )
+    legs = []
+    for window in (WINDOWS["pre"], WINDOWS["post"]):
+        parts = []
+        for a, b, (name, unit), digits in zip(imm, adaptive, COMPONENTS, (1, 2), strict=True):
+            ours, theirs = (with_error(rms(values, window), digits) for values in (a, b))
+            change = percent(relative_change(a, b, window, r.bootstrap))
+            parts.append(f"{name} {ours} against {theirs} {unit} ({change})")
+        legs.append(f"scans {window[0]}-{window[1]}: " + ", ".join(parts))
+    straight = "; ".join(legs)
     forced = ", ".join(
         f"{k}: {rms(c.position, WINDOWS['all'])[0]:.1f} m" for k, c in r.forced.items() if k < SECTION[0] + 5
     )
     alpha = r.main["adaptive"].alpha
     assert alpha is not None
-    alarms = first_alarms(alpha, 0.7)
+    alarms = ramps_begun(alpha, 0.7)
     false_rate = alarms[:, 8 : SECTION[0] - 1].mean()
     quiet = ~alarms[:, : SECTION[0] - 1].any(axis=1)
-    detected = alarms[:, SECTION[0] - 1 :][quiet].argmax(axis=1) + SECTION[0]
+    later = alarms[:, SECTION[0] - 1 :][quiet]
+    detected = numpy.where(later.any(axis=1), later.argmax(axis=1) + SECTION[0], 0)
     shares = ", ".join(f"{k}: {(detected == k).mean():.3f}" for k in range(SECTION[0], SECTION[0] + 4))
     row, column = LOW_GAINS.index(0.3), HIGH_GAINS.index(0.7)
     figure_gains = []
@@ -593,7 +599,7 @@ def _silent(
         experiment, _, opponent = name.partition("; against ")
         others.setdefault((opponent, comparison.verdict), []).append(experiment)
     sensitivity = ". ".join(
-        f"Against {opponent}, {verdict}: {', '.join(names)}" for (opponent, verdict), names in others.items()
+        f"Against {opponent}, {verdict}: {'; '.join(names)}" for (opponent, verdict), names in others.items()
     )
     fixed = r.exact["fixed gain 0.65"]
     quiet_legs = _findings(r, "gains used", WINDOWS["pre"])
@@ -641,7 +647,7 @@ def _silent(
             "C2 in other readings",
             "Which covariance stands in the likelihood? The paper's claim C2 under the other readings:",
             readings,
-            grid_runs_text(r),
+            f"plain filters on the same measurements, {r.grid_episodes} episodes a cell, rule of C2",
             silent,
         ),
         Claim(
@@ -652,11 +658,6 @@ def _silent(
             silent,
         ),
     ]
-
-
-def grid_runs_text(r: Results) -> str:
-    """How the gain grids were run."""
-    return f"plain filters on the same measurements, {r.grid_episodes} episodes a cell, rule of C2"
 
 
 # --- tables
@@ -690,11 +691,7 @@ def tables(r: Results) -> list[Grid]:
     comparison_rows = [
         [
             name,
-            *(
-                percent(e)
-                for two in (c.section, c.turn, c.recovery, c.peak)
-                for e in two
-            ),
+            *(percent(e) for two in (c.section, c.turn, c.recovery, c.peak) for e in two),
             c.verdict,
         ]
         for name, c in _comparisons(r).items()
@@ -745,7 +742,11 @@ def tables(r: Results) -> list[Grid]:
             "IMM against adaptive filters: relative change of the RMS, 95 % interval",
             [
                 "experiment",
-                *(f"{w} {c}" for w in (f"{SECTION[0]}-{SECTION[1]}", "turn", "recovery", "peak") for c in ends),
+                *(
+                    f"{w} {c}"
+                    for w in (f"{SECTION[0]}-{SECTION[1]}", "turn", "recovery", "peak")
+                    for c in ends
+                ),
                 "verdict on C1",
             ],
             comparison_rows,
@@ -771,7 +772,9 @@ def tables(r: Results) -> list[Grid]:
         ),
         Grid(f"Sensitivity of the IMM to what the paper leaves open ({unit})", header, sensitivity),
         Grid(
-            f"Adaptive filter when the manoeuvre is detected at a given scan, exact ({unit})", header, forced
+            "Adaptive filter, manoeuvre detected at a given scan, exact (position m / velocity m/s)",
+            header,
+            forced,
         ),
         Grid(
             "Probability of mode 1",
@@ -826,8 +829,8 @@ def draw_trajectory(r: Results) -> Any:
     grid[0, 0].set_xlim(-11.0, 30.0)
     grid[0, 0].set_ylim(-30.0, 10.0)
     centre = truth[first - 2 : last].mean(axis=0)
-    grid[0, 1].set_xlim(centre[0] - 3.2, centre[0] + 3.2)
-    grid[0, 1].set_ylim(centre[1] - 3.2, centre[1] + 3.2)
+    grid[0, 1].set_xlim(centre[0] - 2.2, centre[0] + 2.2)
+    grid[0, 1].set_ylim(centre[1] - 2.2, centre[1] + 2.2)
     grid[0, 1].set_title("around the turn", fontsize=9)
     grid[0, 0].legend(fontsize=8, frameon=False, loc="lower left")
     return figure
@@ -929,7 +932,6 @@ def draw_gain_grid(r: Results) -> Any:
         best = errors[0].min()
         edges = [numpy.append(numpy.array(g) - half, g[-1] + half) for g in (HIGH_GAINS, LOW_GAINS)]
         mesh = axis.pcolormesh(*edges, errors[0], cmap="cividis_r")
-        # Standard error of the difference to the best cell, not of the cell: neighbours share their noise.
         middle = 0.5 * (errors[0].max() + best)
         for i, low in enumerate(LOW_GAINS):
             for j, high in enumerate(HIGH_GAINS):
