@@ -436,7 +436,7 @@ def _require_window() -> None:
     from matplotlib.backends import BackendFilter, backend_registry
 
     try:
-        # Without a display pyplot falls back to "agg" as it is imported, or refuses, whatever MPLBACKEND says.
+        # Without a display pyplot falls back to "agg" when imported, or refuses, whatever MPLBACKEND says.
         from matplotlib import pyplot
 
         backend = str(pyplot.get_backend())
