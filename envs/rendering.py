@@ -435,7 +435,13 @@ def _require_window() -> None:
     """Say so where matplotlib has no way to open a window."""
     from matplotlib.backends import BackendFilter, backend_registry
 
-    backend = str(matplotlib.get_backend())
+    try:
+        # Without a display pyplot falls back to "agg" when imported, or refuses, whatever MPLBACKEND says.
+        from matplotlib import pyplot
+
+        backend = str(pyplot.get_backend())
+    except ImportError as error:
+        backend = f"unusable: {error}"
     windowed = [name.lower() for name in backend_registry.list_builtin(BackendFilter.INTERACTIVE)]
     if backend.lower() not in windowed and "ipympl" not in backend:
         raise gymnasium.error.Error(
