@@ -15,10 +15,12 @@ DECISIONS = 5
 
 def pytest_generate_tests(metafunc):
     """Fill in the catalogue."""
+    if "env_id" not in metafunc.fixturenames:
+        return
     if "control" in metafunc.fixturenames:
         cases = [(id, control) for id, cls in catalogue().items() for control in cls.controls]
         metafunc.parametrize(("env_id", "control"), cases)
-    elif "env_id" in metafunc.fixturenames:
+    else:
         metafunc.parametrize("env_id", list(catalogue()))
 
 
