@@ -17,7 +17,7 @@ def positive_definite(n, *batch):
 
 
 N = 5
-P2 = alpha_beta.Covariance(*np.abs(rng.normal(size=(3, 2, N))) + [[[2.0]], [[0.0]], [[2.0]]])
+P2 = alpha_beta.Covariance(*(np.abs(rng.normal(size=(2, N))) + least for least in (2.0, 0.0, 2.0)))
 MU = rng.dirichlet(np.ones(3), size=N).T
 TRANSITION = rng.dirichlet(np.ones(3), size=3)
 MIXING = imm.predict_mode_probabilities(TRANSITION, MU).mixing
