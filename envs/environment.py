@@ -1,18 +1,21 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from .catalogue import make_task, nearest
+from .catalogue import find_scenario, make_task, nearest
 from .lanes import Lanes
 from .reward import REWARDS, paper_task, reward
 from .task import Array, Field, Task
 from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from .rendering import EpisodePicture
 
 
 def _observation_space(task: Task) -> gymnasium.spaces.Box:
@@ -63,8 +66,13 @@ class _Face:
         self.detailed_info = detailed_info
         self.lanes = Lanes(task, count, paper_task(task) if reward_kind == "relative" else None)
 
-    def _pay(self, action: Array, info: dict[str, Array]) -> Array:
-        """Step the lanes and return the mean reward over the measurements of this decision."""
+    def _pay(
+        self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
+    ) -> Array:
+        """Step the lanes and return the mean reward over the measurements of this decision.
+
+        ``watch`` is called with the state after the action, once for each measurement.
+        """
         task = self.task
         rewards: list[Array] = []
 
@@ -74,6 +82,8 @@ class _Face:
                 batch_last = {"error": task.error(state), "cost": task.cost(state), **task.records(state)}
                 # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 info.update({name: task.xp.asarray(v.T, copy=True) for name, v in batch_last.items()})
+            if watch is not None:
+                watch(state)
 
         self.lanes.step(lambda state: task.act(state, action), record)
         total = rewards[0]
@@ -119,6 +129,14 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         self._open(make_task(task, control, scenario, **keywords), reward, 1, detailed_info)
         self.render_mode = render_mode
+        self.picture: EpisodePicture | None = None
+        """What keeps and draws the episode; None without a render mode."""
+        if render_mode is not None:
+            # Only here: matplotlib takes longer to import than an episode takes to run.
+            from . import rendering
+
+            name = find_scenario(type(self.task), scenario).name
+            self.picture = rendering.EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
         self.observation_space = _observation_space(self.task)
         self.action_space = self.task.action_space
 
@@ -129,6 +147,9 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         super().reset(seed=seed)
         self.lanes.seed(0, self.np_random)
         self.lanes.restart()
+        if self.picture is not None:
+            self.picture.begin(self.lanes.state)
+            self._show()
         return self.lanes.observe()[0], {}
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
@@ -137,9 +158,49 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._pay(self.lanes.widened(array[None]), info)
+        watch: Callable[[Any], None] | None = None
+        if self.picture is not None:
+            picture, shown = self.picture, self.lanes.observe()[0]
+
+            def watch(state: Any) -> None:
+                picture.keep(state, array, shown)
+
+        paid = self._pay(self.lanes.widened(array[None]), info, watch)
+        self._show()
         info = {name: values[0] for name, values in info.items()}
         return self.lanes.observe()[0], float(paid[0]), False, bool(self.lanes.finished[0]), info
+
+    def _show(self) -> None:
+        """Draw into the window of render mode "human"."""
+        if self.picture is not None and self.render_mode == "human":
+            self.picture.show(self.lanes.state)
+
+    def render(self) -> numpy.ndarray | None:
+        """Draw the episode so far.
+
+        Returns:
+            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
+            every reset and step anyway.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.picture is None:
+            gymnasium.logger.warn(
+                'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
+            )
+            return None
+        if self.lanes.state is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        if self.render_mode == "human":
+            self._show()
+            return None
+        return self.picture.frame(self.lanes.state)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.picture is not None:
+            self.picture.close()
 
 
 class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
