@@ -209,6 +209,9 @@ class Lanes:
             if due:
                 self._store(self._rows(due, [self._children[lane] for lane in due]), due)
         row = self._ring[self._clock % self._slots]
+        if not isinstance(row, numpy.ndarray):
+            # Autograd may keep it until the backward pass, when the ring has long been written over.
+            row = row.clone()
         self.state = self.task.measure(posterior, row)
         if self.paper is not None:
             self.paper_state = self.paper.measure(paper_posterior, row)
