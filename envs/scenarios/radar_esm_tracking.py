@@ -8,7 +8,7 @@ from typing import Any
 
 from ..task import Scenario
 
-_WINDOWS = {"early": (1, 20), "middle": (21, 60), "late": (61, 120), "all": (1, 120)}
+_WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120), "all": (1, 120)}
 
 _ANY_TARGET: dict[str, Any] = {
     "emitter": "fixed",
@@ -25,7 +25,7 @@ SCENARIOS: Mapping[str, Scenario] = {
     for scenario in (
         Scenario(
             "paper",
-            "The paper's experiment: 100 km, closing at 500 m/s, any class, emitter type drawn anew each time.",
+            "The paper's experiment: 100 km, closing at 500 m/s, any class, type drawn anew each time.",
             {},
             _WINDOWS,
         ),

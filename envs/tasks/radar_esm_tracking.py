@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy
 
 from ...filters import class_fusion, imm, singer
@@ -107,6 +106,7 @@ class RadarEsmTrackingParameters:
     def __post_init__(self) -> None:
         check.number("sampling_interval", self.sampling_interval, above=0.0)
         check.integer("horizon", self.horizon, at_least=1)
+        check.integer("decision_interval", self.decision_interval, at_least=1)
         check.integer("esm_period", self.esm_period, at_least=1)
         check.numbers("manoeuvrability", self.manoeuvrability, above=0.0)
         classes = len(self.manoeuvrability)
@@ -141,7 +141,9 @@ class RadarEsmTrackingParameters:
         for name in ("silence_start", "silence_end", "second_emitter_probability"):
             check.number(name, getattr(self, name), at_least=0.0, at_most=1.0)
         if self.silence_start + self.silence_end == 0.0:
-            raise ValueError("silence_start and silence_end must not both be 0: who radiates would be undefined")
+            raise ValueError(
+                "silence_start and silence_end must not both be 0: who radiates would be undefined"
+            )
         check.interval("second_emitter_separation", self.second_emitter_separation, above=0.0, at_most=180.0)
 
 
@@ -258,7 +260,7 @@ class RadarEsmTracking(Task[State]):
 
     | control | space | meaning |
     |---|---|---|
-    | `evidence` (default) | `Box(-1, 1, (3,))` | times `evidence_scale` nats, added to the log-posterior of each class; 0 is the paper's algorithm |
+    | `evidence` (default) | `Box(-1, 1, (3,))` | times `evidence_scale` nats, added to log P; 0: the paper |
     | `mode` | `Discrete(3)` | the class that is believed |
     | `weights` | `Box(0, 1, (3,))` | class probabilities, normalised; all zero is uniform |
 
@@ -268,10 +270,10 @@ class RadarEsmTracking(Task[State]):
 
     A flat `Box` of float64; `env.unwrapped.observation_fields` lists name, unit and scale of every component.
     For each class: the whitened innovations of range and range rate (the second is what the first does not
-    explain; their squares add to the normalised innovation squared), log(1 + normalised innovation squared),
+    explain; their squares add to the normalised innovation squared), log(1 + that square),
     exponential averages of these, the radar log-likelihood of this scan and its sum since the start, both
-    relative to the largest. Of the ESM: the decision (one-hot; with "none" and "refused by the gate", which is
-    shown beside the decision it refuses), counts of used and of refused decisions, the bearing difference
+    relative to the largest. Of the ESM: the decision (one-hot, or "none"; "refused by the gate" is shown
+    beside the decision it refuses), counts of used and of refused decisions, the bearing difference
     over the gate. The last weights and the time. Large values are compressed by sign(x) log(1 + |x|).
     Only differences between measurements and predictions enter: range and speed themselves do not.
 
@@ -284,8 +286,8 @@ class RadarEsmTracking(Task[State]):
 
     The first radar measurement (scan 0) starts all filters: its range and range rate, no acceleration, with
     variances `range_sigma`^2, `range_rate_sigma`^2, `acceleration_sigma`^2 of the class. The true
-    acceleration is drawn with the latter variance. The ESM decides at scan 0 too: that decision multiplies the
-    prior, and the first observation, of scan 1, holds it in the counts and in the last weights.
+    acceleration is drawn with the latter variance. The ESM decides at scan 0 too: that decision multiplies
+    the prior, and the first observation, of scan 1, holds it in the counts and in the last weights.
 
     ## Episode End
 
@@ -424,7 +426,7 @@ class RadarEsmTracking(Task[State]):
             Field("decision_refused", "1", "1 where the bearing gate refuses the decision", **over),
             *each_type("used_count", f"used {count}"),
             *each_type("refused_count", f"refused {count}"),
-            Field("bearing_difference", "1", "radar minus ESM bearing over the gate; 0 if no decision", **over),
+            Field("bearing_difference", "1", "radar minus ESM bearing over the gate", **over),
             *each("last_weight", "weight in force before this scan"),
             Field("time", "1", f"time since the start of the track over {TIME_SHOWN:g} s"),
         )
@@ -657,7 +659,12 @@ class RadarEsmTracking(Task[State]):
         bank = state.bank
         if self.mixes:
             result = class_fusion.advance(
-                bank.probabilities, bank.mean, bank.covariance, measurement, self.models, self.class_transition
+                bank.probabilities,
+                bank.mean,
+                bank.covariance,
+                measurement,
+                self.models,
+                self.class_transition,
             )
             mean, covariance, log_predicted, innovation, log_likelihood = result
         else:
@@ -701,14 +708,14 @@ class RadarEsmTracking(Task[State]):
             state.estimate_covariance,
         )
 
-    def _counted(self, used_counts: Array, refused_counts: Array, intercept: Intercept) -> tuple[Array, Array]:
+    def _counted(self, used: Array, refused: Array, intercept: Intercept) -> tuple[Array, Array]:
         """Counts of used and of refused decisions with this scan's."""
         one_hot = self._one_hot(intercept.decision, self.types)
-        used = self.xp.astype(intercept.used, one_hot.dtype) * one_hot
-        return used_counts + used, refused_counts + (one_hot - used)
+        accepted = self.xp.astype(intercept.used, one_hot.dtype) * one_hot
+        return used + accepted, refused + (one_hot - accepted)
 
     def _esm_log_likelihood(self, intercept: Intercept) -> Array:
-        """log pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
+        """Logarithm of pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
         usable = self.xp.where(intercept.used, intercept.decision, self.types)
         return self.xp.take(self.log_esm, usable, axis=1)
 
