@@ -8,7 +8,7 @@ theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/sing
 import math
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy
 
@@ -317,7 +317,7 @@ class RadarEsmTracking(Task[State]):
         Component("range_rate", "m/s"),
         Component("acceleration", "m/s^2"),
     )
-    modes = ("S0", "S1", "S2")
+    modes: tuple[str, ...] = ("S0", "S1", "S2")
     cost_description = (
         "mean of the squared errors of range, range rate and acceleration over range_sigma, range_rate_sigma "
         "and acceleration_scale"
@@ -404,13 +404,12 @@ class RadarEsmTracking(Task[State]):
         p = self.parameters
         average = f"exponential average over {p.averaging_scans:g} scans"
 
-        def each(name: str, description: str, **more: Any) -> list[Field]:
-            return [Field(f"{name}_{mode}", "1", description, **more) for mode in self.modes]
+        def each(name: str, description: str) -> list[Field]:
+            return [Field(f"{name}_{mode}", "1", description) for mode in self.modes]
 
-        def each_type(name: str, description: str, **more: Any) -> list[Field]:
-            return [Field(f"{name}_{j}", "1", description, **more) for j in range(self.types)]
+        def each_type(name: str, description: str, over: Literal["last", "mean"] = "last") -> list[Field]:
+            return [Field(f"{name}_{j}", "1", description, over) for j in range(self.types)]
 
-        over = {"over_interval": "mean"}
         count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
         return (
             *each("innovation_range", "whitened innovation of the range, signed log"),
@@ -421,12 +420,12 @@ class RadarEsmTracking(Task[State]):
             *each("accumulated_log_likelihood", "sum since the start minus the largest, nats, signed log"),
             *each("log_squared_innovation", "log(1 + normalised innovation squared)"),
             *each("average_log_squared_innovation", average),
-            *each_type("decision", "1 where the ESM decides for this emitter type", **over),
-            Field("decision_none", "1", "1 where the ESM decides nothing at this scan", **over),
-            Field("decision_refused", "1", "1 where the bearing gate refuses the decision", **over),
+            *each_type("decision", "1 where the ESM decides for this emitter type", "mean"),
+            Field("decision_none", "1", "1 where the ESM decides nothing at this scan", "mean"),
+            Field("decision_refused", "1", "1 where the bearing gate refuses the decision", "mean"),
             *each_type("used_count", f"used {count}"),
             *each_type("refused_count", f"refused {count}"),
-            Field("bearing_difference", "1", "radar minus ESM bearing over the gate", **over),
+            Field("bearing_difference", "1", "radar minus ESM bearing over the gate", "mean"),
             *each("last_weight", "weight in force before this scan"),
             Field("time", "1", f"time since the start of the track over {TIME_SHOWN:g} s"),
         )
