@@ -82,8 +82,12 @@ class RadarEsmTrackingParameters:
     """Nats that an evidence of one adds to a class's log-posterior (ours)."""
     averaging_scans: float = 10.0
     """Time constant of the exponential averages in the observation, scans (ours)."""
+    range_scale: float = 3000.0
+    """Error of the range that costs one, m (ours: the paper's radar error)."""
+    range_rate_scale: float = 20.0
+    """Error of the range rate that costs one, m/s (ours: the paper's radar error)."""
     acceleration_scale: float = 10.0
-    """Error of the acceleration that costs as much as one sigma of the radar, m/s^2 (ours)."""
+    """Error of the acceleration that costs one, m/s^2 (ours)."""
     initial_range: tuple[float, float] = (100e3, 100e3)
     """Limits of the range at the start, m (paper: 100 km)."""
     closing_speed: tuple[float, float] = (500.0, 500.0)
@@ -93,7 +97,7 @@ class RadarEsmTrackingParameters:
     emitter: str = "redrawn"
     """"redrawn": the type is drawn anew for every decision, as (8) assumes. "fixed": one type a target."""
     class_change: tuple[float, ...] = ()
-    """Limits of the time at which the class changes once, s; empty: never (ours)."""
+    """Limits of the time at which the class changes once, s, later than the first scan; empty: never (ours)."""
     silence_start: float = 0.0
     """Probability, at each ESM look, that a radiating target falls silent (ours)."""
     silence_end: float = 1.0
@@ -120,6 +124,8 @@ class RadarEsmTrackingParameters:
             "radar_bearing_sigma",
             "esm_bearing_sigma",
             "evidence_scale",
+            "range_scale",
+            "range_rate_scale",
             "acceleration_scale",
         ):
             check.number(name, getattr(self, name), above=0.0)
@@ -137,7 +143,8 @@ class RadarEsmTrackingParameters:
         check.choice("true_class", self.true_class, ("random", *(f"S{s}" for s in range(classes))))
         check.choice("emitter", self.emitter, ("redrawn", "fixed"))
         if self.class_change:
-            check.interval("class_change", self.class_change, at_least=0.0)
+            # The class at scan 0 must have governed one motion before it can change.
+            check.interval("class_change", self.class_change, above=self.sampling_interval)
         for name in ("silence_start", "silence_end", "second_emitter_probability"):
             check.number(name, getattr(self, name), at_least=0.0, at_most=1.0)
         if self.silence_start + self.silence_end == 0.0:
@@ -252,9 +259,12 @@ class RadarEsmTracking(Task[State]):
     next scan. The filters never feel it, and for the weights that an agent states outright the problem is
     myopic: a discount of 0 suffices.
 
-    ``paper`` redraws the emitter type for every decision, which is the assumption behind (8) and makes it
-    exactly Bayesian. A real target has one type: in ``fixed-type`` and all other scenarios the same rule
-    counts one fact again and again and grows sure of a wrong class.
+    `paper` redraws the emitter type for every decision, which is the assumption behind (8) and makes it
+    exactly Bayesian for the radar and the decisions that pass the gate. A real target has one type: in
+    `fixed-type` and all other scenarios the same rule counts one fact again and again and grows sure of a
+    wrong class.
+
+    Everything is linear, so range and speed of the target have no influence on any error.
 
     ## Action Space
 
@@ -279,7 +289,7 @@ class RadarEsmTracking(Task[State]):
 
     ## Rewards
 
-    Minus the mean of three squared errors: range over `range_sigma`, range rate over `range_rate_sigma`,
+    Minus the mean of three squared errors: range over `range_scale`, range rate over `range_rate_scale`,
     acceleration over `acceleration_scale`. Linear in the error beyond 10.
 
     ## Starting State
@@ -319,7 +329,7 @@ class RadarEsmTracking(Task[State]):
     )
     modes: tuple[str, ...] = ("S0", "S1", "S2")
     cost_description = (
-        "mean of the squared errors of range, range rate and acceleration over range_sigma, range_rate_sigma "
+        "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
         "and acceleration_scale"
     )
     huber_bound = 10.0
@@ -741,8 +751,8 @@ class RadarEsmTracking(Task[State]):
     def cost(self, state: State) -> Array:
         """Mean of the three squared errors over their scales."""
         p, error = self.parameters, self.error(state)
-        a = error[0] * (1.0 / p.range_sigma)
-        b = error[1] * (1.0 / p.range_rate_sigma)
+        a = error[0] * (1.0 / p.range_scale)
+        b = error[1] * (1.0 / p.range_rate_scale)
         c = error[2] * (1.0 / p.acceleration_scale)
         return (a * a + b * b + c * c) * (1.0 / 3.0)
 
@@ -755,7 +765,7 @@ class RadarEsmTracking(Task[State]):
         return state.estimate_covariance
 
     def records(self, state: State) -> dict[str, Array]:
-        """Class probabilities, the probability of the true class and its index, and the innovations' NIS.
+        """Class probabilities, the true class and its probability, reported variances, time and NIS.
 
         The NIS of the bank is the mean over the classes by their probability given the radar; where these are
         calibrated its expectation is 2, that of the true class's filter.
@@ -773,6 +783,11 @@ class RadarEsmTracking(Task[State]):
             "nis": nis,
             "true_class": xp.astype(state.truth.target_class, xp.float64),
             "true_class_probability": true_probability,
+            **{
+                f"variance_{component.name}": state.estimate_covariance[i, i]
+                for i, component in enumerate(self.components)
+            },
+            "seconds": xp.astype(state.scan, xp.float64) * self.parameters.sampling_interval,
         }
 
 
