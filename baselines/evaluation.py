@@ -7,31 +7,44 @@ import importlib
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
 from ..envs.catalogue import find_scenario, make_task, nearest, task_class
-from ..envs.lanes import Lanes
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from . import policies
 from .policy import Baselines
+from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
+from .tuning import tuned_policy
 
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
-Progress = Callable[[int], None]
+
+class TunedPolicy(NamedTuple):
+    """A policy with tuned values, some of which belong to the task."""
+
+    task_keywords: dict[str, Any]
+    control: str
+    make: Callable[[Task], Any]
+
+    def __call__(self, task: Task) -> Any:
+        """Make the policy for a task."""
+        return self.make(task)
 
 
 @cache
 def _all_baselines() -> dict[str, Baselines]:
     found = {}
     for module in pkgutil.iter_modules(policies.__path__):
-        task_module = importlib.import_module(f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}")
+        task_module = importlib.import_module(
+            f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}"
+        )
         found[task_module.TASK.id] = importlib.import_module(f"{policies.__name__}.{module.name}").BASELINES
     return found
 
@@ -41,7 +54,7 @@ def baselines_of(id: str) -> Baselines:
     return _all_baselines()[task_class(id).id]
 
 
-def load_policy(id: str, name: str) -> Callable[[Task], Any]:
+def load_policy(id: str, name: str) -> Any:
     """Return what makes a policy, reference estimator or bound for a task.
 
     Args:
@@ -55,6 +68,8 @@ def load_policy(id: str, name: str) -> Callable[[Task], Any]:
     for table in (known.policies, known.references, known.bounds):
         if name in table:
             return table[name]
+    if name.endswith("-tuned"):
+        return TunedPolicy(*tuned_policy(id, name.removesuffix("-tuned"), known.tunable))
     if ":" in name:
         module_name, _, attribute = name.partition(":")
         try:
@@ -65,10 +80,16 @@ def load_policy(id: str, name: str) -> Callable[[Task], Any]:
 
 
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
-    """Control that a run uses: the policy's own, unless it suits the one asked for."""
-    own = getattr(maker, "control", None)
+    """Control that a run uses: the policy's own, or the one that fits a model's action space."""
     if kind != "policy":
         return cls.controls[0]
+    own = getattr(maker, "control", None)
+    space = getattr(maker, "action_space", None)
+    if own is None and space is not None:
+        fitting = [c for c in cls.controls if make_task(cls.id, c).action_space == space]
+        if not fitting:
+            raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
+        own = control if control in fitting else fitting[0]
     if own is None:
         return control or cls.controls[0]
     if control is not None and own != control:
@@ -77,20 +98,15 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
 
 
 def _run_chunk(
-    task: Task, maker: Callable[[Task], Any], kind: str, seeds: Sequence[int], tick: Progress
+    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress
 ) -> dict[str, numpy.ndarray]:
     """Errors and records of some episodes, ``(episodes, time, ...)``."""
-    lanes = Lanes(task, len(seeds))
-    for lane, seed in enumerate(seeds):
-        lanes.seed(lane, numpy.random.default_rng(seed))
-    lanes.restart()
-    actor = maker(task)
     series: dict[str, list[numpy.ndarray]] = {}
 
     def keep(name: str, values: numpy.ndarray) -> None:
-        series.setdefault(name, []).append(numpy.moveaxis(values[..., : lanes.count], -1, 0))
+        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
-    def record(state: Any, _: Any = None) -> None:
+    def record(state: Any) -> None:
         error, covariance = task.error(state), task.covariance(state)
         keep("error", error)
         keep("cost", task.cost(state))
@@ -100,30 +116,11 @@ def _run_chunk(
             keep(name, values)
 
     if kind == "policy":
-        memory: Any = None
-        start = numpy.ones(lanes.count, dtype=bool)
-        for _ in range(lanes.decisions_per_episode):
-            action, memory = actor.predict(lanes.observe(), memory, start, deterministic=True)
-            applied = lanes.widened(numpy.asarray(action))
-            lanes.step(lambda state, applied=applied: task.act(state, applied), record)
-            start = numpy.zeros(lanes.count, dtype=bool)
-            tick(lanes.count * task.decision_interval)
+        run_policy(task, actor, seeds, record, tick)
+    elif kind == "reference":
+        run_reference(task, actor, seeds, record, tick)
     else:
-        memory = actor.start(lanes.state)
-        neutral = lanes.widened(numpy.zeros((lanes.count, *task.action_space.shape)))
-        for _ in range(lanes.decisions_per_episode):
-
-            def update(state: Any) -> Any:
-                nonlocal memory
-                if kind == "bound":
-                    mean_square, memory = actor.update(state, memory)
-                    keep("mean_square", mean_square)
-                    return task.act(state, neutral)
-                state, memory = actor.update(state, memory)
-                return state
-
-            lanes.step(update, record if kind == "reference" else None)
-            tick(lanes.count * task.decision_interval)
+        run_bound(task, actor, seeds, lambda mean_square: keep("mean_square", mean_square), tick)
     return {name: numpy.stack(values, axis=1) for name, values in series.items()}
 
 
@@ -142,7 +139,7 @@ def evaluate(
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        policies: names, or a mapping from a name to a class or object with a ``predict`` method.
+        policies: names, or a mapping from a name to a name, a class, or an object with a ``predict`` method.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
@@ -160,10 +157,17 @@ def evaluate(
         ValueError: for unknown names, or a policy that does not fit the control.
     """
     cls = task_class(env)
-    chosen = find_scenario(cls, scenario)
+    chosen = find_scenario(cls, scenario, keywords)
     known = baselines_of(cls.id)
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
     makers: dict[str, Any] = (
-        dict(policies) if isinstance(policies, Mapping) else {name: load_policy(cls.id, name) for name in policies}
+        {
+            name: load_policy(cls.id, entry) if isinstance(entry, str) else entry
+            for name, entry in policies.items()
+        }
+        if isinstance(policies, Mapping)
+        else {name: load_policy(cls.id, name) for name in policies}
     )
     if not makers:
         raise ValueError("name at least one policy")
@@ -171,20 +175,26 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: known.kind(name) for name in makers}
-    controls = {
-        name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()
-    }
+    controls: dict[str, str] = {}
+    tasks: dict[str, Task] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
-    tasks = {name: make_task(cls.id, controls[name], scenario, **keywords) for name in makers}
+    for name, maker in makers.items():
+        tuned_keywords = getattr(maker, "task_keywords", {})
+        controls[name] = _control_of(maker, kinds[name], control, cls, name)
+        tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
     for name, task in tasks.items():
-        if getattr(makers[name], "control", task.control) != task.control:
-            raise ValueError(f"policy {name!r} does not fit control {task.control!r}")
+        shown = getattr(getattr(makers[name], "observation_space", None), "shape", None)
+        if shown is not None and shown != (len(task.fields),):
+            raise ValueError(
+                f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
+                f"{len(task.fields)} fields"
+            )
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in makers.items():
         make = maker if callable(maker) else lambda _task, maker=maker: maker
         chunks = [
-            _run_chunk(tasks[name], make, kinds[name], seeds[i : i + CHUNK], tick)
+            _run_chunk(tasks[name], make(tasks[name]), kinds[name], seeds[i : i + CHUNK], tick)
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}

@@ -80,7 +80,7 @@ class RandomPolicy(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Draw from the action space with a generator of the policy's own."""
         generator = numpy.random.default_rng(self.seed) if state is None else state
-        space = self.task.action_space
+        space: Any = self.task.action_space
         if hasattr(space, "n"):
             return generator.integers(0, space.n, len(observation)), generator
         return generator.uniform(space.low, space.high, (len(observation), *space.shape)), generator
@@ -116,20 +116,38 @@ class Bound(Protocol):
 
 
 @dataclass(frozen=True)
+class Tunable:
+    """What can be tuned in a policy, and what a choice of values means."""
+
+    control: str
+    """The control of the policy."""
+    limits: Mapping[str, tuple[float, float]]
+    """Lower and upper limit of each value, in the order of the search."""
+    start: Mapping[str, float]
+    """The values in force without tuning."""
+    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]
+    """From values to keywords of the task and what makes the policy for it."""
+
+
+@dataclass(frozen=True)
 class Baselines:
     """What an environment is compared with: the table at the end of each module in :mod:`.policies`."""
 
-    policies: Mapping[str, Callable[[Task], Policy]]
-    references: Mapping[str, Callable[[Task], Any]] = field(default_factory=dict)
-    bounds: Mapping[str, Callable[[Task], Any]] = field(default_factory=dict)
+    policies: Mapping[str, Callable[[Any], Policy]]
+    references: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    bounds: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
     score_paper: str = ""
     """The policy whose score is 0."""
     score_bound: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
     """Names that the quick benchmark runs, in the order of the table."""
-    describe: Mapping[str, str] = field(default_factory=dict)
-    """One line for each name."""
+    tunable: Mapping[str, Tunable] = field(default_factory=dict)
+    """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    best_constant: str = ""
+    """The tunable policy that stands for the best constant action in the room table."""
+    metrics: Callable[[Any, Any], list[Any]] | None = None
+    """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
 
     def kind(self, name: str) -> str:
         """Return "policy", "reference" or "bound"."""

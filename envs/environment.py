@@ -1,8 +1,8 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
 import math
-from collections.abc import Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy
@@ -10,18 +10,27 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from .backend import array_backend, host_array, is_tensor, tensor_on
-from .catalogue import make_task, nearest
+from .catalogue import find_scenario, make_task, nearest
 from .lanes import Lanes
 from .reward import REWARDS, paper_task, reward
 from .task import Array, Field, Task
 from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from .rendering import EpisodePicture
 
 
 def _observation_space(task: Task) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (len(task.fields),), numpy.float64)
 
 
-def _checked_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
+def _all_finite(values: Array) -> bool:
+    # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
+    with numpy.errstate(over="ignore", invalid="ignore"):
+        return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
+
+
+def checked_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
     """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
     if is_tensor(action):
         array, values = action, action.detach()
@@ -40,8 +49,7 @@ def _checked_action(space: gymnasium.Space, action: Any, count: int | None) -> A
         return array
     assert space.shape is not None
     shape = space.shape if count is None else (count, *space.shape)
-    # The sum is finite unless an entry is not, and costs a third of asking for every entry.
-    if array.shape != shape or not real or not math.isfinite(values.sum()):
+    if array.shape != shape or not real or not _all_finite(values):
         raise _unexpected_action(f"finite actions of shape {shape}", values)
     return array
 
@@ -67,8 +75,13 @@ class _Face:
         self.detailed_info = detailed_info
         self.lanes = Lanes(task, count, paper_task(task) if reward_kind == "relative" else None)
 
-    def _pay(self, action: Array, info: dict[str, Array]) -> Array:
-        """Step the lanes and return the mean reward over the measurements of this decision."""
+    def _pay(
+        self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
+    ) -> Array:
+        """Step the lanes and return the mean reward over the measurements of this decision.
+
+        ``watch`` is called with the state after the action, once for each measurement.
+        """
         task = self.task
         rewards: list[Array] = []
 
@@ -76,9 +89,12 @@ class _Face:
             rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
             if self.detailed_info:
                 batch_last = {"error": task.error(state), "cost": task.cost(state), **task.records(state)}
-                info.update(
-                    {name: values.T if values.ndim == 2 else values for name, values in batch_last.items()}
-                )
+                # A copy: some of these arrays are the state's own, and the caller may overwrite them.
+                for name, values in batch_last.items():
+                    batch_first = values.T if values.ndim == 2 else values
+                    info[name] = task.xp.asarray(batch_first, copy=True)
+            if watch is not None:
+                watch(state)
 
         self.lanes.step(lambda state: task.act(state, action), record)
         total = rewards[0]
@@ -108,7 +124,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         ValueError: for an unknown name or a value out of its limits.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gymnasium.Env)
 
     def __init__(
         self,
@@ -124,6 +140,14 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         self._open(make_task(task, control, scenario, **keywords), reward, 1, detailed_info)
         self.render_mode = render_mode
+        self.picture: EpisodePicture | None = None
+        """What keeps and draws the episode; None without a render mode."""
+        if render_mode is not None:
+            # Only here: matplotlib takes longer to import than an episode takes to run.
+            from . import rendering
+
+            name = find_scenario(type(self.task), scenario).name
+            self.picture = rendering.EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
         self.observation_space = _observation_space(self.task)
         self.action_space = self.task.action_space
 
@@ -134,17 +158,60 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         super().reset(seed=seed)
         self.lanes.seed(0, self.np_random)
         self.lanes.restart()
+        if self.picture is not None:
+            self.picture.begin(self.lanes.state)
+            self._show()
         return self.lanes.observe()[0], {}
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
         if self.lanes.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        array = _checked_action(self.action_space, action, None)
+        array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._pay(self.lanes.widened(array[None]), info)
+        watch: Callable[[Any], None] | None = None
+        if self.picture is not None:
+            picture, shown = self.picture, self.lanes.observe()[0]
+
+            def watch(state: Any) -> None:
+                picture.keep(state, array, shown)
+
+        paid = self._pay(self.lanes.widened(array[None]), info, watch)
+        self._show()
         info = {name: values[0] for name, values in info.items()}
         return self.lanes.observe()[0], float(paid[0]), False, bool(self.lanes.finished[0]), info
+
+    def _show(self) -> None:
+        """Draw into the window of render mode "human"."""
+        if self.picture is not None and self.render_mode == "human":
+            self.picture.show(self.lanes.state)
+
+    def render(self) -> numpy.ndarray | None:
+        """Draw the episode so far.
+
+        Returns:
+            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
+            every reset and step anyway.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.picture is None:
+            gymnasium.logger.warn(
+                'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
+            )
+            return None
+        if self.lanes.state is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        if self.render_mode == "human":
+            self._show()
+            return None
+        return self.picture.frame(self.lanes.state)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.picture is not None:
+            self.picture.close()
 
 
 class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -163,7 +230,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             since the last reset; pass detached actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
-        max_episode_steps: truncate earlier than the task's horizon (Gymnasium passes it on from ``make_vec``).
+        max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
         detailed_info: whether ``info`` carries truth error, cost and what an evaluation records.
         **keywords: parameters of the task.
 
@@ -234,8 +301,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 or not mask.any()
             ):
                 raise ValueError(
-                    f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with at least "
-                    f"one True, got {mask!r}"
+                    f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
+                    f"at least one True, got {mask!r}"
                 )
             if self.lanes.state is None and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
@@ -259,25 +326,37 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         array = self._actions(actions)
         info: dict[str, Any] = {}
         paid = self._pay(self.lanes.widened(array), info)[: self.num_envs]
-        if self.detailed_info:
-            info = {name: values[: self.num_envs] for name, values in info.items()}
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self.lanes.restart(numpy.flatnonzero(waiting).tolist())
             paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
         finished = self.lanes.decisions >= self.last_decision
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
-            last = self.lanes.observe()
             done = numpy.flatnonzero(finished)
-            info = self._final_info(info, last, done)
+            info = self._masked(info, ~finished) | {
+                "final_obs": self._final_observations(self.lanes.observe(), done),
+                "_final_obs": self._mask(finished),
+                "final_info": self._masked(info, finished),
+                "_final_info": self._mask(finished),
+            }
             self.lanes.restart(done.tolist())
             self._finished = self._never
         else:
+            info = self._masked(info, ~waiting)
             self._finished = finished
         return self.lanes.observe(), paid, self._mask(self._never), self._mask(finished), info
 
+    def _masked(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
+        """Gymnasium's form of what some sub-environments report: a mask beside every key."""
+        if not mask.any():
+            return {}
+        masked = {}
+        for name, values in info.items():
+            masked[name], masked[f"_{name}"] = values[: self.num_envs], self._mask(mask)
+        return masked
+
     def _actions(self, actions: Any) -> Array:
-        array = _checked_action(self.single_action_space, actions, self.num_envs)
+        array = checked_action(self.single_action_space, actions, self.num_envs)
         if self.backend == "numpy":
             return host_array(array)
         tensor = tensor_on(array, self.device)
@@ -289,25 +368,15 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
         return lanes.copy() if self.backend == "numpy" else tensor_on(lanes, self.device)
 
-    def _final_info(self, info: dict[str, Any], last: Array, done: numpy.ndarray) -> dict[str, Any]:
-        """Gymnasium's form: objects for the finished ones, None elsewhere, and a mask beside every key.
+    def _final_observations(self, last: Array, done: numpy.ndarray) -> Array:
+        """Gymnasium's form: an object for each finished sub-environment, None elsewhere.
 
-        With the torch backend ``final_obs`` is one tensor, the last observation of every lane: taking it
-        apart would cost a transfer for each lane.
+        With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
+        transfer for each lane.
         """
-        mask = numpy.zeros(self.num_envs, dtype=bool)
-        mask[done] = True
-        final_obs = last
-        if self.backend == "numpy":
-            final_obs = numpy.full(self.num_envs, None, dtype=object)
-            for lane in done:
-                final_obs[lane] = last[lane]
-        final_info = {}
-        for name, values in info.items():
-            final_info[name], final_info[f"_{name}"] = values, self._mask(mask)
-        return {
-            "final_obs": final_obs,
-            "_final_obs": self._mask(mask),
-            "final_info": final_info,
-            "_final_info": self._mask(mask),
-        }
+        if self.backend != "numpy":
+            return last
+        final = numpy.full(self.num_envs, None, dtype=object)
+        for lane in done:
+            final[lane] = last[lane]
+        return final

@@ -38,8 +38,9 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     if isinstance(old, tuple):
         parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one.
-    merged = old.copy() if isinstance(old, numpy.ndarray) else old.clone()
+    # A copy, because states are never changed in place: someone may still hold the old one. In the type of
+    # the new one: float32 actions leave float32 in a state, and a fresh lane must not be rounded to it.
+    merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
     merged[..., lanes] = new[..., : len(lanes)]
     return merged
 
@@ -50,7 +51,7 @@ class Lanes:
     Args:
         task: the estimation problem; its namespace decides where arrays live.
         count: number of lanes.
-        paper: the same task under the control of the paper's algorithm, to be run on the same noise beside it.
+        paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
 
     Attributes:
         state: the task's state after the last measurement, lanes padded to a multiple of eight.
@@ -204,8 +205,8 @@ class Lanes:
     def _advance(self, posterior: Any, paper_posterior: Any) -> None:
         self._clock += 1
         if self._in_blocks:
-            due = numpy.flatnonzero((self._clock - self._started) % self._slots == 0)
-            if len(due):
+            due = numpy.flatnonzero((self._clock - self._started) % self._slots == 0).tolist()
+            if due:
                 self._store(self._rows(due, [self._children[lane] for lane in due]), due)
         row = self._ring[self._clock % self._slots]
         if not isinstance(row, numpy.ndarray):

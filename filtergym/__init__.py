@@ -1,7 +1,7 @@
 """Gymnasium environments for adaptive-filter benchmarking.
 
-``import filtergym`` registers every environment: ``gymnasium.make("filtergym/ManeuveringTarget-v0")``. Without
-an import of one's own, ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
+``import filtergym`` registers every environment: ``gymnasium.make("filtergym/ManeuveringTarget-v0")``.
+Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
 from .envs.catalogue import register

@@ -117,7 +117,13 @@ class ErrorMoments(NamedTuple):
 
 
 def propagate_error(
-    moments: ErrorMoments, displacement: Array, increment: Array, R: Array, alpha: Array, beta: Array, T: float
+    moments: ErrorMoments,
+    displacement: Array,
+    increment: Array,
+    R: Array,
+    alpha: Array,
+    beta: Array,
+    T: float,
 ) -> ErrorMoments:
     """Exact moments of the error over one scan, known gains, known manoeuvre of the target.
 

@@ -2,8 +2,9 @@
 
 For ``x(k) = F x(k-1) + w``, ``z = H x + v`` the information recursion of Tichavsky, Muravchik and Nehorai
 (1998) is the covariance recursion of the Kalman filter along the true states:
-``P' = F P F^T + Q``, ``P = (P'^-1 + H^T R^-1 H)^-1``. Written with covariances it needs no inverse of Q, which
-is singular wherever noise enters fewer directions than there are states (a pseudo-inverse would be wrong).
+``P' = F P F^T + Q``, ``P = (P'^-1 + H^T R^-1 H)^-1``. Written with covariances it needs no inverse of Q,
+which is singular wherever noise enters fewer directions than there are states (a pseudo-inverse would be
+wrong).
 """
 
 from .array_namespace import Array

@@ -6,6 +6,7 @@ the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``fi
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -18,11 +19,14 @@ from ...filters.gaussian import log_density
 from .. import parameters as check
 from ..controls import bank_action_space, bank_probabilities, signed_logarithm
 from ..scenarios.maneuvering_target import SCENARIOS
-from ..task import Array, Component, Field, NoiseLayout, PaperPolicy, Task
-from ..trajectory import flown_legs
+from ..task import Array, Component, Field, NoiseLayout, PaperPolicy, Scenario, Task
+from ..trajectory import Trajectory, flown_legs
 
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
+
+FARTHEST_RANGE = 500e3
+"""Metres; a user's trajectory beyond this is taken for a mistake of units."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +286,6 @@ class ManeuveringTarget(Task[State]):
         Component("velocity_y", "m/s"),
     )
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
-    modes = ("mode_1", "mode_2")
     cost_description = "squared position error over the squared range sigma"
     huber_bound = 60.0
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))
@@ -290,7 +293,11 @@ class ManeuveringTarget(Task[State]):
     parameters: ManeuveringTargetParameters
 
     def __init__(
-        self, parameters: ManeuveringTargetParameters, control: str, xp: ModuleType = numpy, device: Any = None
+        self,
+        parameters: ManeuveringTargetParameters,
+        control: str,
+        xp: ModuleType = numpy,
+        device: Any = None,
     ) -> None:
         super().__init__(parameters, control, xp, device)
         p = parameters
@@ -318,6 +325,32 @@ class ManeuveringTarget(Task[State]):
         else:
             self.action_space = bank_action_space(control, len(p.gains))
             self.fields = self._bank_fields()
+
+    @classmethod
+    def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
+        """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
+        interval = keywords.get("sampling_interval", ManeuveringTargetParameters.sampling_interval)
+        check.number("sampling_interval", interval, above=0.0)
+        farthest = float(numpy.hypot(*trajectory.position.T).max())
+        if farthest > FARTHEST_RANGE:
+            raise ValueError(
+                f"trajectory {trajectory.name!r} goes {farthest / 1e3:,.0f} km from the radar at the origin; "
+                f"its range ends at {FARTHEST_RANGE / 1e3:,.0f} km (positions are metres)"
+            )
+        scans = int(trajectory.duration / interval + 1e-9)
+        if scans < 2:
+            raise ValueError(
+                f"trajectory {trajectory.name!r} lasts {trajectory.duration:g} s, which is less than two scans "
+                f"of {interval:g} s: give a smaller sampling_interval"
+            )
+        horizon = keywords.get("horizon", scans)
+        track = trajectory.resampled(interval, horizon + 2)
+        return Scenario(
+            trajectory.name,
+            "A flight given by its positions.",
+            {"flight": "track", "horizon": horizon, "track": tuple(map(tuple, track.tolist()))},
+            {"all": (1, horizon)},
+        )
 
     # --- what the agent is shown
 
@@ -386,7 +419,9 @@ class ManeuveringTarget(Task[State]):
         relative = estimator.log_likelihood - xp.max(estimator.log_likelihood, axis=0)
         normalised, average = estimator.innovation / sigma, estimator.average_innovation
         compressed = signed_logarithm(
-            xp.concat([normalised[0], normalised[1], average[0], average[1], relative, estimator.log_predicted]),
+            xp.concat(
+                [normalised[0], normalised[1], average[0], average[1], relative, estimator.log_predicted]
+            ),
             xp,
         )
         m = len(self.modes)
@@ -444,9 +479,7 @@ class ManeuveringTarget(Task[State]):
         if self.control == "gain":
             covariance = alpha_beta.Covariance(variance, zero, velocity_variance)
             alpha = sum(self.parameters.alpha_range) / 2.0 * ones
-            return AlphaBeta(
-                position, velocity, covariance, zero, variance, zero, zero[0], zero[0], alpha
-            )
+            return AlphaBeta(position, velocity, covariance, zero, variance, zero, zero[0], zero[0], alpha)
         m = len(self.modes)
         mean = xp.concat([position, velocity])
         diagonal = xp.concat([variance, velocity_variance])
@@ -487,8 +520,8 @@ class ManeuveringTarget(Task[State]):
         duration = xp.where(flown, drawn_integer(p.maneuver_duration, draws[0]), 0.0)
         # Sorted starts within the time that the manoeuvres leave free, each moved on by those before it.
         order = xp.sort(xp.where(flown, draws[1], 2.0), axis=0)
-        busy = duration[0] if self.slots else None
-        for m in range(1, self.slots):
+        busy = 0.0 * count
+        for m in range(self.slots):
             busy = busy + duration[m]
         acceleration = between(p.maneuver_acceleration, draws[2])
         direction = 2.0 * math.pi * draws[3]
@@ -525,7 +558,7 @@ class ManeuveringTarget(Task[State]):
             now = turned + (T * duration[m]) * vector
         if not columns:
             empty = xp.reshape(uniforms[:0], (0, uniforms.shape[-1]))
-            return position, velocity, Maneuvers(*[empty] * 6, xp.stack([empty, empty]))
+            return position, velocity, Maneuvers(*[empty] * 6, xp.stack([empty, empty]))  # type: ignore[call-arg]
         parts = [xp.stack([column[i] for column in columns], axis=-2) for i in range(7)]
         return position, velocity, Maneuvers(*parts)
 
@@ -533,7 +566,8 @@ class ManeuveringTarget(Task[State]):
         """True position and velocity at the next scan."""
         xp, T = self.xp, self.T
         if state.maneuvers is None:
-            row = xp.clip(xp.astype(scan, xp.int64), None, self.table.shape[1] - 1)
+            last = int(self.table.shape[1]) - 1
+            row = xp.clip(xp.astype(scan, xp.int64), None, last)
             return self.table[:2, row], self.table[2:, row]
         m = state.maneuvers
         position, velocity = state.position + T * state.velocity, state.velocity
