@@ -42,6 +42,7 @@ from typing import NamedTuple
 
 import numpy
 
+from . import singer
 from .array_namespace import Array, namespace
 from .extended_kalman import JacobianRow
 
@@ -54,48 +55,6 @@ ATTITUDE_ERROR = slice(11, 14)
 ATTITUDE_RATE = slice(14, 17)
 SIZE = 17
 """Number of states."""
-
-
-def singer_transition(alpha: float, T: float) -> Array:
-    """Transition matrix of Singer's model on (x, v, a), ``(3, 3)``.
-
-    ``[[1, T, (aT - 1 + e^-aT) / a^2], [0, 1, (1 - e^-aT) / a], [0, 0, e^-aT]]`` for alpha = a > 0; the first
-    row by its series, because the closed form cancels for small alpha T.
-
-    Args:
-        alpha: reciprocal of the correlation time of the acceleration, 1/s.
-        T: interval, s.
-    """
-    position, velocity, acceleration = singer_impulse_response(alpha, numpy.array(T))
-    return numpy.array([[1.0, T, position], [0.0, 1.0, velocity], [0.0, 0.0, acceleration]])
-
-
-def singer_impulse_response(alpha: float, time: Array) -> Array:
-    """Position, velocity and acceleration a time after a unit acceleration, ``(3, ...)``."""
-    y = alpha * time
-    term = y**2 / 2.0
-    series = term
-    for n in range(3, 25):
-        term = -term * y / n
-        series = series + term
-    position = numpy.where(y < 1.0, series, y + numpy.expm1(-y)) / alpha**2
-    return numpy.stack([position, -numpy.expm1(-y) / alpha, numpy.exp(-y)])
-
-
-def singer_process_noise(alpha: float, sigma: float, T: float) -> Array:
-    """Covariance of Singer's model over one interval on (x, v, a), ``(3, 3)``.
-
-    ``Q = 2 alpha sigma^2 int_0^T g(s) g(s)^T ds`` with the impulse response g, by Gauss-Legendre quadrature:
-    every term is positive, so nothing cancels, where the closed form loses all digits for small alpha T.
-
-    Args:
-        alpha: reciprocal of the correlation time of the acceleration, 1/s.
-        sigma: stationary standard deviation of the acceleration, m/s^2.
-        T: interval, s.
-    """
-    nodes, weights = numpy.polynomial.legendre.leggauss(24)
-    g = singer_impulse_response(alpha, 0.5 * T * (nodes + 1.0))
-    return alpha * sigma**2 * T * (g * weights) @ g.T
 
 
 class AxisModel(NamedTuple):
@@ -133,19 +92,8 @@ def constant_velocity_model(T: float, increment_sigma: float, acceleration_sigma
 
 
 def singer_model(T: float, alpha: float, sigma: float) -> AxisModel:
-    """Hypothesis 3: Singer's manoeuvre; see :func:`singer_transition` and :func:`singer_process_noise`."""
-    return AxisModel(singer_transition(alpha, T), singer_process_noise(alpha, sigma, T))
-
-
-def singer_sigma(largest: float, probability_largest: float, probability_zero: float) -> float:
-    """Standard deviation of a manoeuvre by Singer's rule, ``sqrt(A^2 (1 + 4 P_max - P_0) / 3)``, m/s^2.
-
-    Args:
-        largest: largest acceleration A, m/s^2.
-        probability_largest: probability of +A, and of -A.
-        probability_zero: probability of no acceleration.
-    """
-    return float(largest * numpy.sqrt((1.0 + 4.0 * probability_largest - probability_zero) / 3.0))
+    """Hypothesis 3: Singer's manoeuvre; see :mod:`.singer`."""
+    return AxisModel(singer.transition(alpha, T), singer.process_noise(alpha, sigma, T))
 
 
 class CommonModel(NamedTuple):

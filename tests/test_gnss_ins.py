@@ -4,7 +4,7 @@ import math
 
 import numpy
 import pytest
-from filtergym.filters import extended_kalman, geodesy, gnss_ins, satellites
+from filtergym.filters import extended_kalman, geodesy, gnss_ins, satellites, singer
 
 SITE = (math.radians(53.9), math.radians(27.5667), 220.0)
 SLOTS = (1, 11, 19, 20)
@@ -111,25 +111,11 @@ def test_degenerate_geometry_is_refused():
         satellites.earth_fixed_orbits((25,), numpy.zeros(1))
 
 
-def test_singer_golden_numbers():
-    Q = gnss_ins.singer_process_noise(1 / 20, 1.0, 1.0)
-    golden = [0.0048635570, 0.0120918768, 0.0158558056, 0.0321119868, 0.0475713807, 0.0951625820]
-    # Ten decimals are given.
-    numpy.testing.assert_allclose(Q[numpy.triu_indices(3)], golden, atol=5.1e-11)
-    assert gnss_ins.singer_process_noise(0.01, 1.0, 0.01)[0, 0] == pytest.approx(1.0e-13, rel=2e-4)
-    Q = gnss_ins.singer_process_noise(0.05, 18.0, 0.01)
+def test_singer_model_of_the_experiment():
+    axis = gnss_ins.singer_model(0.01, 0.05, 18.0)
     printed = [1.61955e-10, 4.04865e-08, 5.39730e-06, 1.07960e-05, 1.61919e-03, 0.323838]
-    numpy.testing.assert_allclose(Q[numpy.triu_indices(3)], printed, rtol=5e-6)  # six digits
-    assert gnss_ins.singer_sigma(30.0, 0.1, 0.32) == pytest.approx(18.0, rel=1e-14)
-
-
-@pytest.mark.parametrize("step", [1e-3, 0.3, 7.0])
-def test_singer_models_compose(step):
-    """Two steps are one of twice the length: holds only if F and Q are exact."""
-    F, Q = gnss_ins.singer_transition(0.4, step), gnss_ins.singer_process_noise(0.4, 2.0, step)
-    F2, Q2 = gnss_ins.singer_transition(0.4, 2 * step), gnss_ins.singer_process_noise(0.4, 2.0, 2 * step)
-    numpy.testing.assert_allclose(F @ F, F2, rtol=1e-13, atol=1e-300)
-    numpy.testing.assert_allclose(F @ Q @ F.T + Q, Q2, rtol=1e-13)
+    numpy.testing.assert_allclose(axis.noise[numpy.triu_indices(3)], printed, rtol=5e-6)  # six digits
+    assert singer.acceleration_sigma(30.0, 0.1, 0.32) == pytest.approx(18.0, rel=1e-14)
 
 
 def test_clock_keeps_its_correlation_and_rates_are_stationary():
@@ -149,7 +135,7 @@ def test_advance_is_the_sparse_transition(seed):
         [
             gnss_ins.rest_model(0.1, 0.01, 0.05).transition,
             gnss_ins.constant_velocity_model(0.1, 0.3, 0.05).transition,
-            gnss_ins.singer_transition(0.5, 0.1),
+            singer.transition(0.5, 0.1),
         ],
         axis=-1,
     )[..., None]

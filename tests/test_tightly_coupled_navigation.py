@@ -221,7 +221,7 @@ def test_other_numbers_of_satellites(slots):
         ({"satellites": (1, 11, 19, 25)}, "1 to 24"),
         ({"transition": ((0.9, 0.2, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "must sum to 1"),
         ({"initial_probabilities": (0.5, 0.5)}, "3 numbers"),
-        ({"pseudorange_sigma": 0.0}, "pseudorange_sigma must be a finite number and above 0"),
+        ({"pseudorange_sigma": 0.0}, "pseudorange_sigma must be a finite number above 0"),
         ({"singer_sigma": -1.0}, "singer_sigma"),
         ({"course": "loop"}, "course must be one of"),
         ({"leg_steps": (2000, 1000)}, "ascending"),
