@@ -61,7 +61,7 @@ def naive_bank(task, state, posterior):
             numpy.eye(17)[:, :, None, None], task.axis[:, :, i : i + 1], p.T, task.common.decay
         )[..., 0, 0]
         mean, P = F @ mean, F @ P @ F.T + task.process_noise[:, :, i, 0]
-        position, velocity = task._satellites(state)
+        position, velocity = task.satellites_now(state)
         expected, rows = gnss_ins.observe(mean[:, None], position, velocity, state.ins_angles, p.gravity)
         H = extended_kalman.dense(rows, mean[:, None])[..., 0]
         nu = (state.measurement - expected)[:, 0]

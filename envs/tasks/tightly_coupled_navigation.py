@@ -415,7 +415,7 @@ class TightlyCoupledNavigation(Task[State]):
         Component("clock_drift", "m/s"),
         *(Component(f"acceleration_{axis}", "m/s^2") for axis in ("east", "north", "up")),
         *(Component(f"{angle}_error", "rad") for angle in ("heading", "pitch", "roll")),
-        *(Component(f"{angle}_error_rate", "rad/s") for angle in ("heading", "pitch", "roll")),
+        *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
     groups: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "position": ("position_east", "position_north", "position_up"),
@@ -698,7 +698,7 @@ class TightlyCoupledNavigation(Task[State]):
         steering = chain.probabilities[0] * mean[:, 0]
         for i in range(1, len(HYPOTHESES)):
             steering = steering + chain.probabilities[i] * mean[:, i]
-        expected = gnss_ins.ranges(steering, gnss_ins.geometry(steering, *self._satellites(state)))
+        expected = gnss_ins.ranges(steering, gnss_ins.geometry(steering, *self.satellites_now(state)))
         innovation = state.measurement[: 2 * S] - xp.concat(expected, axis=0)
         state = state._replace(
             predicted_mean=mean,
@@ -712,9 +712,9 @@ class TightlyCoupledNavigation(Task[State]):
             available = xp.concat([state.available[: 2 * S] * kept, state.available[2 * S :]], axis=0)
             state = state._replace(available=available)
         update = self._update(state, self.sensor_variance)
-        nis = xp.stack([self._total(update.squared_residuals[g]) for g in self.sensor_groups])
+        nis = xp.stack([self.total(update.squared_residuals[g]) for g in self.sensor_groups])
         present = [
-            xp.clip(self._total([state.available[j] for j in range(g.start, g.stop)]), 1.0, None)
+            xp.clip(self.total([state.available[j] for j in range(g.start, g.stop)]), 1.0, None)
             for g in self.sensor_groups
         ]
         nis_per_observation = nis / xp.stack(present)[:, None]
@@ -727,13 +727,14 @@ class TightlyCoupledNavigation(Task[State]):
         )
 
     @staticmethod
-    def _total(terms: Any) -> Array:
+    def total(terms: Any) -> Array:
+        """Sum of a sequence of arrays, term by term: its rounding does not depend on their width."""
         total = terms[0]
         for term in terms[1:]:
             total = total + term
         return total
 
-    def _satellites(self, state: State) -> tuple[Array, Array]:
+    def satellites_now(self, state: State) -> tuple[Array, Array]:
         """Positions and velocities of the satellites at the present measurement, ``(3, S, N)`` each."""
         now = self._now(state)
         return (
@@ -747,7 +748,7 @@ class TightlyCoupledNavigation(Task[State]):
 
     def _update(self, state: State, variance: Any) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
-        position, velocity = self._satellites(state)
+        position, velocity = self.satellites_now(state)
         expected, rows = gnss_ins.observe(
             state.predicted_mean,
             position[:, :, None],
@@ -814,7 +815,7 @@ class TightlyCoupledNavigation(Task[State]):
         xp, p, S, m = self.xp, self.parameters, self.satellites, self.observations
         k = xp.astype(state.clock, noise.dtype)
         ins_angles = self.true_angles + state.truth[gnss_ins.ATTITUDE_ERROR]
-        exact, _ = gnss_ins.observe(state.truth, *self._satellites(state), ins_angles, p.gravity)
+        exact, _ = gnss_ins.observe(state.truth, *self.satellites_now(state), ins_angles, p.gravity)
 
         slots = self.constant([float(i) for i in range(S)])[:, None]
         fault = state.rate_fault
@@ -886,7 +887,7 @@ class TightlyCoupledNavigation(Task[State]):
         available = state.available
         counts = xp.stack(
             [
-                xp.clip(self._total([available[j] for j in range(g.start, g.stop)]), 1.0, None)
+                xp.clip(self.total([available[j] for j in range(g.start, g.stop)]), 1.0, None)
                 for g in self.sensor_groups
             ]
         )[:, None]
@@ -968,17 +969,18 @@ class TightlyCoupledNavigation(Task[State]):
         return state.covariance
 
     def records(self, state: State) -> dict[str, Array]:
-        """Probabilities, NIS of the combination and its degrees, true hypothesis, rates off the aperture."""
+        """Probabilities, NIS of the combination and its degrees, time, true hypothesis, rates off the aperture."""
         xp, p, S = self.xp, self.parameters, self.satellites
-        nis = self._total([state.nis[i] for i in range(len(GROUPS))])
+        nis = self.total([state.nis[i] for i in range(len(GROUPS))])
         beyond = xp.abs(state.range_innovation[S:]) > p.rate_aperture
         outside = beyond[0]
         for j in range(1, S):
             outside = outside | beyond[j]
         return {
             "mode_probability": state.probabilities,
-            "nis": self._total([state.probabilities[i] * nis[i] for i in range(len(HYPOTHESES))]),
-            "nis_degrees": self._total([state.available[j] for j in range(self.observations)]),
+            "nis": self.total([state.probabilities[i] * nis[i] for i in range(len(HYPOTHESES))]),
+            "nis_degrees": self.total([state.available[j] for j in range(self.observations)]),
+            "seconds": p.T * state.clock,
             "true_mode": state.mode,
             "rate_outside_aperture": xp.astype(outside, state.truth.dtype),
         }
