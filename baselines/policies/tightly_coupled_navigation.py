@@ -94,12 +94,12 @@ class FixedGain(ConstantPolicy):
 
     Args:
         task: the problem.
-        action: of the control "gain".
+        action: of the control "gain"; by default the accelerometers are as good as switched off.
     """
 
     control = "gain"
 
-    def __init__(self, task: Task, action: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> None:
+    def __init__(self, task: Task, action: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0)) -> None:
         super().__init__(task)
         self.action = action
 
@@ -151,6 +151,36 @@ class NisAdaptive(Policy):
         return numpy.clip(numpy.stack(action, axis=1), -1.0, 1.0), None
 
 
+class StuckCheck(NisAdaptive):
+    """Accelerometers that repeat their last reading exactly are switched off; otherwise as told by the NIS.
+
+    Noise never repeats itself, so a reading held over a whole decision is a stuck sensor for certain; until
+    the decision after it sticks the filter trusts it.
+    """
+
+    def __init__(
+        self,
+        task: TightlyCoupledNavigation,
+        threshold: float = 3.0,
+        rates: float = 0.0,
+        accelerometers: float = 0.0,
+        base: float = 0.0,
+    ) -> None:
+        super().__init__(task, threshold, rates, accelerometers, base)
+        self.readings = task.columns([f"accelerometer_{axis}" for axis in ("forward", "right", "down")])
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Compare with the readings of the last decision."""
+        action, _ = super().act(observation, None, start)
+        readings = observation[:, self.readings]
+        if state is not None:
+            stuck = (readings == state).all(axis=1) & ~start
+            action[:, GROUPS.index("accelerometers")] = numpy.where(
+                stuck, 1.0, action[:, GROUPS.index("accelerometers")]
+            )
+        return action, readings
+
+
 # --- reference estimator and bound
 
 
@@ -195,9 +225,7 @@ class _KnownMode:
         moved = xp.concat(
             [track.mean[:8], xp.where(lanes, 0.0 * track.mean[8:11], track.mean[8:11]), track.mean[11:]]
         )
-        return track._replace(
-            mean=moved, covariance=_replaced(track.covariance, variance, self.task, lanes)
-        )
+        return track._replace(mean=moved, covariance=_replaced(track.covariance, variance, self.task, lanes))
 
     def predicted(self, state: State, track: _Track, noises: Array, variance: float) -> _Track:
         """Prediction to the present measurement.
@@ -279,9 +307,7 @@ class KnownMode(_KnownMode):
     def reported(self, state: State, track: _Track, update: extended_kalman.Correction) -> State:
         """State that reports this filter, and whose tracking loops are steered by it."""
         xp, task, M = self.task.xp, self.task, len(HYPOTHESES)
-        certain = xp.astype(
-            xp.arange(M, device=state.mode.device)[:, None] == state.mode, track.mean.dtype
-        )
+        certain = xp.astype(xp.arange(M, device=state.mode.device)[:, None] == state.mode, track.mean.dtype)
         nis = xp.stack([task.total(update.squared_residuals[g]) for g in task.sensor_groups])
         return state._replace(
             estimate=track.mean,
@@ -477,7 +503,8 @@ def _measures(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
 
 
 def _fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    action = tuple(values[group] for group in GROUPS)
+    # The other two groups change nothing that can be measured.
+    action = tuple(values.get(group, 0.0) for group in GROUPS)
     return {}, lambda task: FixedGain(task, action)
 
 
@@ -485,22 +512,30 @@ def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any]
     return {"transition": chain(1.0 - 10.0 ** values["log10_leave"])}, MultiHypothesis
 
 
-def _nis_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    return {}, lambda task: NisAdaptive(task, **values)
+def _adaptive(
+    cls: type[NisAdaptive],
+) -> Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]:
+    return lambda values: ({}, lambda task: cls(task, **values))
 
 
 TUNABLE = {
     "fixed-gain": Tunable(
         "gain",
-        {"pseudoranges": (-0.5, 0.5), "rates": (-0.5, 0.5), "accelerometers": (0.0, 1.0), "attitude": (-0.5, 0.5)},
-        {group: 0.0 for group in GROUPS},
+        {"rates": (-0.2, 0.3), "accelerometers": (0.0, 1.0)},
+        {"rates": 0.0, "accelerometers": 0.8},
         _fixed_gain,
     ),
     "nis-adaptive": Tunable(
         "gain",
         {"threshold": (0.5, 10.0), "rates": (0.0, 2.0), "accelerometers": (0.0, 4.0), "base": (0.0, 1.0)},
         {"threshold": 3.0, "rates": 1.0, "accelerometers": 1.0, "base": 0.0},
-        _nis_adaptive,
+        _adaptive(NisAdaptive),
+    ),
+    "stuck-check": Tunable(
+        "gain",
+        {"threshold": (0.5, 10.0), "rates": (0.0, 2.0)},
+        {"threshold": 3.0, "rates": 0.0},
+        _adaptive(StuckCheck),
     ),
     "sticky": Tunable("evidence", {"log10_leave": (-6.0, -0.5)}, {"log10_leave": -4.0}, _sticky),
 }
@@ -510,6 +545,7 @@ BASELINES = Baselines(
         "multi-hypothesis": MultiHypothesis,
         "sticky": Sticky,
         "nis-adaptive": NisAdaptive,
+        "stuck-check": StuckCheck,
         "fixed-gain": FixedGain,
         "singer": Singer,
         "constant-velocity": ConstantVelocity,
@@ -526,6 +562,8 @@ BASELINES = Baselines(
         "multi-hypothesis",
         "sticky",
         "nis-adaptive",
+        "stuck-check",
+        "fixed-gain",
         "singer",
         "constant-velocity",
         "rest",
