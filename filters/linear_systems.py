@@ -111,12 +111,12 @@ def unobserved_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[com
     """
     modes = []
     for value in numpy.linalg.eigvals(F):
-        limit = value.real if continuous else abs(value) - 1.0
-        if limit > -_MARGIN:
+        growth = value.real if continuous else abs(value) - 1.0
+        if growth > -_MARGIN:
             stacked = numpy.vstack([F - value * numpy.eye(len(F)), H])
             smallest = numpy.linalg.svd(stacked, compute_uv=False)[-1]
             # The square root of the rounding: double eigenvalues are known no better.
-            if smallest < 1e-7 * max(1.0, numpy.linalg.norm(stacked, 2)):
+            if smallest < 1e-7 * max(1.0, float(numpy.linalg.norm(stacked, 2))):
                 modes.append(complex(value))
     return modes
 

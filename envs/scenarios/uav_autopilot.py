@@ -9,14 +9,14 @@ from collections.abc import Mapping
 from ..task import Scenario
 
 _RANDOM = {
-    "command_amplitude": (0.5, 2.0),
+    "command_amplitude": (0.25, 1.0),
     "disturbance_levels": ((0.25, 4.0), (0.25, 4.0), (0.25, 4.0)),
     "disturbance_times": ((100, 250), (350, 500)),
     "sensor_levels": ((0.5, 2.0), (0.5, 5.0)),
     "sensor_times": ((150, 450),),
     "dropouts": 2,
 }
-_NOMINAL_WITH_COMMANDS = {"command_amplitude": (0.5, 2.0)}
+_NOMINAL_WITH_COMMANDS = {"command_amplitude": (0.25, 1.0)}
 
 SCENARIOS: Mapping[str, Scenario] = {
     scenario.name: scenario

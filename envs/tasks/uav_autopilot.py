@@ -78,7 +78,7 @@ _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Parameters:
+class UavAutopilotParameters:
     """Constants of the plant, the autopilot, the filter and the episode. None stands for the plant's value.
 
     Sources: "paper" is the paper; "Aerosonde" are textbook coefficients (Beard and McLain, Small Unmanned
@@ -293,7 +293,7 @@ class Model(NamedTuple):
     """Covariance of the rest, ``(n, n)``."""
 
 
-def constant_rate(parameters: Parameters) -> Model:
+def constant_rate(parameters: UavAutopilotParameters) -> Model:
     """Plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
 
     Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
@@ -305,7 +305,7 @@ def constant_rate(parameters: Parameters) -> Model:
     return Model(numpy.array([[1.0, T], [0.0, 1.0]]), B, Q, numpy.zeros((2, 2)))
 
 
-def pitch_channel(parameters: Parameters, actuator_lag: float = 1.0) -> Model:
+def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Model:
     """Plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
 
     With the aerodynamic angle ``a = incidence + gust``:
@@ -361,7 +361,7 @@ class Design(NamedTuple):
     """Of the state in the nominal loop without command, ``(n, n)``."""
 
 
-def design(parameters: Parameters) -> Design:
+def design(parameters: UavAutopilotParameters) -> Design:
     """Design the loop.
 
     Raises:
@@ -484,14 +484,14 @@ class UavAutopilot(Task[State]):
     its square, the reading, and whether it answered; the log NIS per reading and that of its short average;
     the command, the control in force, the log trace of the covariance, the time, the last action.
     Innovations, command, control and readings are compressed by ``sign(x) log(1 + |x|)`` in units of one
-    sigma of a sensor. Sigmas are those of the filter before it is acted on: its last covariance, predicted with the Q
-    of the last action.
+    sigma of a sensor. Sigmas are those of the filter before it is acted on: its last covariance, predicted
+    with the Q of the last action.
 
     ## Rewards
 
     Minus the quadratic cost of the loop at this measurement,
-    ``((x - x_r)^T W (x - x_r) + R u^2) / sigma^2``, with the equilibrium ``x_r`` of the command (output r,
-    all else zero), the control that follows from the estimate, and sigma the nominal standard deviation of the
+    ``((x - x_r)^T W (x - x_r) + R u^2) / sigma^2``. ``x_r`` is the equilibrium of the command (output r, all
+    else zero), u the control that follows from the estimate, sigma the nominal standard deviation of the
     output's sensor (U: 0.5 deg; P: 1 m). Beyond the Huber bound it grows linearly. An action shows at once in
     the control and later in the tracking error: the problem is not myopic.
 
@@ -506,8 +506,9 @@ class UavAutopilot(Task[State]):
     ## Arguments
 
     ``plant``, ``control``, ``scenario`` (``random``, ``paper-noise``, ``paper-step``; held out:
-    ``gust-front``, ``sensor-degradation``, ``actuator-lag``), and every field of ``Parameters``. Refused, with the reason: an
-    L that does not stabilise the plant, noise that is not positive, sensors that do not determine the state.
+    ``gust-front``, ``sensor-degradation``, ``actuator-lag``), and every field of
+    :class:`UavAutopilotParameters`. Refused, with the reason: an L that does not stabilise the plant, noise
+    that is not positive, sensors that do not determine the state.
 
     ## Version History
 
@@ -520,18 +521,18 @@ class UavAutopilot(Task[State]):
         "unmanned aircraft using optimal Kalman filter"
     )
     controls = ("gain", "mode")
-    Parameters = Parameters
+    Parameters = UavAutopilotParameters
     scenarios: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     components = tuple(Component(*c) for c in COORDINATES["U"])
     cost_description = (
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"
     )
-    huber_bound = 60.0
+    huber_bound = 30.0
     paper_policy = PaperPolicy("gain", (0.0,))
 
     def __init__(
-        self, parameters: Parameters, control: str, xp: ModuleType = numpy, device: Any = None
+        self, parameters: UavAutopilotParameters, control: str, xp: ModuleType = numpy, device: Any = None
     ) -> None:
         """Design the loop and lay out noise, observation and action."""
         super().__init__(parameters, control, xp, device)
