@@ -1,0 +1,255 @@
+"""Monte Carlo evaluation: every policy, reference estimator and bound on identical noise.
+
+The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+import numpy
+import xarray
+
+from ..envs.catalogue import find_scenario, make_task, nearest, task_class
+from ..envs.lanes import Lanes
+from ..envs.reward import capped_cost
+from ..envs.task import Scenario, Task
+from ..filters.gaussian import log_density
+from . import policies
+from .policy import Baselines
+from .seeds import episode_seeds
+
+CHUNK = 2048
+"""Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
+
+Progress = Callable[[int], None]
+
+
+@cache
+def _all_baselines() -> dict[str, Baselines]:
+    found = {}
+    for module in pkgutil.iter_modules(policies.__path__):
+        task_module = importlib.import_module(
+            f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}"
+        )
+        found[task_module.TASK.id] = importlib.import_module(f"{policies.__name__}.{module.name}").BASELINES
+    return found
+
+
+def baselines_of(id: str) -> Baselines:
+    """Return what an environment is compared with."""
+    return _all_baselines()[task_class(id).id]
+
+
+def load_policy(id: str, name: str) -> Callable[[Task], Any]:
+    """Return what makes a policy, reference estimator or bound for a task.
+
+    Args:
+        id: environment id.
+        name: one of the environment's own, or ``module:Class`` of a user's.
+
+    Raises:
+        ValueError: if there is no such name.
+    """
+    known = baselines_of(id)
+    for table in (known.policies, known.references, known.bounds):
+        if name in table:
+            return table[name]
+    if ":" in name:
+        module_name, _, attribute = name.partition(":")
+        try:
+            return getattr(importlib.import_module(module_name), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"cannot load policy {name!r}: {error}") from error
+    raise nearest("policy", name, known.names)
+
+
+def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+    """Control that a run uses: the policy's own, unless it suits the one asked for."""
+    own = getattr(maker, "control", None)
+    if kind != "policy":
+        return cls.controls[0]
+    if own is None:
+        return control or cls.controls[0]
+    if control is not None and own != control:
+        raise ValueError(f"policy {name!r} is made for control {own!r}, not {control!r}")
+    return own
+
+
+def _applied(task: Task, action: Any) -> Callable[[Any], Any]:
+    return lambda state: task.act(state, action)
+
+
+def _run_chunk(
+    task: Task, maker: Callable[[Task], Any], kind: str, seeds: Sequence[int], tick: Progress
+) -> dict[str, numpy.ndarray]:
+    """Errors and records of some episodes, ``(episodes, time, ...)``."""
+    lanes = Lanes(task, len(seeds))
+    for lane, seed in enumerate(seeds):
+        lanes.seed(lane, numpy.random.default_rng(seed))
+    lanes.restart()
+    actor = maker(task)
+    series: dict[str, list[numpy.ndarray]] = {}
+
+    def keep(name: str, values: numpy.ndarray) -> None:
+        series.setdefault(name, []).append(numpy.moveaxis(values[..., : lanes.count], -1, 0))
+
+    def record(state: Any, _: Any = None) -> None:
+        error, covariance = task.error(state), task.covariance(state)
+        keep("error", error)
+        keep("cost", task.cost(state))
+        keep("capped_cost", capped_cost(task, state))
+        keep("nees", log_density(error, covariance)[1])
+        for name, values in task.records(state).items():
+            keep(name, values)
+
+    if kind == "policy":
+        memory: Any = None
+        start = numpy.ones(lanes.count, dtype=bool)
+        for _ in range(lanes.decisions_per_episode):
+            action, memory = actor.predict(lanes.observe(), memory, start, deterministic=True)
+            applied = lanes.widened(numpy.asarray(action))
+            lanes.step(_applied(task, applied), record)
+            start = numpy.zeros(lanes.count, dtype=bool)
+            tick(lanes.count * task.decision_interval)
+    else:
+        memory = actor.start(lanes.state)
+        neutral = lanes.widened(numpy.zeros((lanes.count, *(task.action_space.shape or ()))))
+        for _ in range(lanes.decisions_per_episode):
+
+            def update(state: Any) -> Any:
+                nonlocal memory
+                if kind == "bound":
+                    mean_square, memory = actor.update(state, memory)
+                    keep("mean_square", mean_square)
+                    return task.act(state, neutral)
+                state, memory = actor.update(state, memory)
+                return state
+
+            lanes.step(update, record if kind == "reference" else None)
+            tick(lanes.count * task.decision_interval)
+    return {name: numpy.stack(values, axis=1) for name, values in series.items()}
+
+
+def evaluate(
+    env: str,
+    policies: Sequence[str] | Mapping[str, Any],
+    scenario: Any = None,
+    episodes: int = 500,
+    seed: int = 0,
+    split: str = "test",
+    control: str | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> xarray.Dataset:
+    """Run policies, reference estimators and bounds over the same episodes.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        policies: names, or a mapping from a name to a class or object with a ``predict`` method.
+        scenario: name of a scenario or a trajectory; default: the environment's training distribution.
+        episodes: Monte Carlo runs M.
+        seed: number of the experiment.
+        split: "test" (default), "validation" or "train"; splits share no episode.
+        control: demand this control; by default every policy runs in its own.
+        progress: called with the number of measurements done, now and then.
+        **keywords: parameters of the task.
+
+    Returns:
+        Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
+        truth), ``cost``, ``capped_cost``, ``nees``, whatever the task records (``nis``,
+        ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
+
+    Raises:
+        ValueError: for unknown names, or a policy that does not fit the control.
+    """
+    cls = task_class(env)
+    chosen = find_scenario(cls, scenario)
+    known = baselines_of(cls.id)
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
+    makers: dict[str, Any] = (
+        dict(policies)
+        if isinstance(policies, Mapping)
+        else {name: load_policy(cls.id, name) for name in policies}
+    )
+    if not makers:
+        raise ValueError("name at least one policy")
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    seeds = episode_seeds(split, seed, episodes)
+    kinds = {name: known.kind(name) for name in makers}
+    controls = {name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()}
+    # Every task is made before any episode runs, so that a wrong keyword costs nothing.
+    tasks = {name: make_task(cls.id, controls[name], scenario, **keywords) for name in makers}
+    for name, task in tasks.items():
+        if getattr(makers[name], "control", task.control) != task.control:
+            raise ValueError(f"policy {name!r} does not fit control {task.control!r}")
+    tick = progress or (lambda _: None)
+    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
+    for name, maker in makers.items():
+        make = maker if callable(maker) else lambda _task, maker=maker: maker
+        chunks = [
+            _run_chunk(tasks[name], make, kinds[name], seeds[i : i + CHUNK], tick)
+            for i in range(0, episodes, CHUNK)
+        ]
+        per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
+    return _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed)
+
+
+def _dataset(
+    per_policy: dict[str, dict[str, numpy.ndarray]],
+    kinds: dict[str, str],
+    controls: dict[str, str],
+    tasks: dict[str, Task],
+    scenario: Scenario,
+    seeds: Sequence[int],
+    split: str,
+    seed: int,
+) -> xarray.Dataset:
+    task = next(iter(tasks.values()))
+    names = list(per_policy)
+    times = numpy.arange(1, task.horizon + 1)
+    variables: dict[str, Any] = {}
+    for key in sorted({key for series in per_policy.values() for key in series}):
+        example = next(series[key] for series in per_policy.values() if key in series)
+        stacked = numpy.full((len(names), *example.shape), numpy.nan)
+        for i, name in enumerate(names):
+            if key in per_policy[name]:
+                stacked[i] = per_policy[name][key]
+        dims = ["policy", "episode", "time"]
+        if example.ndim == 3:
+            dims.append("component" if key in ("error", "mean_square") else "mode" if "mode" in key else key)
+        variables[key] = (dims, stacked)
+    dataset = xarray.Dataset(
+        variables,
+        coords={
+            "policy": names,
+            "kind": ("policy", [kinds[n] for n in names]),
+            "control": ("policy", [controls[n] for n in names]),
+            "episode": numpy.arange(len(seeds)),
+            "episode_seed": ("episode", numpy.array(seeds, dtype=numpy.uint64)),
+            "time": times,
+            "component": [c.name for c in task.components],
+            "unit": ("component", [c.unit for c in task.components]),
+        },
+        attrs={
+            "environment": task.id,
+            "scenario": scenario.name,
+            "split": split,
+            "seed": seed,
+            "windows": {
+                name: (first, min(last, task.horizon))
+                for name, (first, last) in (scenario.windows or {"all": (1, task.horizon)}).items()
+                if first <= task.horizon
+            },
+            "groups": dict(task.groups),
+            "cost": task.cost_description,
+            "huber_bound": task.huber_bound,
+        },
+    )
+    if "mode_probability" in dataset:
+        dataset = dataset.assign_coords(mode=list(task.modes))
+    return dataset
