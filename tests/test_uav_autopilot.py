@@ -516,7 +516,7 @@ def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone(
         ({"feedback": (0.0, 0.0, 0.0, 0.0, 0.0)}, "feedback must stabilise the plant.*spectral radius"),
         ({"feedback": (1.0, 2.0)}, "feedback must be 5 numbers"),
         ({"sensor_sigmas": (0.5, 0.0, 0.5)}, r"sensor_sigmas\[1\].*above 0.0.*got 0.0"),
-        ({"gust_sigma": -1.0}, "gust_sigma must be a finite number and above 0.0, got -1.0"),
+        ({"gust_sigma": -1.0}, "gust_sigma must be a finite number above 0.0, got -1.0"),
         ({"moment_disturbance": 0.0}, "moment_disturbance"),
         ({"sensors": ("rate", "elevator")}, "sensors cannot detect.*add a sensor"),
         ({"sensors": ("speed",)}, "each of sensors must be one of"),

@@ -538,7 +538,7 @@ class UavAutopilot(Task[State]):
         super().__init__(parameters, control, xp, device)
         p = parameters
         self.design = design(p)
-        self.components = tuple(Component(*c) for c in COORDINATES[p.plant])  # type: ignore[misc]
+        self.components = tuple(Component(*c) for c in COORDINATES[p.plant])
         names = tuple(c.name for c in COORDINATES[p.plant])
         self.sensors: tuple[str, ...] = p.value("sensors")
         self._measured = tuple(names.index(sensor) for sensor in self.sensors)
