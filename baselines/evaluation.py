@@ -7,24 +7,35 @@ import importlib
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
 from ..envs.catalogue import find_scenario, make_task, nearest, task_class
-from ..envs.lanes import Lanes
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from . import policies
 from .policy import Baselines
+from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
+from .tuning import tuned_policy
 
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
-Progress = Callable[[int], None]
+
+class TunedPolicy(NamedTuple):
+    """A policy with tuned values, some of which belong to the task."""
+
+    task_keywords: dict[str, Any]
+    control: str
+    make: Callable[[Task], Any]
+
+    def __call__(self, task: Task) -> Any:
+        """Make the policy for a task."""
+        return self.make(task)
 
 
 @cache
@@ -43,7 +54,7 @@ def baselines_of(id: str) -> Baselines:
     return _all_baselines()[task_class(id).id]
 
 
-def load_policy(id: str, name: str) -> Callable[[Task], Any]:
+def load_policy(id: str, name: str) -> Any:
     """Return what makes a policy, reference estimator or bound for a task.
 
     Args:
@@ -57,6 +68,8 @@ def load_policy(id: str, name: str) -> Callable[[Task], Any]:
     for table in (known.policies, known.references, known.bounds):
         if name in table:
             return table[name]
+    if name.endswith("-tuned"):
+        return TunedPolicy(*tuned_policy(id, name.removesuffix("-tuned"), known.tunable))
     if ":" in name:
         module_name, _, attribute = name.partition(":")
         try:
@@ -78,25 +91,16 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
     return own
 
 
-def _applied(task: Task, action: Any) -> Callable[[Any], Any]:
-    return lambda state: task.act(state, action)
-
-
 def _run_chunk(
-    task: Task, maker: Callable[[Task], Any], kind: str, seeds: Sequence[int], tick: Progress
+    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress
 ) -> dict[str, numpy.ndarray]:
     """Errors and records of some episodes, ``(episodes, time, ...)``."""
-    lanes = Lanes(task, len(seeds))
-    for lane, seed in enumerate(seeds):
-        lanes.seed(lane, numpy.random.default_rng(seed))
-    lanes.restart()
-    actor = maker(task)
     series: dict[str, list[numpy.ndarray]] = {}
 
     def keep(name: str, values: numpy.ndarray) -> None:
-        series.setdefault(name, []).append(numpy.moveaxis(values[..., : lanes.count], -1, 0))
+        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
-    def record(state: Any, _: Any = None) -> None:
+    def record(state: Any) -> None:
         error, covariance = task.error(state), task.covariance(state)
         keep("error", error)
         keep("cost", task.cost(state))
@@ -106,30 +110,11 @@ def _run_chunk(
             keep(name, values)
 
     if kind == "policy":
-        memory: Any = None
-        start = numpy.ones(lanes.count, dtype=bool)
-        for _ in range(lanes.decisions_per_episode):
-            action, memory = actor.predict(lanes.observe(), memory, start, deterministic=True)
-            applied = lanes.widened(numpy.asarray(action))
-            lanes.step(_applied(task, applied), record)
-            start = numpy.zeros(lanes.count, dtype=bool)
-            tick(lanes.count * task.decision_interval)
+        run_policy(task, actor, seeds, record, tick)
+    elif kind == "reference":
+        run_reference(task, actor, seeds, record, tick)
     else:
-        memory = actor.start(lanes.state)
-        neutral = lanes.widened(numpy.zeros((lanes.count, *(task.action_space.shape or ()))))
-        for _ in range(lanes.decisions_per_episode):
-
-            def update(state: Any) -> Any:
-                nonlocal memory
-                if kind == "bound":
-                    mean_square, memory = actor.update(state, memory)
-                    keep("mean_square", mean_square)
-                    return task.act(state, neutral)
-                state, memory = actor.update(state, memory)
-                return state
-
-            lanes.step(update, record if kind == "reference" else None)
-            tick(lanes.count * task.decision_interval)
+        run_bound(task, actor, seeds, lambda mean_square: keep("mean_square", mean_square), tick)
     return {name: numpy.stack(values, axis=1) for name, values in series.items()}
 
 
@@ -181,9 +166,13 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: known.kind(name) for name in makers}
-    controls = {name: _control_of(maker, kinds[name], control, cls, name) for name, maker in makers.items()}
+    controls: dict[str, str] = {}
+    tasks: dict[str, Task] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
-    tasks = {name: make_task(cls.id, controls[name], scenario, **keywords) for name in makers}
+    for name, maker in makers.items():
+        tuned_keywords = getattr(maker, "task_keywords", {})
+        controls[name] = _control_of(maker, kinds[name], control, cls, name)
+        tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
     for name, task in tasks.items():
         if getattr(makers[name], "control", task.control) != task.control:
             raise ValueError(f"policy {name!r} does not fit control {task.control!r}")
@@ -192,7 +181,7 @@ def evaluate(
     for name, maker in makers.items():
         make = maker if callable(maker) else lambda _task, maker=maker: maker
         chunks = [
-            _run_chunk(tasks[name], make, kinds[name], seeds[i : i + CHUNK], tick)
+            _run_chunk(tasks[name], make(tasks[name]), kinds[name], seeds[i : i + CHUNK], tick)
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}

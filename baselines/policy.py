@@ -116,6 +116,20 @@ class Bound(Protocol):
 
 
 @dataclass(frozen=True)
+class Tunable:
+    """What can be tuned in a policy, and what a choice of values means."""
+
+    control: str
+    """The control of the policy."""
+    limits: Mapping[str, tuple[float, float]]
+    """Lower and upper limit of each value, in the order of the search."""
+    start: Mapping[str, float]
+    """The values in force without tuning."""
+    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]
+    """From values to keywords of the task and what makes the policy for it."""
+
+
+@dataclass(frozen=True)
 class Baselines:
     """What an environment is compared with: the table at the end of each module in :mod:`.policies`."""
 
@@ -128,6 +142,10 @@ class Baselines:
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
     """Names that the quick benchmark runs, in the order of the table."""
+    tunable: Mapping[str, Tunable] = field(default_factory=dict)
+    """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    best_constant: str = ""
+    """The tunable policy that stands for the best constant action in the room table."""
     metrics: Callable[[Any, Any], list[Any]] | None = None
     """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
 

@@ -15,9 +15,11 @@ from .baselines.evaluation import baselines_of, evaluate
 from .baselines.figures import evaluation_figures, save
 from .baselines.metrics import Record, tidy_records
 from .baselines.reproduction import paper_module, papers, save_reproduction
+from .baselines.tuning import FOLDER, merged_table, table_path, tune
 from .benchmark import Cell, run_benchmark
-from .envs.catalogue import catalogue, parameter_names, task_class
+from .envs.catalogue import catalogue, nearest, parameter_names, task_class
 from .results import writable_folder, write_records, write_text
+from .room import insert, measure_room, room_markdown
 from .tables import results_table
 
 app = typer.Typer(
@@ -159,6 +161,70 @@ def benchmark(
 
         run_benchmark(out, full, seed, environment or (), started, finished)
     console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+
+
+@app.command("tune")
+def tune_policy(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    policy: Annotated[str, typer.Option(help="Policy to tune.")],
+    budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
+    scenario: Annotated[
+        str | None, typer.Option(help="A training scenario; held-out ones are refused.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
+) -> None:
+    """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
+
+    Example: filtergym tune filtergym/ManeuveringTarget-v0 --policy imm --budget 4000000
+    """
+    cls = task_class(environment)
+    tunable = baselines_of(cls.id).tunable
+    if policy not in tunable:
+        raise nearest("tunable policy", policy, tunable)
+    writable_folder(out)
+    with progress_bar() as bar:
+        line = bar.add_task(f"tuning {policy}", total=budget)
+        outcome = tune(
+            cls.id,
+            policy,
+            tunable[policy],
+            budget,
+            scenario,
+            seed,
+            progress=lambda steps: bar.update(line, advance=steps),
+        )
+    table = Table("value", "untuned", "tuned", title=f"{policy} on {outcome.scenario}")
+    for name, value in outcome.values.items():
+        table.add_row(name, f"{tunable[policy].start[name]:g}", f"{value:g}")
+    table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
+    console.print(table)
+    path = table_path(cls.id, out)
+    command = f"filtergym tune {cls.id} --policy {policy} --budget {budget} --seed {seed}"
+    existing = path.read_text(encoding="utf-8") if path.exists() else None
+    write_text(path, merged_table(existing, outcome, command))
+    console.print(f"saved in {path}; use it as --policy {policy}-tuned")
+
+
+@app.command("room")
+def room(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    episodes: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 5000,
+    seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
+    into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
+) -> None:
+    """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
+
+    Example: filtergym room filtergym/ManeuveringTarget-v0
+    """
+    cls = task_class(environment)
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
+    console.print(results_table(records))
+    if into is not None:
+        command = f"filtergym room {cls.id} --episodes {episodes} --seed {seed} --into {into}"
+        insert(into, room_markdown(records, command))
 
 
 @app.command("reproduce")

@@ -10,10 +10,23 @@ def with_interval(record: Any, scale: float = 1.0, digits: int = 3) -> str:
     """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``."""
     if record is None or record.value is None:
         return "-"
-    value = f"{record.value * scale:.{digits}g}"
+
+    def text(value: float) -> str:
+        value *= scale
+        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:#.{digits}g}".rstrip(".")
+
     if record.low is None or record.low == record.high:
-        return value
-    return f"{value} [{record.low * scale:.{digits}g}, {record.high * scale:.{digits}g}]"
+        return f"{record.value * scale:.{digits}g}"
+    return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
+
+
+def main_components(records: Sequence[Any], whole: str = "all") -> list[str]:
+    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    first = records[0]
+    names = [
+        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == whole
+    ]
+    return [g for g in names if any(other.startswith(f"{g}_") for other in names)] or names[:3]
 
 
 def results_table(records: Sequence[Any], whole: str = "all") -> Table:
@@ -24,11 +37,7 @@ def results_table(records: Sequence[Any], whole: str = "all") -> Table:
         whole: the window that spans the run.
     """
     first = records[0]
-    groups = [
-        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == whole
-    ]
-    # Groups such as "position" come after the components they are made of; show them alone where they exist.
-    shown = [g for g in groups if any(other.startswith(f"{g}_") for other in groups)] or groups[:3]
+    shown = main_components(records, whole)
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     table = Table(
         title=f"{first.environment}, scenario {first.scenario} "

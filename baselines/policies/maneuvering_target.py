@@ -4,6 +4,7 @@ Equation numbers and readings are those of the task's paper (Bakulev, Sychev, Ng
 """
 
 import math
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import numpy
@@ -12,7 +13,7 @@ from ...envs.controls import signed_exponential
 from ...envs.task import Array, Task
 from ...envs.tasks.maneuvering_target import ManeuveringTarget, Outside, State
 from ...filters import bounds, imm, kalman, polar
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy
+from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
 
 
 class InteractingMultipleModel(Policy):
@@ -37,7 +38,12 @@ class InteractingMultipleModel(Policy):
 
 
 class HardInteractingMultipleModel(InteractingMultipleModel):
-    """Believe the most probable mode only: a switching filter."""
+    """Believe the most probable mode only.
+
+    With all weight on one mode the bank mixes every filter into the same state with the same covariance, so
+    both modes explain the next measurement equally well and the transition probabilities decide: the first
+    mode is believed for ever. On this bank of process-noise-free filters it *is* ``fixed-low``.
+    """
 
     control = "mode"
 
@@ -57,40 +63,34 @@ class ZeroEvidence(ConstantPolicy):
 
 
 class FixedGain(ConstantPolicy):
-    """One alpha-beta filter of constant gain."""
+    """One alpha-beta filter of constant gain ``alpha``."""
 
     control = "gain"
-    alpha: float
 
-    def __init__(self, task: ManeuveringTarget) -> None:
+    def __init__(self, task: ManeuveringTarget, alpha: float) -> None:
         super().__init__(task)
-        self.action = (task.action_for_alpha(self.gain(task)),)
-
-    def gain(self, task: ManeuveringTarget) -> float:
-        """Position gain."""
-        return self.alpha
+        self.action = (task.action_for_alpha(alpha),)
 
 
 class FixedLow(FixedGain):
-    """The smaller of the bank's gains, never changed."""
+    """The smallest of the bank's gains, never changed."""
 
-    def gain(self, task: ManeuveringTarget) -> float:
-        """The first gain of the bank."""
-        return min(task.parameters.gains)
+    def __init__(self, task: ManeuveringTarget) -> None:
+        super().__init__(task, min(task.parameters.gains))
 
 
 class FixedHigh(FixedGain):
-    """The larger of the bank's gains, never changed."""
+    """The largest of the bank's gains, never changed."""
 
-    def gain(self, task: ManeuveringTarget) -> float:
-        """The last gain of the bank."""
-        return max(task.parameters.gains)
+    def __init__(self, task: ManeuveringTarget) -> None:
+        super().__init__(task, max(task.parameters.gains))
 
 
 class FixedBest(FixedGain):
     """The constant gain of least whole-run error on the paper's flight, exact: alpha = 0.65."""
 
-    alpha = 0.65
+    def __init__(self, task: ManeuveringTarget, alpha: float = 0.65) -> None:
+        super().__init__(task, alpha)
 
 
 class AdaptiveGain(Policy):
@@ -103,13 +103,14 @@ class AdaptiveGain(Policy):
     """
 
     control = "gain"
-    false_alarm_probability = 1e-3
-    ramp_scans = 7
     rearm = False
 
-    def __init__(self, task: ManeuveringTarget) -> None:
+    def __init__(
+        self, task: ManeuveringTarget, false_alarm_probability: float = 1e-3, ramp_scans: float = 7.0
+    ) -> None:
         super().__init__(task)
-        self.threshold = -2.0 * math.log(self.false_alarm_probability)
+        self.threshold = -2.0 * math.log(false_alarm_probability)
+        self.ramp_scans = ramp_scans
         self.low, self.high = min(task.parameters.gains), max(task.parameters.gains)
         self.squared = task.columns(["log_squared_innovation"])[0]
 
@@ -272,6 +273,58 @@ class KnownInputBound(_KalmanReference):
         return task.xp.stack([P[i, i] for i in range(4)]), P
 
 
+def _gains(values: Mapping[str, float]) -> tuple[float, float]:
+    return min(values["low"], values["high"]), max(values["low"], values["high"])
+
+
+def _tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+    stay = values["stay_low"], values["stay_high"]
+    transition = ((stay[0], 1.0 - stay[0]), (1.0 - stay[1], stay[1]))
+    return {"gains": _gains(values), "transition": transition}, InteractingMultipleModel
+
+
+def _tuned_adaptive(cls: type[AdaptiveGain]) -> Callable[[Mapping[str, float]], Any]:
+    def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+        def make(task: ManeuveringTarget) -> Policy:
+            return cls(task, 10.0 ** values["log10_false_alarm"], values["ramp_scans"])
+
+        return {"gains": _gains(values)}, make
+
+    return apply
+
+
+_GAIN_LIMITS = {"low": (0.05, 0.5), "high": (0.4, 0.95)}
+_GAIN_START = {"low": 0.3, "high": 0.7}
+_RAMP_LIMITS = {"log10_false_alarm": (-5.0, -0.5), "ramp_scans": (1.0, 20.0)}
+_RAMP_START = {"log10_false_alarm": -3.0, "ramp_scans": 7.0}
+
+TUNABLE = {
+    "imm": Tunable(
+        "weights",
+        {**_GAIN_LIMITS, "stay_low": (0.5, 0.999), "stay_high": (0.3, 0.999)},
+        {**_GAIN_START, "stay_low": 0.9, "stay_high": 0.9},
+        _tuned_imm,
+    ),
+    "adaptive": Tunable(
+        "gain",
+        {**_GAIN_LIMITS, **_RAMP_LIMITS},
+        {**_GAIN_START, **_RAMP_START},
+        _tuned_adaptive(AdaptiveGain),
+    ),
+    "adaptive-rearm": Tunable(
+        "gain",
+        {**_GAIN_LIMITS, **_RAMP_LIMITS},
+        {**_GAIN_START, **_RAMP_START},
+        _tuned_adaptive(RearmingAdaptiveGain),
+    ),
+    "fixed-best": Tunable(
+        "gain",
+        {"alpha": (0.05, 0.95)},
+        {"alpha": 0.65},
+        lambda values: ({}, lambda task: FixedBest(task, values["alpha"])),
+    ),
+}
+
 BASELINES = Baselines(
     policies={
         "imm": InteractingMultipleModel,
@@ -288,6 +341,8 @@ BASELINES = Baselines(
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
     score_bound="known-turn",
+    tunable=TUNABLE,
+    best_constant="fixed-best",
     benchmark=(
         "imm",
         "adaptive",
