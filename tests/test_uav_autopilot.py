@@ -255,7 +255,7 @@ def test_monte_carlo_of_the_reference_table(
             sums += numpy.stack(
                 [
                     record["output"] ** 2,
-                    record["control"] ** 2,
+                    record["control_signal"] ** 2,
                     task.cost(state) * task.cost_unit,
                     nees / n,
                     shown,

@@ -914,14 +914,14 @@ class UavAutopilot(Task[State]):
         return level * level * self._scaled_noise + self._other_noise
 
     def records(self, state: State) -> dict[str, Array]:
-        """Signals of the loop: output, command, control that follows, NIS per available reading, and the
+        """Signals of the loop: output, command, control signal that follows, NIS per available reading, and the
         innovation over its sigma of the output's sensor (of the first where the output is not measured).
         """
         shown = self.measured.index(self.output) if self.output in self.measured else 0
         return {
             "output": state.truth[self.output],
             "command": state.command,
-            "control": self.autopilot(state),
+            "control_signal": self.autopilot(state),
             "nis": state.nis,
             "innovation": state.innovation[shown],
         }
