@@ -352,9 +352,7 @@ def metrics(run: Any, bootstrap: Bootstrap) -> list[Measure]:
             bootstrap.interval(control_variance[:, times].mean(axis=1)),
             f"({control_unit})^2",
         )
-        add(
-            "tracking_rmse", bootstrap.estimate((tracking[:, times] ** 2).mean(axis=1), numpy.sqrt), unit
-        )
+        add("tracking_rmse", bootstrap.estimate((tracking[:, times] ** 2).mean(axis=1), numpy.sqrt), unit)
         if theory is not None and window == "steady":
             add("output_variance_theory", _exact(theory.output_variance), f"({unit})^2")
             add("control_variance_theory", _exact(theory.control_variance), f"({control_unit})^2")
