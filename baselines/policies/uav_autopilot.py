@@ -11,7 +11,7 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.controls import signed_exponential
-from ...envs.task import Array, Task
+from ...envs.task import Array
 from ...envs.tasks.uav_autopilot import MODES, State, UavAutopilot
 from ...filters import linear_systems, packed_covariance
 from ..bootstrap import Bootstrap, Estimate

@@ -33,7 +33,7 @@ SETTLED = slice(200, HORIZON)
 AFTER_STEP = slice(300, HORIZON)
 STEP_TIME = 200
 SCALES = (0.01, 1.0, 100.0)
-_CASES = {
+_CASES: dict[str, dict[str, Any]] = {
     "P, H = I": {"plant": "P"},
     "P, H = [1 0]": {"plant": "P", "sensors": ("position",)},
     "U": {"plant": "U"},
@@ -67,8 +67,8 @@ class Signals:
 
 def _run(keywords: dict[str, Any], scenario: str, loop: str, episodes: int, progress: Progress) -> Signals:
     control = "mode" if loop == "raw-sensors" else "gain"
-    more = {"step_time": STEP_TIME} if scenario == "paper-step" else {}
-    task = make_task("UavAutopilot", control, scenario, horizon=HORIZON, **more, **keywords)
+    more: dict[str, Any] = {"step_time": STEP_TIME} if scenario == "paper-step" else {}
+    task = make_task("UavAutopilot", control, scenario, **{"horizon": HORIZON, **more, **keywords})
     assert isinstance(task, UavAutopilot)
     shown = task.measured.index(task.output)
     kept: dict[str, list[numpy.ndarray]] = {}
@@ -169,13 +169,15 @@ def _theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, n
         return T * (numpy.abs(row @ response + feed) ** 2).sum(axis=(1, 2))
 
     S = d.H @ d.steady.predicted @ d.H.T + d.R
-    white = 0.0 * frequency + 1.0
-    driven = T * task.parameters.acceleration_sigma**2 if task.parameters.plant == "P" else 0.0
+    # The noise on the control between two measurements belongs to the second one, hence the z.
+    driven = numpy.zeros((1, noise.shape[1]))
+    if task.parameters.plant == "P":
+        driven[0, 0] = task.parameters.acceleration_sigma
     return {
-        "plant_input": power(-L @ numpy.hstack([numpy.eye(n), -numpy.eye(n)])) + driven * white,
+        "plant_input": power(-L @ numpy.hstack([numpy.eye(n), -numpy.eye(n)]), z * driven),
         "observation": power(numpy.hstack([coordinate, 0.0 * coordinate]), direct),
         "estimate": power(numpy.hstack([coordinate, -coordinate])),
-        "innovation": T * S[shown, shown] * white,
+        "innovation": T * S[shown, shown] + 0.0 * frequency,
     }
 
 
@@ -191,7 +193,7 @@ def _without_command_in_prediction(task: UavAutopilot) -> float:
 
 
 def _covariances(task: UavAutopilot, steps: int, **changes: Any) -> numpy.ndarray:
-    """Sigma of the output's estimate by the recursion (12), and the gain on the integrating mode, ``(2, steps)``.
+    """Recursion (12): sigma of the output's estimate, gain on the integrating mode, ``(2, steps)``.
 
     The mode's coordinate is ``w^T x`` with ``w^T F = w^T``, scaled to contain the output once.
     """
@@ -267,15 +269,20 @@ def _draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) 
         axes[0, column].set_xlabel("time, s")
         # Without its last value, the one of node 1 that has no successor.
         frequency, power = _spectrum(values[:, STEP_TIME : HORIZON - 2], T)
-        axes[1, column].semilogy(frequency, power, color=COLOURS[0], lw=1.4, label=f"{len(values)} runs")
+        axes[1, column].plot(frequency, power, color=COLOURS[0], lw=1.4, label=f"{len(values)} runs")
         fine = numpy.linspace(frequency[1], frequency[-1], 300)
         theory = _theory_spectra(signals.task, fine)[name]
-        axes[1, column].semilogy(fine, theory, color=COLOURS[1], lw=1.2, ls="--", label="theory, noise alone")
+        axes[1, column].plot(fine, theory, color=COLOURS[1], lw=1.2, ls="--", label="theory, noise alone")
         axes[1, column].set_xlabel("frequency, Hz")
+        if name == "innovation":
+            axes[1, column].set_ylim(0.0, 1.5 * float(theory[0]))
+        else:
+            axes[1, column].set_yscale("log")
     axes[1, 1].sharey(axes[1, 0])
     axes[0, 1].sharey(axes[0, 0])
+    squared = f"({unit})²" if "/" in unit else f"{unit}²"
     axes[0, 0].set_ylabel(f"signal, {unit}")
-    axes[1, 0].set_ylabel(f"energy spectrum, ({unit})²/Hz")
+    axes[1, 0].set_ylabel(f"energy spectrum, {squared}/Hz")
     axes[1, 1].legend(fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
     _tidy(figure)
@@ -327,7 +334,10 @@ def _draw_mistuning(tasks: dict[str, UavAutopilot]) -> Any:
         assert best is not None
         for value, name in ((raw.cost, "raw sensors"), (best.cost, "true state")):
             axis.axhline(value * task.cost_unit, color="0.5", lw=0.8, ls=":")
-            axis.text(1e3, value * task.cost_unit, f"cost with {name}", fontsize=7, ha="right", va="bottom")
+            axis.text(
+                1e3, value * task.cost_unit, f"cost with {name}", fontsize=7, ha="right", va="center",
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+            )  # fmt: skip
         axis.axvline(1.0, color="0.7", lw=0.8)
         axis.set_title(title, loc="left", fontsize=9)
         axis.set_xlabel("factor on the process noise that the filter believes")
@@ -419,7 +429,7 @@ def reproduce(progress: Progress = lambda done: None, episodes: int | None = Non
 
 
 def _variance_table(noise: dict[str, dict[str, Signals]]) -> Grid:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for case, loops in noise.items():
         for loop, s in loops.items():
             theory = stationary(s.task, loop)
@@ -436,11 +446,11 @@ def _variance_table(noise: dict[str, dict[str, Signals]]) -> Grid:
                     _measured(s.cost[:, SETTLED]),
                 )
             )
-    d = make_task("UavAutopilot", "gain", "paper-noise", **_CASES["P, H = [1 0]"]).design  # type: ignore[attr-defined]
-    loop = linear_systems.measurement_feedback_loop(
+    d = noise["P, H = [1 0]"]["kalman"].task.design
+    raw = linear_systems.measurement_feedback_loop(
         d.model.F, d.model.B, d.H, d.feedback, d.model.scaled_noise, d.R
     )
-    radius = linear_systems.spectral_radius(loop.transition)
+    radius = linear_systems.spectral_radius(raw.transition)
     rows.append(("P, H = [1 0]", "raw-sensors", f"unstable, spectral radius {radius:.4f}", *["-"] * 5))
     return Grid(
         "Variances of the loop with white-noise input, theory (Lyapunov equation) and Monte Carlo ± one "
@@ -508,11 +518,13 @@ def _figures(P: Signals, P_step: Signals, U: Signals) -> tuple[dict[str, Any], d
     }
     figures = {"figure_3_filter": _draw_filter(P, P_step)}
     captions = {
-        "figure_3_filter": "Plant P: signal at the input (A) and the output (B) of the filter, one run; the dotted "
-        "line is the step of the command.",
-        "plant_u_spectra": "Plant U: spectra of pitch at nodes 2 to 4 with white-noise input.",
+        "figure_3_filter": "Plant P: signal at the input (A) and the output (B) of the filter, one run; "
+        "the dotted line is the step of the command.",
+        "plant_u_spectra": "Plant U: spectra of pitch at nodes 2 to 4, white-noise input; leakage as above.",
         "mistuning": "What a wrong process noise in the filter costs the loop.",
-        "covariance": "Where the correcting term of (5) bounds the covariance, and where it does not: plant U.",
+        "covariance": "Where the correcting term of (5) bounds the covariance of plant U, and where it "
+        "does not (left; with all sensors the two curves coincide), and where the gain goes to sleep "
+        "(right).",
     }
     for name, unit, title, number in (
         ("plant_input", "m/s²", "node 1, plant input: control and white noise", "4_node_1"),
@@ -523,8 +535,9 @@ def _figures(P: Signals, P_step: Signals, U: Signals) -> tuple[dict[str, Any], d
         key = f"figure_{number}"
         figures[key] = _draw_node(name, unit, f"Plant P, {title}", P, P_step)
         captions[key] = (
-            f"Plant P, {title}: one run above, energy spectrum of the settled loop (left) and from the step on "
-            "(right) below."
+            f"Plant P, {title}: one run above, energy spectrum of the settled loop (left) and from the step "
+            "on (right) below. What lies above theory at either end is leakage of the rectangular "
+            "window."
         )
     figures["plant_u_spectra"] = _draw_pitch_spectra(U)
     figures["mistuning"] = _draw_mistuning({"plant P": P.task, "plant U": U.task})
@@ -566,10 +579,10 @@ def _claims(
         Claim(
             "1",
             "The model works correctly even with strongly noisy signals.",
-            f"P: noise 0 dB at node 2 is {_decibel(P):.1f} dB weaker at node 3 (U: {_decibel(U):.1f} dB). Mean "
-            f"output after a unit step: P {_measured(step['P, H = I'].output[:, AFTER_STEP], 3)}, U "
-            f"{_measured(step['U'].output[:, AFTER_STEP], 3)}. NEES per coordinate {_measured(P.nees[:, SETTLED], 3)}"
-            f" and {_measured(U.nees[:, SETTLED], 3)}.",
+            f"P: noise 0 dB at node 2 is {_decibel(P):.1f} dB weaker at node 3 (U: {_decibel(U):.1f} dB). "
+            f"Mean output after a unit step: P {_measured(step['P, H = I'].output[:, AFTER_STEP], 3)}, U "
+            f"{_measured(step['U'].output[:, AFTER_STEP], 3)}. NEES per coordinate "
+            f"{_measured(P.nees[:, SETTLED], 3)} and {_measured(U.nees[:, SETTLED], 3)}.",
             f"{M} runs of {HORIZON} measurements, burn-in 200 (300 after the step); ± one standard error",
             "reproduced",
         ),
@@ -578,19 +591,20 @@ def _claims(
             "If A - BL is asymptotically stable, the loop with the filter is too (separation).",
             "largest distance of a pole of the loop from the union of the separate designs: "
             + ", ".join(f"{case}: {value:.0e}" for case, value in defects.items()),
-            "eigenvalues of the loop written in state and estimate, matched with those of F - BL and (I - KH)F",
+            "eigenvalues of the loop written in state and estimate, matched with those of F - BL and (I - "
+            "KH)F",
             "reproduced",
         ),
         Claim(
             "3",
             "The correcting term of the Riccati equation limits the growth of the covariance.",
-            f"U, sigma of pitch after 2 min: {settled[-1]:.3f} deg with all sensors, {alone[-1]:.1f} deg without "
-            f"measurements; but {blind[-1]:.1f} deg and growing when no sensor detects pitch. With gusts as the "
-            f"only noise the covariance stays bounded, but the gain on the pitch integrator, which gusts do not "
-            f"reach, falls as 1/t and the filter goes to sleep: {gusts[599]:.1e} after 12 s, {gusts[-1]:.1e} after "
-            "20 min.",
-            "recursion (12); the condition is detectability, and for a steady filter that is stable also noise "
-            "on every integrating mode",
+            f"U, sigma of pitch after 2 min: {settled[-1]:.3f} deg with all sensors, {alone[-1]:.1f} deg "
+            f"without measurements; but {blind[-1]:.1f} deg and growing when no sensor detects pitch. With "
+            "gusts as the only noise the covariance stays bounded, but the gain on the pitch integrator, "
+            f"which gusts do not reach, falls as 1/t and the filter goes to sleep: {gusts[599]:.1e} after "
+            f"12 s, {gusts[-1]:.1e} after 20 min.",
+            "recursion (12); the condition is detectability, and for a steady filter that is stable also "
+            "noise on every integrating mode",
             "reproduced in part",
         ),
         Claim(
@@ -605,22 +619,23 @@ def _claims(
         Claim(
             "5",
             "Command: equations (6), (10) print none.",
-            f"taken literally a unit command settles at {_without_command_in_prediction(P.task):.3f} (P) and "
-            f"{_without_command_in_prediction(U.task):.3f} (U) in place of 1; with the command in the prediction "
-            f"overshoot and settling are {100 * _response(responses['P, H = I'], 0.25)[0]:.2f} %, "
-            f"{_response(responses['P, H = I'], 0.25)[2]:.2f} s (P), "
-            f"{100 * _response(responses['U'], 0.02)[0]:.2f} %, {_response(responses['U'], 0.02)[2]:.2f} s (U)",
+            f"taken literally a unit command settles at {_without_command_in_prediction(P.task):.3f} (P) "
+            f"and {_without_command_in_prediction(U.task):.3f} (U) in place of 1; with the command in the "
+            f"prediction overshoot and settling are {100 * _response(responses['P, H = I'], 0.25)[0]:.2f} "
+            f"%, {_response(responses['P, H = I'], 0.25)[2]:.2f} s (P), "
+            f"{100 * _response(responses['U'], 0.02)[0]:.2f} %, {_response(responses['U'], 0.02)[2]:.2f} s "
+            "(U)",
             "fixed point of the loop; response as difference of runs with and without step on the same noise",
             "paper is silent",
         ),
         Claim(
             "6",
             "What is the filter worth to the loop?",
-            f"cost with raw sensors over cost with the filter: P {_ratio(raw_p, P)}, U {_ratio(raw_u, U)}. The "
-            "output itself gains less: its variance is "
-            f"{numpy.mean(raw_p.output[:, SETTLED] ** 2) / numpy.mean(P.output[:, SETTLED] ** 2):.2f} (P) and "
-            f"{numpy.mean(raw_u.output[:, SETTLED] ** 2) / numpy.mean(U.output[:, SETTLED] ** 2):.2f} (U) times as "
-            "large without it. With position alone and no filter the loop is unstable (P).",
+            f"cost with raw sensors over cost with the filter: P {_ratio(raw_p, P)}, U {_ratio(raw_u, U)}. "
+            "The output itself gains less: its variance is "
+            f"{numpy.mean(raw_p.output[:, SETTLED] ** 2) / numpy.mean(P.output[:, SETTLED] ** 2):.2f} (P) "
+            f"and {numpy.mean(raw_u.output[:, SETTLED] ** 2) / numpy.mean(U.output[:, SETTLED] ** 2):.2f} "
+            "(U) times as large without it. With position alone and no filter the loop is unstable (P).",
             f"{M} runs, same noise",
             "paper is silent",
         ),
@@ -628,8 +643,8 @@ def _claims(
             "7",
             "How wrong may the filter's process noise be?",
             f"cost of the loop above the optimum with Q times 0.01 / 100: P {percent[0]} / {percent[2]}, U "
-            f"{percent_u[0]} / {percent_u[2]}. Smallest cost is not smallest output variance: U with Q times 100 "
-            f"has {theory['U'][2][1]:.4f} deg² against {theory['U'][1][1]:.4f}, for "
+            f"{percent_u[0]} / {percent_u[2]}. Smallest cost is not smallest output variance: U with Q "
+            f"times 100 has {theory['U'][2][1]:.4f} deg² against {theory['U'][1][1]:.4f}, for "
             f"{theory['U'][2][2] / theory['U'][1][2]:.1f} times the control variance.",
             "Lyapunov equation of the loop with the mistuned steady filter",
             "paper is silent",

@@ -1,9 +1,9 @@
 """Scenarios of UavAutopilot: the paper's two inputs, the training distribution, and three held-out tests.
 
 Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16
-(plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of ``paper-noise`` stops before
-the end: in the last moments control costs and no longer pays, so that a policy that knows the time can be
-better there than the filter, which is optimal for a loop that goes on.
+(plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of
+``paper-noise`` stops before the end: in the last moments control costs and no longer pays, so that a policy
+that knows the time can be better there than the filter, which is optimal for a loop that goes on.
 """
 
 from collections.abc import Mapping
