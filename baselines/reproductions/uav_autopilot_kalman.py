@@ -30,6 +30,8 @@ EPISODES = 600
 HORIZON = 600
 SETTLED = slice(200, HORIZON)
 """Measurements after the burn-in."""
+TWO_MINUTES = 6000
+"""Measurements of plant U."""
 AFTER_STEP = slice(300, HORIZON)
 STEP_TIME = 200
 SCALES = (0.01, 1.0, 100.0)
@@ -39,7 +41,7 @@ _CASES: dict[str, dict[str, Any]] = {
     "U": {"plant": "U"},
 }
 _LOOPS = ("true-state", "kalman", "raw-sensors")
-_RUNS = 3 * len(_CASES) - 1 + 2 * len(_CASES) + 2 * 2
+_RUNS = (len(_LOOPS) + 1) * len(_CASES) - 1 + 2 * 2
 STEPS = _RUNS * EPISODES * HORIZON
 
 Progress = Callable[[int], None]
@@ -214,6 +216,20 @@ def _covariances(task: UavAutopilot, steps: int, **changes: Any) -> numpy.ndarra
             P = rest @ P @ rest.T + K @ R @ K.T
         found[:, k] = math.sqrt(P[task.output, task.output]), float(numpy.linalg.norm(w @ K))
     return found
+
+
+def _covariance_curves(task: UavAutopilot, steps: int) -> dict[str, numpy.ndarray]:
+    """Recursion (12) of plant U where its correcting term bounds the covariance and where it does not."""
+    names = [c.name for c in task.components]
+    H = numpy.eye(len(names))
+    rate, elevator = names.index("rate"), names.index("elevator")
+    R = numpy.diag(numpy.square(task.parameters.value("sensor_sigmas")[1:]))
+    return {
+        "with the correcting term": _covariances(task, steps),
+        "without it (no measurement)": _covariances(task, steps, H=H[:0]),
+        "no sensor of pitch: not detectable": _covariances(task, steps, H=H[[rate, elevator]], R=R),
+        "gusts the only noise": _covariances(task, steps, Q=task.design.model.scaled_noise),
+    }
 
 
 # --- figures
@@ -423,8 +439,9 @@ def reproduce(progress: Progress = lambda done: None, episodes: int | None = Non
         for plant in "PU"
     }
     P, U = noise["P, H = I"]["kalman"], noise["U"]["kalman"]
-    figures, captions = _figures(P, step["P, H = I"], U)
-    claims = _claims(noise, step, responses, random, M)
+    curves = _covariance_curves(U.task, TWO_MINUTES)
+    figures, captions = _figures(P, step["P, H = I"], U, curves)
+    claims = _claims(noise, step, responses, random, curves, M)
     return Reproduction(TITLE, claims, (table, quantities), figures, captions)
 
 
@@ -503,19 +520,10 @@ def _quantity_table(
     return Grid("Filter and response", ("quantity", *_CASES), rows)
 
 
-def _figures(P: Signals, P_step: Signals, U: Signals) -> tuple[dict[str, Any], dict[str, str]]:
-    task, T = U.task, U.task.parameters.value("sampling_interval")
-    d, names = task.design, [c.name for c in task.components]
-    H = numpy.eye(len(names))
-    rate, elevator = names.index("rate"), names.index("elevator")
-    R = numpy.diag(numpy.square(task.parameters.value("sensor_sigmas")[1:]))
-    steps = 20_000
-    curves = {
-        "with the correcting term": _covariances(task, steps),
-        "without it (no measurement)": _covariances(task, steps, H=H[:0]),
-        "no sensor of pitch: not detectable": _covariances(task, steps, H=H[[rate, elevator]], R=R),
-        "gusts the only noise": _covariances(task, steps, Q=d.model.scaled_noise),
-    }
+def _figures(
+    P: Signals, P_step: Signals, U: Signals, curves: dict[str, numpy.ndarray]
+) -> tuple[dict[str, Any], dict[str, str]]:
+    T = U.task.parameters.value("sampling_interval")
     figures = {"figure_3_filter": _draw_filter(P, P_step)}
     captions = {
         "figure_3_filter": "Plant P: signal at the input (A) and the output (B) of the filter, one run; "
@@ -550,6 +558,7 @@ def _claims(
     step: dict[str, Signals],
     responses: dict[str, numpy.ndarray],
     random: dict[str, Any],
+    curves: dict[str, numpy.ndarray],
     M: int,
 ) -> list[Claim]:
     P, U = noise["P, H = I"]["kalman"], noise["U"]["kalman"]
@@ -557,11 +566,7 @@ def _claims(
     for case, loops in noise.items():
         d = loops["kalman"].task.design
         defects[case] = linear_systems.separation_defect(d.model.F, d.model.B, d.H, d.feedback, d.steady.gain)
-    settled = _covariances(U.task, 6000)[0]
-    alone = _covariances(U.task, 6000, H=numpy.eye(5)[:0])[0]
-    R = numpy.diag(numpy.square(U.task.parameters.value("sensor_sigmas")[1:]))
-    blind = _covariances(U.task, 6000, H=numpy.eye(5)[[1, 3]], R=R)[0]
-    gusts = _covariances(U.task, 60_000, Q=U.task.design.model.scaled_noise)[1]
+    settled, alone, blind, gusts = curves.values()
     theory = {plant: [loop_theory(s.task, scale) for scale in SCALES] for plant, s in (("P", P), ("U", U))}
     excess = {}
     for plant, dataset in random.items():
@@ -598,11 +603,11 @@ def _claims(
         Claim(
             "3",
             "The correcting term of the Riccati equation limits the growth of the covariance.",
-            f"U, sigma of pitch after 2 min: {settled[-1]:.3f} deg with all sensors, {alone[-1]:.1f} deg "
-            f"without measurements; but {blind[-1]:.1f} deg and growing when no sensor detects pitch. With "
+            f"U, sigma of pitch after 2 min: {settled[0, -1]:.3f} deg with all sensors, {alone[0, -1]:.1f} deg "
+            f"without measurements; but {blind[0, -1]:.1f} deg and growing when no sensor detects pitch. With "
             "gusts as the only noise the covariance stays bounded, but the gain on the pitch integrator, "
-            f"which gusts do not reach, falls as 1/t and the filter goes to sleep: {gusts[599]:.1e} after "
-            f"12 s, {gusts[-1]:.1e} after 20 min.",
+            f"which gusts do not reach, falls as 1/t and the filter goes to sleep: {gusts[1, 599]:.1e} after "
+            f"12 s, {gusts[1, -1]:.1e} after 2 min.",
             "recursion (12); the condition is detectability, and for a steady filter that is stable also "
             "noise on every integrating mode",
             "reproduced in part",
