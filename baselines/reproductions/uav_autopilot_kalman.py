@@ -603,8 +603,8 @@ def _claims(
         Claim(
             "3",
             "The correcting term of the Riccati equation limits the growth of the covariance.",
-            f"U, sigma of pitch after 2 min: {settled[0, -1]:.3f} deg with all sensors, {alone[0, -1]:.1f} deg "
-            f"without measurements; but {blind[0, -1]:.1f} deg and growing when no sensor detects pitch. With "
+            f"U, sigma of pitch in 2 min: {settled[0, -1]:.3f} deg with all sensors, {alone[0, -1]:.1f} deg "
+            f"without measurements; but {blind[0, -1]:.1f} deg, growing, when no sensor detects pitch. With "
             "gusts as the only noise the covariance stays bounded, but the gain on the pitch integrator, "
             f"which gusts do not reach, falls as 1/t and the filter goes to sleep: {gusts[1, 599]:.1e} after "
             f"12 s, {gusts[1, -1]:.1e} after 2 min.",
