@@ -80,10 +80,16 @@ def load_policy(id: str, name: str) -> Any:
 
 
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
-    """Control that a run uses: the policy's own, unless it suits the one asked for."""
-    own = getattr(maker, "control", None)
+    """Control that a run uses: the policy's own, or the one that fits a model's action space."""
     if kind != "policy":
         return cls.controls[0]
+    own = getattr(maker, "control", None)
+    space = getattr(maker, "action_space", None)
+    if own is None and space is not None:
+        fitting = [c for c in cls.controls if make_task(cls.id, c).action_space == space]
+        if not fitting:
+            raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
+        own = control if control in fitting else fitting[0]
     if own is None:
         return control or cls.controls[0]
     if control is not None and own != control:
@@ -133,7 +139,7 @@ def evaluate(
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        policies: names, or a mapping from a name to a class or object with a ``predict`` method.
+        policies: names, or a mapping from a name to a name, a class, or an object with a ``predict`` method.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
@@ -151,12 +157,15 @@ def evaluate(
         ValueError: for unknown names, or a policy that does not fit the control.
     """
     cls = task_class(env)
-    chosen = find_scenario(cls, scenario)
+    chosen = find_scenario(cls, scenario, keywords)
     known = baselines_of(cls.id)
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
     makers: dict[str, Any] = (
-        dict(policies)
+        {
+            name: load_policy(cls.id, entry) if isinstance(entry, str) else entry
+            for name, entry in policies.items()
+        }
         if isinstance(policies, Mapping)
         else {name: load_policy(cls.id, name) for name in policies}
     )
@@ -174,8 +183,12 @@ def evaluate(
         controls[name] = _control_of(maker, kinds[name], control, cls, name)
         tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
     for name, task in tasks.items():
-        if getattr(makers[name], "control", task.control) != task.control:
-            raise ValueError(f"policy {name!r} does not fit control {task.control!r}")
+        shown = getattr(getattr(makers[name], "observation_space", None), "shape", None)
+        if shown is not None and shown != (len(task.fields),):
+            raise ValueError(
+                f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
+                f"{len(task.fields)} fields"
+            )
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in makers.items():

@@ -8,7 +8,8 @@ import difflib
 import functools
 import importlib
 import pkgutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy
 from . import parameters as check
 from . import tasks
 from .task import Scenario, Task
-from .trajectory import Trajectory
+from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
 
 
 @functools.cache
@@ -52,10 +53,20 @@ def parameter_names(cls: type[Task]) -> list[str]:
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 
-def find_scenario(cls: type[Task], scenario: str | Trajectory | None) -> Scenario:
-    """Return a scenario by name (default: the environment's own), or one made from a user's trajectory."""
+def find_scenario(
+    cls: type[Task], scenario: str | Trajectory | None, keywords: Mapping[str, Any] | None = None
+) -> Scenario:
+    """Return a scenario by name (default: the environment's own), or make one from a user's trajectory.
+
+    Args:
+        cls: the environment.
+        scenario: a name, a trajectory, or the path of a CSV or NetCDF file with one.
+        keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
+    """
+    if isinstance(scenario, str) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
+        scenario = read_trajectory(Path(scenario))
     if isinstance(scenario, Trajectory):
-        return cls.scenario_from_trajectory(scenario)
+        return cls.scenario_from_trajectory(scenario, keywords or {})
     name = scenario or cls.default_scenario
     if name not in cls.scenarios:
         raise nearest("scenario", name, cls.scenarios)
@@ -87,7 +98,7 @@ def make_task(
     control = control or cls.controls[0]
     if control not in cls.controls:
         raise nearest("control", control, cls.controls)
-    chosen = find_scenario(cls, scenario)
+    chosen = find_scenario(cls, scenario, keywords)
     known = parameter_names(cls)
     for name in keywords:
         if name not in known:

@@ -148,8 +148,8 @@ class Task(ABC, Generic[State]):
         self.device = device
 
     @classmethod
-    def scenario_from_trajectory(cls, trajectory: Any) -> Scenario:
-        """Make a scenario of a user's trajectory; only tasks whose target flies freely can."""
+    def scenario_from_trajectory(cls, trajectory: Any, keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""
         raise ValueError(f"{cls.id} does not take a trajectory as scenario")
 
     def constant(self, values: Any) -> Array:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy
 
@@ -77,6 +78,46 @@ class Trajectory:
         rate = curve(inside, 1)
         position = curve(inside) + rate * (wanted - inside)[:, None]
         return numpy.concatenate([position, rate], axis=1).T
+
+
+TRAJECTORY_SUFFIXES = (".csv", ".nc")
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory from a file.
+
+    Args:
+        path: CSV with a header line, or NetCDF with variables along one dimension: ``time`` (s), ``x``, ``y``
+            (m) and optionally ``vx``, ``vy`` (m/s).
+
+    Raises:
+        ValueError: if the file cannot be read, a column is missing, or a value is not a number.
+    """
+    columns: dict[str, numpy.ndarray]
+    try:
+        if path.suffix == ".nc":
+            import xarray
+
+            with xarray.open_dataset(path, engine="scipy", decode_times=False) as data:
+                columns = {str(name): data[name].values for name in data.variables}
+        else:
+            with path.open(encoding="utf-8-sig") as file:
+                names = [name.strip() for name in file.readline().split(",")]
+                values = numpy.loadtxt(file, delimiter=",", ndmin=2)
+            if values.shape[1] != len(names):
+                raise ValueError(f"{len(names)} column names but {values.shape[1]} columns")
+            columns = dict(zip(names, values.T, strict=True))
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"cannot read trajectory {path}: {error}") from error
+    missing = [name for name in ("time", "x", "y") if name not in columns]
+    if missing:
+        raise ValueError(
+            f"trajectory {path} lacks the column {', '.join(missing)}; it has {', '.join(columns)} and needs "
+            "time, x, y and optionally vx, vy"
+        )
+    position = numpy.column_stack([columns["x"], columns["y"]])
+    velocity = numpy.column_stack([columns["vx"], columns["vy"]]) if {"vx", "vy"} <= set(columns) else None
+    return Trajectory(columns["time"], position, velocity, name=path.stem)
 
 
 def flown_legs(

@@ -6,6 +6,7 @@ the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``fi
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -18,11 +19,14 @@ from ...filters.gaussian import log_density
 from .. import parameters as check
 from ..controls import bank_action_space, bank_probabilities, signed_logarithm
 from ..scenarios.maneuvering_target import SCENARIOS
-from ..task import Array, Component, Field, NoiseLayout, PaperPolicy, Task
-from ..trajectory import flown_legs
+from ..task import Array, Component, Field, NoiseLayout, PaperPolicy, Scenario, Task
+from ..trajectory import Trajectory, flown_legs
 
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
+
+FARTHEST_RANGE = 500e3
+"""Metres; a user's trajectory beyond this is taken for a mistake of units."""
 
 
 @dataclass(frozen=True)
@@ -321,6 +325,32 @@ class ManeuveringTarget(Task[State]):
         else:
             self.action_space = bank_action_space(control, len(p.gains))
             self.fields = self._bank_fields()
+
+    @classmethod
+    def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
+        """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
+        interval = keywords.get("sampling_interval", ManeuveringTargetParameters.sampling_interval)
+        check.number("sampling_interval", interval, above=0.0)
+        farthest = float(numpy.hypot(*trajectory.position.T).max())
+        if farthest > FARTHEST_RANGE:
+            raise ValueError(
+                f"trajectory {trajectory.name!r} goes {farthest / 1e3:,.0f} km from the radar at the origin; "
+                f"its range ends at {FARTHEST_RANGE / 1e3:,.0f} km (positions are metres)"
+            )
+        scans = int(trajectory.duration / interval + 1e-9)
+        if scans < 2:
+            raise ValueError(
+                f"trajectory {trajectory.name!r} lasts {trajectory.duration:g} s, which is less than two scans "
+                f"of {interval:g} s: give a smaller sampling_interval"
+            )
+        horizon = keywords.get("horizon", scans)
+        track = trajectory.resampled(interval, horizon + 2)
+        return Scenario(
+            trajectory.name,
+            "A flight given by its positions.",
+            {"flight": "track", "horizon": horizon, "track": tuple(map(tuple, track.tolist()))},
+            {"all": (1, horizon)},
+        )
 
     # --- what the agent is shown
 
