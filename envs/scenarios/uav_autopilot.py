@@ -16,7 +16,7 @@ _RANDOM = {
     "disturbance_times": ((100, 250), (350, 500)),
     "sensor_levels": ((0.5, 2.0), (0.5, 5.0)),
     "sensor_times": ((150, 450),),
-    "dropouts": 2,
+    "dropout_period": 300,
 }
 _NOMINAL_WITH_COMMANDS = {"command_amplitude": (0.25, 1.0)}
 
