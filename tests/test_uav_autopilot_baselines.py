@@ -196,6 +196,23 @@ def test_nobody_beats_the_optimal_filter_in_its_own_scenario(plant: str) -> None
     assert floor.mean() < -10.0 * floor.std() / math.sqrt(len(floor))
 
 
+def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
+    """Why the comparison above stops before the end: no leak, but the optimum is that of an endless loop."""
+
+    class RestAtTheEnd(module.Kalman):
+        def act(
+            self, observation: numpy.ndarray, state: Any, start: numpy.ndarray
+        ) -> tuple[numpy.ndarray, Any]:
+            left = self.task.horizon * (1.0 - observation[:, self.task.columns(["time"])[0]])
+            return numpy.where(left < 9.5, -0.3, 0.0)[:, None], None
+
+    dataset = evaluate(ID, {"kalman": module.Kalman, "resting": RestAtTheEnd}, "paper-noise", 200)
+    saved = dataset["cost"].values[0].mean(axis=1) - dataset["cost"].values[1].mean(axis=1)
+    assert saved.mean() > 4.0 * saved.std(ddof=1) / math.sqrt(200)
+    assert saved.mean() < 0.002 * dataset["cost"].values[0].mean()
+    numpy.testing.assert_array_equal(*(dataset["cost"].values[:, :, :589]))
+
+
 # ---------------------------------------------------------------- policies
 
 

@@ -278,7 +278,12 @@ def stationary(task: UavAutopilot, name: str) -> Stationary | None:
     """
     p, d = task.parameters, task.design
     nominal = ((1.0, 1.0),)
-    if (p.disturbance_levels, p.sensor_levels, p.dropout_period, p.actuator_lag) != (nominal, nominal, 0, 1.0):
+    if (p.disturbance_levels, p.sensor_levels, p.dropout_period, p.actuator_lag) != (
+        nominal,
+        nominal,
+        0,
+        1.0,
+    ):
         return None
     F, B, H, L, R = d.model.F, d.model.B, d.H, d.feedback, d.R
     Q, n = d.model.scaled_noise + d.model.other_noise, len(d.model.F)

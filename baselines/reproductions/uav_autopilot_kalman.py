@@ -456,9 +456,9 @@ def _variance_table(noise: dict[str, dict[str, Signals]]) -> Grid:
                     case,
                     loop,
                     f"{theory.output_variance:.5f}",
-                    _measured(s.output[:, SETTLED] ** 2),
+                    _measured(s.output[:, SETTLED] ** 2, 5),
                     f"{theory.control_variance:.5f}",
-                    _measured(s.control[:, SETTLED] ** 2),
+                    _measured(s.control[:, SETTLED] ** 2, 5),
                     f"{theory.cost * s.task.cost_unit:.4f}",
                     _measured(s.cost[:, SETTLED]),
                 )
