@@ -84,7 +84,7 @@ class UavAutopilotPicture(Picture):
                 guides=(-2.0, 0.0, 2.0),
             ),
             Strip("NIS per reading, short average", {"NIS": "mean_nis"}, (0.0, 2.0), guides=(1.0,)),
-            Strip("hidden: noise over nominal", levels, (0.0, 2.0), guides=(1.0,), steps=True),
+            Strip("hidden: noise over nominal", levels, (0.0, 2.2), guides=(1.0,), steps=True),
             steered,
         ]
 
