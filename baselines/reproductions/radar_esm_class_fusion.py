@@ -655,7 +655,7 @@ def draw_deviation(r: Results, component: int) -> Any:
         axis.set_yscale("log")
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "25" else "")
-    axis.set_ylabel(f"standard deviation of the {label} error, {unit}")
+    axis.set_ylabel(f"std. deviation of {label} error, {unit}")
     axis.set_xlabel("t, s")
     axis.set_xlim(0.0, _TIMES[-1])
     axis.grid(alpha=0.25, which="both", lw=0.4)
