@@ -500,3 +500,32 @@ def test_recognition_verdict():
 def test_reproduction_refuses_too_few_episodes():
     with pytest.raises(ValueError, match="at least 100"):
         reproduction.reproduce(lambda _: None, 5)
+
+
+# --- the picture
+
+
+def test_picture_shows_accelerations_decisions_and_the_change():
+    from filtergym.envs.environment import TaskEnv
+
+    world = TaskEnv(ID, "weights", "class-change", render_mode="rgb_array")
+    world.reset(seed=2)
+    for _ in range(100):
+        world.step(numpy.ones(3))
+    drawn = world.picture
+    frame = world.render()
+    history = {name: numpy.array(values) for name, values in drawn.history.items()}
+    panels = drawn.picture
+    numpy.testing.assert_array_equal(panels.true.get_ydata(), history["true"])
+    numpy.testing.assert_allclose(
+        panels.estimate.get_ydata() - history["true"], history["error.acceleration"]
+    )
+    used, refused = (numpy.isfinite(history[name]) for name in ("used", "refused"))
+    assert not (used & refused).any()
+    assert (numpy.flatnonzero(used | refused) % 4 == 3).all()
+    assert (used | refused).any()
+    change = int(numpy.flatnonzero(numpy.diff(history["true_class"]))[0]) + 2
+    assert panels.shaded() == [(change - 0.5, 120.5)]
+    world.reset(seed=3)
+    assert (world.render() != frame).any()
+    world.close()
