@@ -1,0 +1,317 @@
+r"""Tracking a target of unknown class: a filter for each class, weighed by a radar and by a type recogniser.
+
+The algorithm of the paper by Ivanov and Seliverstov; equation numbers are theirs. A target of class s moves
+by x(k) = Phi(s) x(k-1) + xi(s), a radar measures z = H x + noise at every scan k, and at some scans the
+electronic support measures (ESM) decide for a type rho with the known probabilities pi(rho | type). The
+class may jump with probabilities q(s(k) | s(k-1)). One cycle, in the order of (8)-(10):
+
+    1  each filter predicts and updates with the model of s(k-1)         x~, R~, Delta, Theta, mu, Omega
+    2  Lambda(s(k-1)) = N(Delta; 0, Theta) weighs it by the radar        w(s') = P(s') Lambda(s')
+    3  the class jumps                                                   P-(s) = sum_s' q(s | s') w(s')
+       and the filters mix                                               x(s), R(s)            (9), (10)
+    4  the ESM decision is a factor, where there is one that may be used P(s) ~ pi(rho | s) P-(s)   (8)
+    5  output                                                            x, R                (11), (12)
+
+Steps 1 to 3 are :func:`advance`, 4 is :func:`~filtergym.filters.imm.mode_posterior`, 5 is
+:func:`~filtergym.filters.imm.combine`. An IMM mixes before it predicts; here mixing ends the cycle, because
+(8)-(10) write every factor of the motion as a function of s(k-1). The two differ in whether an ESM decision
+judges the class before or after a jump.
+
+With a constant class, q = identity, nothing mixes: a bank of Kalman filters whose covariances and gains do
+not depend on the data (:func:`design_channels`), and :func:`update_channels` is all that is left to do.
+
+Reading: the first sum of (8) is over s(k-1), for a fixed s(k). The type probabilities of a class are
+pi(rho | s) = sum_j pi(rho | type j) P(type j | s).
+Reading: in the gate (6), (7) the inverse is that of the standard normal distribution function and P_err the
+probability of *refusing* two bearings of one target, whatever the damaged prose calls it.
+
+Shapes: M classes, J types, n states, m measured components; probabilities ``(M, N)``, means ``(n, M, N)``,
+covariances ``(n, n, M, N)``, models ``(n, n, M)``.
+"""
+
+import math
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy
+
+from . import imm
+from .array_namespace import Array, namespace
+from .gaussian import log_density
+from .small_matrices import apply, cholesky, product, solve_lower, transpose
+
+# --- the general recursion
+
+
+class Models(NamedTuple):
+    """Motion of each class and the one radar that measures them all."""
+
+    Phi: Array
+    """Transition matrices, ``(n, n, M)``."""
+    Q: Array
+    """Covariances of the process noise, ``(n, n, M)``."""
+    H: Array
+    """Measurement matrix, ``(m, n)``."""
+    R: Array
+    """Covariance of the measurement noise, ``(m, m)``."""
+
+
+class Advance(NamedTuple):
+    """The bank after radar update and class transition, before the ESM."""
+
+    mean: Array
+    """Conditional estimates (9), ``(n, M, N)``."""
+    covariance: Array
+    """Their covariances (10), ``(n, n, M, N)``."""
+    log_predicted: Array
+    """Logarithm of P-(s), normalised, ``(M, N)``."""
+    innovation: Array
+    """Whitened innovations of the filters before mixing, ``(m, M, N)``: :func:`whiten`."""
+    log_likelihood: Array
+    """log Lambda of the filters before mixing, as a density, ``(M, N)``."""
+
+
+def whiten(factor: list[list[Array]], innovation: Array) -> Array:
+    """``L^-1 Delta`` with ``Theta = L L^T``: independent components of variance one, ``(m, ...)``.
+
+    The first is the innovation of the first component over its predicted sigma, the next what of the second
+    the first does not explain, over its sigma, and so on. Their squares add to the normalised innovation
+    squared.
+    """
+    return namespace(innovation).stack(solve_lower(factor, innovation))
+
+
+def advance(
+    probabilities: Array, mean: Array, covariance: Array, z: Array, models: Models, class_transition: Array
+) -> Advance:
+    """Steps 1 to 3 of the recursion: radar update of every filter, class transition, mixing.
+
+    A class that cannot be reached keeps its own filter.
+
+    Args:
+        probabilities: P(s(k-1)), ``(M, N)``.
+        mean: x(s(k-1)), ``(n, M, N)``.
+        covariance: R(s(k-1)), ``(n, n, M, N)``.
+        z: radar measurement, ``(m, N)``.
+        models: of the classes.
+        class_transition: q, ``(M, M)``, row = from, column = to.
+    """
+    xp = namespace(mean)
+    Phi, Q = models.Phi[..., None], models.Q[..., None]
+    H, R = models.H[..., None, None], models.R[..., None, None]
+    predicted = apply(Phi, mean)
+    predicted_covariance = product(product(Phi, covariance), transpose(Phi)) + Q
+    innovation = z[:, None] - apply(H, predicted)
+    HP = product(H, predicted_covariance)
+    Theta = product(HP, transpose(H)) + R
+    factor = cholesky(Theta)
+    whitened = whiten(factor, innovation)
+    # G = L^-1 H R~, so that the gain is G^T L^-1.
+    G = xp.stack(solve_lower(factor, HP))
+    updated = predicted + apply(transpose(G), whitened)
+    gain = transpose(_solve_upper(factor, G))
+    rest = xp.eye(mean.shape[0], dtype=mean.dtype, device=mean.device)[..., None, None] - product(gain, H)
+    # Joseph form: positive definite whatever the rounding.
+    updated_covariance = product(product(rest, predicted_covariance), transpose(rest)) + product(
+        product(gain, R), transpose(gain)
+    )
+    log_likelihood, _ = log_density(innovation, Theta)
+    weights = imm.mode_posterior(imm.log_probabilities(probabilities), log_likelihood)
+    jump = imm.predict_mode_probabilities(class_transition, weights)
+    mixed, mixed_covariance = imm.mix(updated, updated_covariance, jump.mixing)
+    return Advance(
+        mixed, mixed_covariance, imm.log_probabilities(jump.probabilities), whitened, log_likelihood
+    )
+
+
+def _solve_upper(L: list[list[Array]], B: Array) -> Array:
+    """Solve ``L^T X = B``."""
+    size = len(L)
+    x: list[Array] = [None] * size
+    for i in reversed(range(size)):
+        entry = B[i]
+        for j in range(i + 1, size):
+            entry = entry - L[j][i] * x[j]
+        x[i] = entry / L[i][i]
+    return namespace(B).stack(x)
+
+
+# --- the bank of constant classes
+
+
+class Channels(NamedTuple):
+    """What a bank of constant classes can know before any data, for scans 0 to K."""
+
+    gain: numpy.ndarray
+    """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""
+    covariance: numpy.ndarray
+    """Covariances after the update, ``(n, n, M, K + 1)``."""
+    whitening: numpy.ndarray
+    """Inverse Cholesky factors of Theta, lower triangular, ``(m, m, M, K + 1)``; zero at scan 0."""
+    log_normaliser: numpy.ndarray
+    """``-1/2 log det(2 pi Theta)``, ``(M, K + 1)``; zero at scan 0."""
+
+
+def design_channels(models: Models, start: numpy.ndarray, scans: int) -> Channels:
+    """Gains, covariances and innovation statistics of the Kalman filters of all classes.
+
+    Args:
+        models: of the classes, NumPy arrays.
+        start: covariances at scan 0, ``(n, n, M)``.
+        scans: K, the last scan.
+    """
+    n, classes = start.shape[0], start.shape[2]
+    m = models.H.shape[0]
+    gain = numpy.zeros((n, m, classes, scans + 1))
+    covariance = numpy.zeros((n, n, classes, scans + 1))
+    whitening = numpy.zeros((m, m, classes, scans + 1))
+    log_normaliser = numpy.zeros((classes, scans + 1))
+    covariance[..., 0] = start
+    H, R = models.H, models.R
+    for s in range(classes):
+        P = start[..., s]
+        for k in range(1, scans + 1):
+            P = models.Phi[..., s] @ P @ models.Phi[..., s].T + models.Q[..., s]
+            Theta = H @ P @ H.T + R
+            K = numpy.linalg.solve(Theta, H @ P).T
+            rest = numpy.eye(n) - K @ H
+            P = rest @ P @ rest.T + K @ R @ K.T
+            L = numpy.linalg.cholesky(Theta)
+            gain[..., s, k], covariance[..., s, k] = K, P
+            whitening[..., s, k] = numpy.linalg.inv(L)
+            log_normaliser[s, k] = -numpy.log(numpy.diag(L)).sum() - 0.5 * m * math.log(2.0 * math.pi)
+    return Channels(gain, covariance, whitening, log_normaliser)
+
+
+class ChannelUpdate(NamedTuple):
+    """Result of one scan of the bank of constant classes."""
+
+    mean: Array
+    """``(n, M, N)``."""
+    innovation: Array
+    """Whitened, ``(m, M, N)``."""
+    log_likelihood: Array
+    """``(M, N)``."""
+
+
+def update_channels(
+    mean: Array, z: Array, Phi: Array, H: Array, gain: Array, whitening: Array, log_normaliser: Array
+) -> ChannelUpdate:
+    """Step 1 of the recursion for filters whose gains are known.
+
+    Args:
+        mean: x(s), ``(n, M, N)``.
+        z: radar measurement, ``(m, N)``.
+        Phi: ``(n, n, M)``.
+        H: ``(m, n)``.
+        gain: of this scan, ``(n, m, M, N)``.
+        whitening: ``(m, m, M, N)``.
+        log_normaliser: ``(M, N)``.
+    """
+    predicted = apply(Phi[..., None], mean)
+    innovation = z[:, None] - apply(H[..., None, None], predicted)
+    whitened = apply(whitening, innovation)
+    squared = whitened[0] * whitened[0]
+    for i in range(1, whitened.shape[0]):
+        squared = squared + whitened[i] * whitened[i]
+    return ChannelUpdate(predicted + apply(gain, innovation), whitened, log_normaliser - 0.5 * squared)
+
+
+def channel_error_covariance(
+    models: Models, channels: Channels, target: int, channel: int, start: numpy.ndarray
+) -> numpy.ndarray:
+    """Exact error covariance of the filter of one class on a target of another, ``(n, n, K + 1)``.
+
+    Truth and error e = estimate - truth obey one linear recursion of 2 n states,
+
+        x(k) = Phi_t x + xi,   e(k) = (I - K H) (Phi_c e + (Phi_c - Phi_t) x - xi) + K v
+
+    with t the target's class and c the filter's, so the covariance follows without Monte Carlo. The mean of
+    the error is zero when that of x lies where Phi_c and Phi_t agree (any mean position and velocity).
+
+    Args:
+        models: of the classes.
+        channels: design of the filters, for scans 0 to K.
+        target: index of the true class.
+        channel: index of the filter.
+        start: joint covariance of (x, e) at scan 0, ``(2 n, 2 n)``.
+    """
+    n = models.Phi.shape[0]
+    Phi_t, Phi_c = models.Phi[..., target], models.Phi[..., channel]
+    scans = channels.gain.shape[-1]
+    joint = start
+    result = numpy.zeros((n, n, scans))
+    result[..., 0] = start[n:, n:]
+    for k in range(1, scans):
+        K = channels.gain[..., channel, k]
+        rest = numpy.eye(n) - K @ models.H
+        A = numpy.block([[Phi_t, numpy.zeros((n, n))], [rest @ (Phi_c - Phi_t), rest @ Phi_c]])
+        B = numpy.concatenate([numpy.eye(n), -rest])
+        C = numpy.concatenate([numpy.zeros_like(K), K])
+        joint = A @ joint @ A.T + B @ models.Q[..., target] @ B.T + C @ models.R @ C.T
+        result[..., k] = joint[n:, n:]
+    return result
+
+
+# --- the ESM
+
+
+def decision_probabilities(confusion: numpy.ndarray, composition: numpy.ndarray) -> numpy.ndarray:
+    """Probability pi(rho | s) of every ESM decision for every class, ``(M, J)``.
+
+    Args:
+        confusion: pi(rho | type), ``(J, J)``, row = true type, column = decision; equation (5).
+        composition: P(type | s), ``(M, J)``, rows sum to one.
+    """
+    return numpy.asarray(composition) @ numpy.asarray(confusion)
+
+
+def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
+    """Mean log-likelihood ratio of one decision, nats, ``(M, M)``: row = true class, column = its rival.
+
+    The Kullback-Leibler divergence of rows of :func:`decision_probabilities`, which must be positive.
+    """
+    logarithm = numpy.log(probabilities)
+    return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
+
+
+def fixed_type_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
+    """Log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
+
+    (8) multiplies pi(rho | s) at every decision, which is Bayes' rule only if the type is drawn anew each
+    time. For one type ``log sum_j P(type j | s) prod_rho pi(rho | type j)^count(rho)``: the posterior of type
+    and class together, summed over the type.
+
+    Args:
+        counts: how often each type was decided, ``(J, N)``.
+        log_confusion: log pi(rho | type), ``(J, J)``, row = true type; finite.
+        log_composition: log P(type | s), ``(M, J)``; finite.
+    """
+    xp = namespace(counts)
+    evidence = apply(log_confusion[..., None], counts)
+    joint = log_composition[..., None] + evidence[None]
+    largest = xp.max(joint, axis=1)
+    terms = xp.exp(joint - largest[:, None])
+    total = terms[:, 0]
+    for j in range(1, terms.shape[1]):
+        total = total + terms[:, j]
+    return largest + xp.log(total)
+
+
+def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float) -> float:
+    """Largest difference of two bearings that are taken for one target, equation (7), in the sigmas' unit.
+
+    ``sqrt(sigma_Z^2 + sigma_Y^2) F^-1(1 - P_err / 2)``.
+
+    Raises:
+        ValueError: ``error_probability`` is not between 0 and 1.
+    """
+    if not 0.0 < error_probability < 1.0:
+        raise ValueError(f"error_probability must be above 0 and below 1, got {error_probability!r}")
+    return math.hypot(radar_sigma, esm_sigma) * NormalDist().inv_cdf(1.0 - error_probability / 2.0)
+
+
+def bearing_difference(first: Array, second: Array) -> Array:
+    """Difference of two bearings in degrees, wrapped to [-180, 180)."""
+    difference = first - second
+    return difference - 360.0 * namespace(difference).floor((difference + 180.0) / 360.0)

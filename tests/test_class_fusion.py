@@ -1,0 +1,245 @@
+"""Class fusion: the recursion against a naive one, the bank as its special case, the ESM's mathematics."""
+
+import itertools
+import math
+
+import array_api_compat.torch as torch
+import numpy
+import pytest
+from filtergym.envs.tasks.radar_esm_tracking import RadarEsmTracking, RadarEsmTrackingParameters
+from filtergym.filters import class_fusion, imm
+
+PARAMETERS = RadarEsmTrackingParameters()
+MODELS, START = RadarEsmTracking.design_models(PARAMETERS)
+ASYMMETRIC = numpy.array([[0.9, 0.08, 0.02], [0.0, 0.7, 0.3], [0.25, 0.05, 0.7]])
+
+
+def bank(rng, N):
+    """Random weights, means and covariances of a bank, and a measurement near them."""
+    P = rng.dirichlet([1.0, 1.0, 1.0], N).T
+    mean = rng.standard_normal((3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None]
+    root = rng.standard_normal((3, 3, 3, N)) * numpy.array([1000.0, 20.0, 5.0])[:, None, None, None]
+    covariance = numpy.einsum("iksn,jksn->ijsn", root, root)
+    z = numpy.stack([2000.0 * rng.standard_normal(N), 30.0 * rng.standard_normal(N)])
+    return P, mean, covariance, z
+
+
+def naive(P, mean, covariance, z, models, q, factor):
+    """Equations (8) to (12) as printed, one lane, matrices and loops."""
+    M = len(P)
+    mu, Omega, Lambda = [], [], []
+    for s in range(M):
+        x = models.Phi[..., s] @ mean[:, s]
+        R = models.Phi[..., s] @ covariance[..., s] @ models.Phi[..., s].T + models.Q[..., s]
+        Theta = models.H @ R @ models.H.T + models.R
+        Delta = z - models.H @ x
+        K = R @ models.H.T @ numpy.linalg.inv(Theta)
+        mu.append(x + K @ Delta)
+        Omega.append(R - K @ models.H @ R)
+        Lambda.append(
+            numpy.linalg.det(Theta) ** -0.5 * math.exp(-0.5 * Delta @ numpy.linalg.inv(Theta) @ Delta)
+        )
+    posterior, X, C = numpy.zeros(M), [], []
+    for s in range(M):
+        w = numpy.array([P[r] * q[r, s] * Lambda[r] for r in range(M)])
+        posterior[s] = factor[s] * w.sum()
+        X.append(sum(w[r] * mu[r] for r in range(M)) / w.sum())
+        C.append(sum(w[r] * (Omega[r] + numpy.outer(mu[r] - X[s], mu[r] - X[s])) for r in range(M)) / w.sum())
+    posterior /= posterior.sum()
+    out = sum(posterior[s] * X[s] for s in range(M))
+    second = sum(posterior[s] * (C[s] + numpy.outer(X[s], X[s])) for s in range(M))
+    return posterior, numpy.stack(X, -1), numpy.stack(C, -1), out, second - numpy.outer(out, out)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("q", [ASYMMETRIC, numpy.eye(3)], ids=["asymmetric", "identity"])
+def test_recursion_is_the_printed_one(seed, q):
+    rng = numpy.random.default_rng(seed)
+    P, mean, covariance, z = bank(rng, 8)
+    factor = rng.uniform(0.05, 0.9, (3, 8))
+    step = class_fusion.advance(P, mean, covariance, z, MODELS, q)
+    posterior = imm.mode_posterior(step.log_predicted, numpy.log(factor))
+    out, out_covariance = imm.combine(step.mean, step.covariance, posterior)
+    scale = numpy.array([1000.0, 20.0, 5.0])
+    for n in range(8):
+        p, X, C, x, R = naive(P[:, n], mean[..., n], covariance[..., n], z[:, n], MODELS, q, factor[:, n])
+        # A few hundred operations on numbers of one scale; Omega and (12) of the oracle subtract.
+        assert posterior[:, n] == pytest.approx(p, rel=1e-10, abs=1e-15)
+        assert step.mean[..., n] / scale[:, None] == pytest.approx(X / scale[:, None], abs=1e-11)
+        assert out[:, n] / scale == pytest.approx(x / scale, abs=1e-11)
+        both = numpy.outer(scale, scale)
+        assert step.covariance[..., n] / both[..., None] == pytest.approx(C / both[..., None], abs=1e-9)
+        assert out_covariance[..., n] / both == pytest.approx(R / both, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_identity_is_a_bank_of_kalman_filters(seed):
+    rng = numpy.random.default_rng(seed)
+    N, scans = 8, 60
+    channels = class_fusion.design_channels(MODELS, START, scans)
+    mean = numpy.zeros((3, 3, N)) + numpy.array([1e3, -5.0, 0.0])[:, None, None]
+    general, general_covariance = mean, START[..., None] + numpy.zeros(N)
+    P = Q = numpy.full((3, N), 1 / 3)
+    for k in range(1, scans + 1):
+        z = numpy.stack([1e3 + 3000 * rng.standard_normal(N), 20 * rng.standard_normal(N)])
+        step = class_fusion.advance(Q, general, general_covariance, z, MODELS, numpy.eye(3))
+        general, general_covariance, Q = step.mean, step.covariance, numpy.exp(step.log_predicted)
+        column = numpy.full(N, k)
+        update = class_fusion.update_channels(
+            mean,
+            z,
+            MODELS.Phi,
+            MODELS.H,
+            channels.gain[..., column],
+            channels.whitening[..., column],
+            channels.log_normaliser[..., column],
+        )
+        mean = update.mean
+        P = imm.mode_posterior(imm.log_probabilities(P), update.log_likelihood)
+        # The issue of both ways of computing one thing: relative 1e-12 (ranges of kilometres).
+        assert general == pytest.approx(mean, rel=1e-12, abs=1e-9)
+        assert general_covariance == pytest.approx(channels.covariance[..., column], rel=1e-11)
+        assert pytest.approx(P, abs=1e-12) == Q
+        assert step.log_likelihood == pytest.approx(update.log_likelihood, rel=1e-12)
+        assert step.innovation == pytest.approx(update.innovation, rel=1e-11, abs=1e-11)
+
+
+def test_class_transition_is_read_from_row_to_column():
+    P, mean, covariance, z = bank(numpy.random.default_rng(0), 8)
+    P = numpy.array([[0.0], [1.0], [0.0]]) + numpy.zeros(8)
+    step = class_fusion.advance(P, mean, covariance, z, MODELS, ASYMMETRIC)
+    assert numpy.exp(step.log_predicted) == pytest.approx(ASYMMETRIC[1][:, None] + numpy.zeros(8), abs=1e-12)
+
+
+def test_a_class_of_no_probability_and_a_wild_measurement_stay_finite():
+    P, mean, covariance, _ = bank(numpy.random.default_rng(1), 8)
+    z = numpy.full((2, 8), 1e9)
+    P = numpy.array([[1.0], [0.0], [0.0]]) + 0.0 * P
+    for q in (numpy.eye(3), ASYMMETRIC):
+        step = class_fusion.advance(P, mean, covariance, z, MODELS, q)
+        assert all(numpy.isfinite(array).all() for array in step)
+
+
+def test_whitened_innovations_square_to_the_nis():
+    P, mean, covariance, z = bank(numpy.random.default_rng(2), 8)
+    step = class_fusion.advance(P, mean, covariance, z, MODELS, numpy.eye(3))
+    Phi = MODELS.Phi[..., 1]
+    predicted = Phi @ covariance[..., 1, 4] @ Phi.T + MODELS.Q[..., 1]
+    Theta = MODELS.H @ predicted @ MODELS.H.T + MODELS.R
+    Delta = z[:, 4] - MODELS.H @ Phi @ mean[:, 1, 4]
+    w = step.innovation[:, 1, 4]
+    assert w @ w == pytest.approx(Delta @ numpy.linalg.solve(Theta, Delta), rel=1e-12)
+    assert w[0] == pytest.approx(Delta[0] / math.sqrt(Theta[0, 0]), rel=1e-12)
+
+
+def test_torch_agrees_with_numpy():
+    arrays = bank(numpy.random.default_rng(3), 8)
+    expected = class_fusion.advance(*arrays, MODELS, ASYMMETRIC)
+    tensors = [torch.asarray(a, dtype=torch.float64) for a in arrays]
+    models = class_fusion.Models(*(torch.asarray(m, dtype=torch.float64) for m in MODELS))
+    result = class_fusion.advance(*tensors, models, torch.asarray(ASYMMETRIC, dtype=torch.float64))
+    for a, b in zip(result, expected, strict=True):
+        # The same operations; exp and log may differ in the last digit.
+        assert a.numpy() == pytest.approx(b, rel=1e-12, abs=1e-10)
+
+
+# --- exact errors
+
+
+def joint_start(target):
+    """Covariance of truth and error when the first measurement starts the track."""
+    joint = numpy.zeros((6, 6))
+    variance = PARAMETERS.acceleration_sigma[target] ** 2
+    joint[2, 2] = joint[5, 5] = variance
+    joint[2, 5] = joint[5, 2] = -variance
+    joint[3, 3], joint[4, 4] = PARAMETERS.range_sigma**2, PARAMETERS.range_rate_sigma**2
+    return joint
+
+
+def exact_deviations(target, channel):
+    channels = class_fusion.design_channels(MODELS, START, 120)
+    errors = class_fusion.channel_error_covariance(MODELS, channels, target, channel, joint_start(target))
+    return numpy.sqrt(numpy.stack([errors[i, i] for i in range(3)]))
+
+
+def test_exact_errors_after_a_minute():
+    expected = {0: (279.77, 6.85, 1.29), 1: (279.78, 8.71, 2.17), 2: (279.79, 11.74, 5.86)}
+    for channel, row in expected.items():
+        # Published to 0.01.
+        assert exact_deviations(0, channel)[:, 120] == pytest.approx(row, abs=0.0055)
+
+
+def test_exact_errors_in_the_windows():
+    windows = {(1, 20): 0, (20, 60): 1, (60, 120): 2}
+    table = {
+        (0, 2, 1): (12.27, 11.74, 11.74),
+        (0, 0, 1): (8.71, 7.02, 6.85),
+        (0, 2, 2): (7.10, 5.86, 5.86),
+        (0, 0, 2): (2.01, 1.32, 1.29),
+        (1, 2, 1): (12.39, 11.85, 11.85),
+        (1, 1, 1): (11.04, 9.84, 9.84),
+        (1, 2, 2): (7.84, 6.39, 6.39),
+        (1, 1, 2): (5.77, 4.12, 4.12),
+        (2, 2, 1): (13.55, 13.13, 13.13),
+        (2, 2, 2): (13.21, 11.74, 11.74),
+    }
+    for (target, channel, component), row in table.items():
+        deviations = exact_deviations(target, channel)[component]
+        for (first, last), i in windows.items():
+            rms = math.sqrt((deviations[first : last + 1] ** 2).mean())
+            assert rms == pytest.approx(row[i], abs=0.0055)
+
+
+def test_a_matched_filter_reports_its_error():
+    channels = class_fusion.design_channels(MODELS, START, 40)
+    for s in range(3):
+        exact = class_fusion.channel_error_covariance(MODELS, channels, s, s, joint_start(s))
+        assert exact == pytest.approx(channels.covariance[:, :, s], rel=1e-9)
+
+
+# --- ESM
+
+
+def test_information_per_decision():
+    probabilities = class_fusion.decision_probabilities(
+        numpy.array(PARAMETERS.recognition), numpy.array(PARAMETERS.composition)
+    )
+    assert probabilities == pytest.approx(1 / 30 + 26 / 30 * numpy.array(PARAMETERS.composition), rel=1e-12)
+    information = class_fusion.information_per_decision(probabilities)
+    pairs = [information[0, 1], information[0, 2], information[1, 2], information[2, 1]]
+    assert pairs == pytest.approx([1.21, 1.47, 0.66, 0.64], abs=0.0055)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_fixed_type_posterior_sums_over_the_types(seed):
+    rng = numpy.random.default_rng(seed)
+    confusion, composition = rng.dirichlet([1.0] * 4, 4), rng.dirichlet([1.0] * 4, 3)
+    decisions = rng.integers(0, 4, (6, 8))
+    counts = numpy.stack([(decisions == j).sum(axis=0) for j in range(4)]).astype(float)
+    result = class_fusion.fixed_type_log_likelihood(counts, numpy.log(confusion), numpy.log(composition))
+    for n, s in itertools.product(range(8), range(3)):
+        likelihood = sum(composition[s, j] * math.prod(confusion[j, decisions[:, n]]) for j in range(4))
+        assert result[s, n] == pytest.approx(math.log(likelihood), rel=1e-12)
+
+
+def test_gate_and_wrapped_bearings():
+    assert class_fusion.bearing_gate(15.0, 3.0, 0.1) == pytest.approx(25.2, abs=0.05)
+    assert class_fusion.bearing_gate(1.5, 3.0, 0.1) == pytest.approx(5.52, abs=0.005)
+    differences = class_fusion.bearing_difference(
+        numpy.array([359.0, 1.0, 10.0]), numpy.array([1.0, 359.0, 4.0])
+    )
+    assert differences.tolist() == [-2.0, 2.0, 6.0]
+    for bad in (0.0, 1.0, -0.1, 1.5):
+        with pytest.raises(ValueError, match="error_probability"):
+            class_fusion.bearing_gate(1.0, 1.0, bad)
+
+
+def test_wrong_target_association():
+    # P(associate a wrong target) at 2, 5, 10, 20 degrees.
+    from scipy.stats import norm
+
+    for sigma, expected in ((15.0, (0.90, 0.88, 0.83, 0.63)), (1.5, (0.84, 0.56, 0.09, 0.000))):
+        gate, spread = class_fusion.bearing_gate(sigma, 3.0, 0.1), math.hypot(sigma, 3.0)
+        for separation, probability in zip((2, 5, 10, 20), expected, strict=True):
+            inside = norm.cdf((gate - separation) / spread) - norm.cdf((-gate - separation) / spread)
+            assert inside == pytest.approx(probability, abs=0.0055)

@@ -1,0 +1,396 @@
+"""RadarEsmTracking: the paper's numbers by Monte Carlo, no truth in sight, NumPy and torch alike."""
+
+import math
+
+import array_api_compat.torch as torch
+import numpy
+import pytest
+from filtergym.envs.controls import signed_exponential
+from filtergym.envs.tasks.radar_esm_tracking import TASK, State
+from filtergym.filters import class_fusion, imm
+
+SCENARIOS = tuple(TASK.scenarios)
+LEAKY = ((0.9, 0.08, 0.02), (0.0, 0.7, 0.3), (0.25, 0.05, 0.7))
+
+
+def make(scenario="paper", control="evidence", xp=numpy, kind=TASK, **keywords):
+    parameters = TASK.Parameters(**{**TASK.scenarios[scenario].parameters, **keywords})
+    return kind(parameters, control, xp)
+
+
+def draw(task, N, seed):
+    """Noise of an episode for N lanes: uniforms, normals, rows."""
+    rng, layout = numpy.random.default_rng(seed), task.noise
+    start = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
+    rows = (
+        numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
+        for _ in range(task.horizon + 1)
+    )
+    return *start, rows
+
+
+def roll(task, noise, policy=None):
+    """States after every ``measure`` and after every ``act``, the latter with its observation."""
+    uniforms, normals, rows = noise
+    state = task.begin(uniforms, normals)
+    zero = numpy.zeros((task.classes, uniforms.shape[-1]))
+    for row in rows:
+        measured = task.measure(state, row)
+        observation = task.observe(measured)
+        state = task.act(measured, zero if policy is None else policy(observation))
+        yield measured, observation, state
+
+
+def leaves(value):
+    if isinstance(value, tuple):
+        for item in value:
+            yield from leaves(item)
+    else:
+        yield value
+
+
+# --- the paper's numbers
+
+
+@pytest.fixture(scope="module")
+def monte_carlo():
+    """Squared errors, reported variances and P(true class) of 6000 targets of each class, 120 scans."""
+    results = []
+    for s in range(3):
+        task = make(true_class=f"S{s}")
+        errors, variances, probabilities = [], [], []
+        for _, _, state in roll(task, draw(task, 6000, 2008 + s)):
+            covariance = task.covariance(state)
+            errors.append(task.error(state) ** 2)
+            variances.append(numpy.stack([covariance[i, i] for i in range(3)]))
+            probabilities.append(state.bank.probabilities[s])
+        results.append((numpy.stack(errors), numpy.stack(variances), numpy.stack(probabilities)))
+    return results
+
+
+def test_errors_of_the_paper_policy(monte_carlo):
+    """The table of adaptive RMSE (M = 20000), within four standard errors of the difference."""
+    table = {
+        (0, 1): ((9.04, 0.02), (7.06, 0.02), (6.85, 0.01)),
+        (0, 2): ((2.83, 0.01), (1.33, 0.005), (1.29, 0.005)),
+        (1, 1): ((11.22, 0.02), (9.91, 0.02), (9.84, 0.01)),
+        (1, 2): ((6.06, 0.02), (4.17, 0.01), (4.12, 0.01)),
+        (2, 1): ((13.80, 0.02), (13.19, 0.02), (13.13, 0.01)),
+        (2, 2): ((13.46, 0.03), (11.75, 0.01), (11.72, 0.01)),
+        **{(s, 0): ((1091.0, 4.0), (492.3, 2.0), (325.3, 1.5)) for s in range(3)},
+    }
+    for (s, component), row in table.items():
+        for (first, last), (expected, published) in zip(((1, 20), (20, 60), (60, 120)), row, strict=True):
+            means = monte_carlo[s][0][first - 1 : last, component].mean(axis=0)
+            rmse = math.sqrt(means.mean())
+            own = means.std() / math.sqrt(means.size) / (2.0 * rmse)
+            assert abs(rmse - expected) < 4.0 * math.hypot(own, published), (s, component, first, rmse)
+
+
+def test_recognition_of_the_paper_policy(monte_carlo):
+    table = (
+        (0.747, 0.862, 0.963, 0.996, 0.999),
+        (0.628, 0.738, 0.897, 0.980, 0.996),
+        (0.668, 0.785, 0.917, 0.985, 0.997),
+    )
+    for s, row in enumerate(table):
+        for seconds, expected in zip((2, 5, 10, 20, 30), row, strict=True):
+            P = monte_carlo[s][2][2 * seconds - 1]
+            # The published one has M = 20000; 0.0005 is its rounding.
+            error = math.hypot(P.std() / math.sqrt(P.size), P.std() / math.sqrt(20000)) + 0.0005
+            assert abs(P.mean() - expected) < 4.0 * error, (s, seconds, P.mean())
+        first = 0.5 * ((monte_carlo[s][2] >= 0.9).argmax(axis=0) + 1)
+        assert abs(numpy.median(first) - (4.0, 5.5, 4.0)[s]) <= 0.5
+
+
+def test_the_paper_filter_is_bayesian(monte_carlo):
+    """Uniform classes, redrawn types: mean squared error over mean reported variance is 1 within 3 %."""
+    squared = sum(result[0] for result in monte_carlo)
+    reported = sum(result[1] for result in monte_carlo)
+    for first, last in ((1, 20), (20, 60), (60, 120)):
+        ratio = squared[first - 1 : last].mean(axis=(0, 2)) / reported[first - 1 : last].mean(axis=(0, 2))
+        assert ratio == pytest.approx(numpy.ones(3), abs=0.03)
+
+
+def test_class_probabilities_are_calibrated():
+    task = make(horizon=20)
+    states = [state for *_, state in roll(task, draw(task, 20000, 5))]
+    P = numpy.concatenate([states[k].bank.probabilities.ravel() for k in (4, 9)])
+    true = numpy.concatenate(
+        [(states[k].truth.target_class == numpy.arange(3)[:, None]).ravel() for k in (4, 9)]
+    )
+    for low in numpy.arange(0.0, 1.0, 0.1):
+        chosen = (low <= P) & (low + 0.1 > P)
+        # Three entries of a lane and two times share a draw: count each lane once.
+        error = 0.5 / math.sqrt(chosen.sum() / 2.0)
+        assert abs(true[chosen].mean() - P[chosen].mean()) < 4.0 * error
+
+
+def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_repairs_it():
+    task = make("fixed-type")
+    p = task.parameters
+    *_, (_, _, state) = roll(task, draw(task, 4000, 7))
+    floor = numpy.array(p.composition)
+    joint = class_fusion.fixed_type_log_likelihood(
+        state.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
+    )
+    repaired = imm.normalised_exponential(state.bank.accumulated + joint)
+    wrong = state.truth.target_class != numpy.arange(3)[:, None]
+
+    def sure_and_wrong(P):
+        return ((P >= 0.9) & wrong).any(axis=0).mean()
+
+    assert sure_and_wrong(state.bank.probabilities) > 0.1
+    # A posterior is wrong in at most a tenth of the runs in which it is sure at 0.9.
+    assert sure_and_wrong(repaired) < 0.04
+
+
+# --- the task's contract
+
+
+def test_fields_and_shapes():
+    for control in TASK.controls:
+        task = make("random", control)
+        uniforms, normals, rows = draw(task, 8, 0)
+        state = task.measure(task.begin(uniforms, normals), next(rows))
+        observation = task.observe(state)
+        assert observation.shape == (len(task.fields), 8)
+        assert len({f.name for f in task.fields}) == len(task.fields)
+        assert observation.dtype == numpy.float64
+        action = numpy.zeros(8, dtype=int) if control == "mode" else numpy.zeros((3, 8))
+        state = task.act(state, action)
+        assert task.error(state).shape == (3, 8)
+        assert task.covariance(state).shape == (3, 3, 8)
+        assert task.cost(state).shape == (8,)
+        assert task.records(state)["mode_probability"].shape == (3, 8)
+
+
+def test_observation_shows_what_it_names():
+    task = make("random", averaging_scans=1.0)
+    noise = draw(task, 64, 3)
+    decided = refused = 0
+    for k, (_, observation, _) in enumerate(roll(task, noise), start=1):
+        shown = {f.name: observation[i] for i, f in enumerate(task.fields)}
+        one_hot = numpy.stack([shown[f"decision_{j}"] for j in range(4)])
+        assert (one_hot.sum(axis=0) + shown["decision_none"] == 1.0).all()
+        if k % 4:
+            assert (shown["decision_none"] == 1.0).all()
+        outside = (numpy.abs(shown["bearing_difference"]) > 1.0).astype(float)
+        assert (outside == shown["decision_refused"]).all()
+        decided, refused = decided + one_hot.sum(), refused + shown["decision_refused"].sum()
+        counts = sum(shown[f"{kind}_count_{j}"] for kind in ("used", "refused") for j in range(4))
+        assert (counts * 10.0).round(9).max() <= k // 4 + 1
+        nis = sum(
+            signed_exponential(shown[f"innovation_{c}_S1"], numpy) ** 2 for c in ("range", "range_rate")
+        )
+        assert numpy.log1p(nis) == pytest.approx(shown["log_squared_innovation_S1"], rel=1e-12)
+        assert shown["time"] == pytest.approx(k * 0.5 / 60.0)
+    assert decided > 500
+    # association_error 0.2, binomial.
+    assert refused / decided == pytest.approx(0.2, abs=4.0 * math.sqrt(0.16 / decided))
+
+
+def test_first_observation_holds_the_decision_at_scan_0():
+    task = make()
+    _, observation, _ = next(roll(task, draw(task, 512, 1)))
+    p = task.parameters
+    counts = observation[task.columns([f"used_count_{j}" for j in range(4)])] * 10.0
+    assert set(counts.sum(axis=0).round(12)) == {0.0, 1.0}
+    pi = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
+    posterior = numpy.where(counts.sum(axis=0) > 0.5, pi @ counts, 1.0 + 0.0 * counts[:3])
+    posterior = posterior / posterior.sum(axis=0)
+    weights = observation[task.columns([f"last_weight_S{s}" for s in range(3)])]
+    assert weights == pytest.approx(posterior, rel=1e-12)
+
+
+@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
+def test_zero_evidence_is_the_recursion(transition):
+    """The paper's algorithm as a policy equals the plain filter fed with the measurements alone."""
+    more = {} if transition is None else {"class_transition": transition}
+    task = make("random", **more)
+    p = task.parameters
+    models, start = task.design_models(p)
+    q = numpy.array(p.class_transition)
+    pi = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
+    pi = numpy.concatenate([pi, numpy.ones((3, 1))], axis=1)
+    uniforms, normals, rows = draw(task, 16, 4)
+    state = task.begin(uniforms, normals)
+    mean = numpy.stack([numpy.concatenate([state.measurement, numpy.zeros((1, 16))])] * 3, axis=1)
+    covariance = start[..., None] + numpy.zeros(16)
+    P = numpy.full((3, 16), 1 / 3) * pi[:, numpy.where(state.intercept.used, state.intercept.decision, 4)]
+    P = P / P.sum(axis=0)
+    for row in rows:
+        state = task.measure(state, row)
+        step = class_fusion.advance(P, mean, covariance, state.measurement, models, q)
+        used = numpy.where(state.intercept.used, state.intercept.decision, 4)
+        P = imm.mode_posterior(step.log_predicted, numpy.log(pi[:, used]))
+        mean, covariance = step.mean, step.covariance
+        estimate, reported = imm.combine(mean, covariance, P)
+        state = task.act(state, numpy.zeros((3, 16), dtype=numpy.float32))
+        assert state.estimate == pytest.approx(estimate, rel=1e-10, abs=1e-8)
+        assert task.covariance(state) == pytest.approx(reported, rel=1e-9, abs=1e-9)
+        assert state.bank.probabilities == pytest.approx(P, rel=1e-8, abs=1e-14)
+
+
+class Replayed(TASK):
+    """The task with measurements from a tape in place of those of its own truth."""
+
+    tape: list
+
+    def _radar(self, truth, normals):
+        return self.tape[0][0]
+
+    def _intercepted(self, truth, due, normals, uniforms):
+        return self.tape.pop(0)[1]
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
+def test_no_truth_in_the_observation(scenario, transition):
+    more = {"horizon": 40, **({} if transition is None else {"class_transition": transition})}
+    task, other = make(scenario, **more), make(scenario, kind=Replayed, **more)
+    uniforms, normals, rows = draw(task, 8, 11)
+    state = task.begin(uniforms, normals)
+    other.tape = [(state.measurement, state.intercept)]
+    their_uniforms, their_normals, their_rows = draw(other, 8, 12)
+    theirs = other.begin(their_uniforms, their_normals)
+    rng = numpy.random.default_rng(0)
+    for row, their_row in zip(rows, their_rows, strict=True):
+        state = task.measure(state, row)
+        other.tape = [(state.measurement, state.intercept)]
+        theirs = other.measure(theirs, their_row)
+        assert (state.truth.motion != theirs.truth.motion).all()
+        assert numpy.array_equal(task.observe(state), other.observe(theirs))
+        action = rng.uniform(-1.0, 1.0, (3, 8))
+        state, theirs = task.act(state, action), other.act(theirs, action)
+        assert numpy.array_equal(state.estimate, theirs.estimate)
+        assert numpy.array_equal(task.covariance(state), other.covariance(theirs))
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_lanes_do_not_know_their_neighbours(scenario):
+    """A lane gives the same bits in any batch, also next to lanes at other times."""
+    task = make(scenario, horizon=30)
+    uniforms, normals, rows = draw(task, 16, 2)
+    rows = list(rows)
+    wide = task.begin(uniforms, normals)
+    narrow = task.begin(uniforms[:, :8], normals[:, :8])
+    for row in rows[:9]:
+        wide = task.act(task.measure(wide, row), numpy.zeros((3, 16)))
+    # Lanes 0 to 7 start again at scan 0 beside lanes 8 to 15 at scan 9.
+    fresh = task.begin(uniforms, normals)
+    first = numpy.arange(16) < 8
+
+    def merged(a, b):
+        if isinstance(a, tuple):
+            return type(a)(*(merged(x, y) for x, y in zip(a, b, strict=True)))
+        return numpy.where(first, a, b)
+
+    wide: State = merged(fresh, wide)
+    for row in rows[9:]:
+        wide, narrow = task.measure(wide, row), task.measure(narrow, row[:, :8])
+        assert numpy.array_equal(task.observe(wide)[:, :8], task.observe(narrow))
+        wide, narrow = task.act(wide, numpy.zeros((3, 16))), task.act(narrow, numpy.zeros((3, 8)))
+        assert numpy.array_equal(task.cost(wide)[:8], task.cost(narrow))
+
+
+@pytest.mark.parametrize("scenario", ["paper", "crowded", "silent", "class-change"])
+@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
+def test_torch_plays_the_same_episode(scenario, transition):
+    more = {"horizon": 50, **({} if transition is None else {"class_transition": transition})}
+    ours, theirs = make(scenario, **more), make(scenario, xp=torch, **more)
+    uniforms, normals, rows = draw(ours, 8, 6)
+    a = ours.begin(uniforms, normals)
+    b = theirs.begin(torch.asarray(uniforms), torch.asarray(normals))
+    rng = numpy.random.default_rng(1)
+    for row in rows:
+        action = rng.uniform(-1.0, 1.0, (3, 8))
+        a, b = ours.measure(a, row), theirs.measure(b, torch.asarray(row))
+        # Recursions of 50 scans; exp and log differ in the last digit between the libraries.
+        assert theirs.observe(b).numpy() == pytest.approx(ours.observe(a), rel=1e-8, abs=1e-9)
+        a, b = ours.act(a, action), theirs.act(b, torch.asarray(action))
+        assert theirs.cost(b).numpy() == pytest.approx(ours.cost(a), rel=1e-8)
+    assert [tuple(x.shape) for x in leaves(b)] == [x.shape for x in leaves(a)]
+
+
+def test_gradient_from_cost_to_evidence():
+    """Derivative of the summed cost by torch against central differences."""
+    task = make("random", xp=torch, horizon=6)
+    uniforms, normals, rows = draw(task, 8, 8)
+    rows = [torch.asarray(row) for row in rows]
+
+    def total(action):
+        state = task.begin(torch.asarray(uniforms), torch.asarray(normals))
+        result = 0.0
+        for row in rows:
+            state = task.act(task.measure(state, row), action)
+            result = result + task.cost(state).sum()
+        return result
+
+    action = torch.asarray(numpy.random.default_rng(0).uniform(-0.3, 0.3, (3, 8)))
+    assert torch.autograd.gradcheck(
+        total, (action.clone().requires_grad_(True),), eps=1e-6, rtol=1e-6, atol=1e-7
+    )
+
+
+def test_other_emitter_is_heard_as_often_as_stated():
+    task = make("crowded", radar_bearing_sigma=0.01, esm_bearing_sigma=0.01)
+    *_, (_, _, state) = roll(task, draw(task, 500, 9))
+    refused = state.refused_counts.sum(axis=0).mean()
+    # 31 or so looks, half at least 2 degrees off a gate of 0.02, a tenth of the others refused by chance.
+    looks = state.scan[0] // task.parameters.esm_period + 1
+    assert refused / looks == pytest.approx(0.5 + 0.05, abs=4.0 * 0.5 / math.sqrt(500 * looks))
+    assert (state.truth.other_class != state.truth.target_class).all()
+
+
+def test_class_changes_once_within_its_limits():
+    task = make("class-change")
+    classes = numpy.stack([m.truth.target_class for m, _, _ in roll(task, draw(task, 400, 10))])
+    changes = numpy.diff(classes, axis=0) != 0
+    assert (changes.sum(axis=0) == 1).all()
+    scans = changes.argmax(axis=0) + 2
+    assert scans.min() >= 30
+    assert scans.max() <= 90
+    assert scans.std() == pytest.approx(60 / math.sqrt(12), rel=0.1)
+
+
+def test_silent_targets_radiate_in_bursts():
+    task = make("silent")
+    *_, (_, _, state) = roll(task, draw(task, 2000, 13))
+    looks = state.scan[0] // task.parameters.esm_period + 1
+    heard = (state.used_counts + state.refused_counts).sum(axis=0).mean() / looks
+    assert heard == pytest.approx(0.08 / 0.48, abs=0.015)
+
+
+def test_cost_never_reaches_the_huber_bound():
+    for scenario in SCENARIOS:
+        task = make(scenario)
+        beyond = [
+            (task.cost(state) > task.huber_bound**2).mean() for *_, state in roll(task, draw(task, 400, 14))
+        ]
+        assert numpy.mean(beyond) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("keywords", "reason"),
+    [
+        ({"composition": ((0.5, 0.5, 0.5, 0.0),) * 3}, r"composition\[0\] must sum to 1"),
+        ({"recognition": ((1.0, 0.1), (0.0, 1.0))}, r"recognition\[0\] must sum to 1"),
+        ({"prior": (0.5, 0.6, -0.1)}, r"prior\[0\]\[2\] must be .* got -0.1"),
+        ({"class_transition": ((1.0, 0.0), (0.0, 1.0))}, "class_transition must have 3 rows"),
+        ({"true_class": "S3"}, "true_class must be one of 'random', 'S0', 'S1', 'S2', got 'S3'"),
+        ({"emitter": "sometimes"}, "emitter must be one of"),
+        ({"association_error": 1.0}, "association_error must be .* below 1"),
+        ({"second_emitter_probability": 1.5}, "second_emitter_probability must be .* at most 1"),
+        ({"silence_start": 0.0, "silence_end": 0.0}, "must not both be 0"),
+        ({"acceleration_sigma": (1.0, 2.0)}, "acceleration_sigma must be 3 numbers"),
+        ({"range_sigma": 0.0}, "range_sigma must be .* above 0"),
+        ({"initial_range": (2e5, 1e5)}, "initial_range must be in ascending order"),
+        ({"horizon": 0}, "horizon must be an integer of at least 1"),
+        ({"decision_interval": 0}, "decision_interval must be an integer of at least 1"),
+        ({"esm_period": 2.5}, "esm_period must be an integer"),
+    ],
+)
+def test_bad_parameters_are_refused_with_the_reason(keywords, reason):
+    with pytest.raises(ValueError, match=reason):
+        TASK.Parameters(**keywords)
