@@ -31,6 +31,7 @@ import argparse
 import itertools
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -294,7 +295,8 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
         backends += [(f"torch {d}", {"backend": "torch", "device": d}) for d in devices]
     cells = [(id, control) for id in ids for control in catalogue()[id].controls]
     sizes = FULL if full else QUICK
-    console = Console()
+    # Wide enough for the tables where the output is a file.
+    console = Console(width=None if sys.stdout.isatty() else 150)
 
     single = Table(
         "environment", "control", "step, µs", "of processor time", title="Single environment, gymnasium.make"
