@@ -18,6 +18,7 @@ Reading: the paper refers to an equation (7) that does not exist; (6) is meant.
 Everything here is design, computed once for one model: plain NumPy and SciPy, no batch axis.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy
@@ -76,7 +77,8 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
 def van_loan(A: ArrayLike, BGBt: ArrayLike, step: float) -> tuple[Matrix, Matrix]:
     """Exact sampling of a linear process driven by white noise.
 
-    ``exp([[-A, BGB^T], [0, A^T]] step) = [[., Phi^-1 Qd], [0, Phi^T]]`` (Van Loan, 1978).
+    ``exp([[-A, BGB^T], [0, A^T]] step) = [[., Phi^-1 Qd], [0, Phi^T]]`` (Van Loan, 1978). ``Phi^-1`` grows
+    without limit where modes decay, so a long step is halved until ``|A| step`` is at most one, then doubled.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -94,9 +96,14 @@ def van_loan(A: ArrayLike, BGBt: ArrayLike, step: float) -> tuple[Matrix, Matrix
     BGBt = _intensity("BGBt", BGBt, n)
     if not (numpy.isfinite(step) and step > 0):
         raise ValueError(f"step must be a positive number of seconds, got {step!r}")
-    exponential = scipy.linalg.expm(step * numpy.block([[-A, BGBt], [numpy.zeros((n, n)), A.T]]))
+    halvings = max(0, math.ceil(math.log2(max(step * float(numpy.linalg.norm(A)), 0.5))))
+    short = step / 2**halvings
+    exponential = scipy.linalg.expm(short * numpy.block([[-A, BGBt], [numpy.zeros((n, n)), A.T]]))
     Phi = exponential[n:, n:].T
     Qd = Phi @ exponential[:n, n:]
+    for _ in range(halvings):
+        Qd = Phi @ Qd @ Phi.T + Qd
+        Phi = Phi @ Phi
     return Phi, (Qd + Qd.T) / 2
 
 

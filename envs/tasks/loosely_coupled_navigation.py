@@ -521,7 +521,7 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             pull = (p.spoofing_rate * p.step) * (clock - state.spoofing[0] + 1.0)
             measurement = measurement + xp.where(_within(clock, state.spoofing), pull, 0.0)
         if p.outage_probability:
-            available = xp.where(_within(clock, state.outage), 0.0, 1.0)
+            available = xp.where(_within(clock, state.outage), 0.0, xp.ones_like(clock))
             measurement = available * measurement
         return state._replace(
             clock=clock,
