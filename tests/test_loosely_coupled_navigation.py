@@ -316,6 +316,20 @@ def test_ins_noise_has_the_drawn_intensities():
         np.testing.assert_allclose([q11, s.coupling * q33, q33], [Qd[0, 0], Qd[0, 2], Qd[2, 2]], rtol=1e-9)
 
 
+def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
+    task = make("paper")
+    # One lane for each source: beta, eta, the two noises; the step is linear in them.
+    normals = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0]])
+    noise = np.array([[0.0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
+    after = task.sense(task.begin(np.full((20, 5), 0.5), normals), noise)
+    error = np.stack([(after.ins - after.reference)[0], after.drift[0], after.coloured[0]])
+    Phi, Qd = kalman_bucy.van_loan(*MODEL[:2], 0.01)
+    # The last lane has no source and stays free of error.
+    np.testing.assert_array_equal(error[:, 4], 0.0)
+    np.testing.assert_allclose(error[:, :2], Phi @ np.sqrt(START)[:, [1, 2]], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(error[:, 2:4] @ error[:, 2:4].T, Qd, rtol=1e-9, atol=1e-16)
+
+
 # --- Contract ----------------------------------------------------------------------------------------------
 
 
