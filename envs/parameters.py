@@ -33,7 +33,7 @@ def number(
     ]
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     if not is_number or not all(holds for _, holds in limits):
-        expected = " and ".join(["a finite number", *stated])
+        expected = " ".join(["a finite number", " and ".join(stated)]).strip()
         raise ValueError(f"{name} must be {expected}, got {value!r}")
 
 

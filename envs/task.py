@@ -21,6 +21,10 @@ shows a real measurement that is not acted on.
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). A state is a NamedTuple of arrays ``(..., N)`` and is never changed in place.
 
+In a closed loop the truth follows from the estimate: the control is computed from the state's estimate when
+the next measurement is made. A reference estimator that replaces the estimate then flies a truth of its own,
+on the same noise.
+
 **No truth at any distance:** nothing that ``observe`` returns, and nothing that it is computed from, may
 depend on the truth except through the measurements.
 """
@@ -112,17 +116,17 @@ class Task(ABC, Generic[State]):
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
-    components: ClassVar[tuple[Component, ...]]
-    """What :meth:`error` returns."""
-    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    components: tuple[Component, ...]
+    """What :meth:`error` returns. This and the four attributes below may be set for each instance."""
+    groups: Mapping[str, tuple[str, ...]] = {}
     """Names for several components taken together, such as ``position``: the root of their summed squares."""
-    modes: ClassVar[tuple[str, ...]] = ()
+    modes: tuple[str, ...] = ()
     """Names of the hypotheses of the bank; their probabilities are recorded when a state reports them."""
     cost_description: ClassVar[str]
     """What :meth:`cost` is and its unit, in words."""
-    huber_bound: ClassVar[float]
+    huber_bound: float
     """Root of the cost beyond which the reward is linear; see :func:`huber`."""
-    paper_policy: ClassVar[PaperPolicy]
+    paper_policy: PaperPolicy
 
     parameters: Any
     control: str
@@ -142,6 +146,11 @@ class Task(ABC, Generic[State]):
         self.decision_interval = parameters.decision_interval
         self.xp = xp
         self.device = device
+
+    @classmethod
+    def scenario_from_trajectory(cls, trajectory: Any, keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""
+        raise ValueError(f"{cls.id} does not take a trajectory as scenario")
 
     def constant(self, values: Any) -> Array:
         """Turn numbers into a float64 array of the task's namespace and device."""
@@ -185,7 +194,11 @@ class Task(ABC, Generic[State]):
 
     @abstractmethod
     def cost(self, state: State) -> Array:
-        """Step 5: squared error in units of the sensor's nominal variance, uncapped, ``(N,)``."""
+        """Step 5: what the estimate costs, uncapped, ``(N,)``.
+
+        A squared error in units of the sensor's nominal variance, or, where the estimate drives a control
+        loop, the quadratic cost of the loop in a fixed unit.
+        """
 
     @abstractmethod
     def error(self, state: State) -> Array:
@@ -197,7 +210,8 @@ class Task(ABC, Generic[State]):
 
     def records(self, state: State) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
-        ``mode_probability``."""
+        ``mode_probability``.
+        """
         return {}
 
 

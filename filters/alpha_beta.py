@@ -19,7 +19,7 @@ All arrays are elementwise in the batch; axes of space are just more batch.
 
 from typing import NamedTuple
 
-from .array_namespace import Array
+from .array_namespace import Array, namespace
 
 
 class Covariance(NamedTuple):
@@ -117,7 +117,13 @@ class ErrorMoments(NamedTuple):
 
 
 def propagate_error(
-    moments: ErrorMoments, displacement: Array, increment: Array, R: Array, alpha: Array, beta: Array, T: float
+    moments: ErrorMoments,
+    displacement: Array,
+    increment: Array,
+    R: Array,
+    alpha: Array,
+    beta: Array,
+    T: float,
 ) -> ErrorMoments:
     """Exact moments of the error over one scan, known gains, known manoeuvre of the target.
 
@@ -138,3 +144,41 @@ def propagate_error(
     velocity = moments.velocity + increment
     covariance = update_covariance(predict_covariance(moments.covariance, T), R, alpha, beta, T)
     return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)
+
+
+def predict_joint_covariance(P: Array, T: float) -> Array:
+    """``F P F^T`` for several coordinates at once, cross terms kept, no process noise.
+
+    Args:
+        P: covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
+        T: sampling interval, s.
+    """
+    xp = namespace(P)
+    d = P.shape[0] // 2
+    rows = xp.concat([P[:d] + T * P[d:], P[d:]], axis=0)
+    return xp.concat([rows[:, :d] + T * rows[:, d:], rows[:, d:]], axis=1)
+
+
+def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: float) -> Array:
+    """Joseph form for several coordinates at once with the same gains in each.
+
+    Args:
+        P: covariance of the prediction of (positions, velocities), ``(2 d, 2 d, ...)``.
+        R: measurement variance of each coordinate, ``(d, ...)``; coordinates are measured independently.
+        alpha: position gain, broadcasting against the trailing axes.
+        beta: velocity gain; ``beta / T`` enters the filter.
+        T: sampling interval, s.
+    """
+    xp = namespace(P)
+    d = P.shape[0] // 2
+    rate = beta / T
+    rest = 1.0 - alpha
+    rows = xp.concat([rest * P[:d], P[d:] - rate * P[:d]], axis=0)
+    moved = xp.concat([rest * rows[:, :d], rows[:, d:] - rate * rows[:, :d]], axis=1)
+    noise = [alpha * alpha * R, alpha * rate * R, rate * rate * R]
+    zero = xp.zeros_like(noise[0][0])
+    gained = [
+        [noise[i // d + j // d][i % d] if i % d == j % d else zero for j in range(2 * d)]
+        for i in range(2 * d)
+    ]
+    return moved + xp.stack([xp.stack(row, axis=0) for row in gained], axis=0)

@@ -113,5 +113,3 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
         for i in range(n)
     ]
     return F, Q
-
-

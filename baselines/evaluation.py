@@ -1,0 +1,257 @@
+"""Monte Carlo evaluation: every policy, reference estimator and bound on identical noise.
+
+The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ..envs.catalogue import find_scenario, make_task, nearest, task_class
+from ..envs.reward import capped_cost
+from ..envs.task import Scenario, Task
+from ..filters.gaussian import log_density
+from . import policies
+from .policy import Baselines
+from .rollout import Progress, run_bound, run_policy, run_reference
+from .seeds import episode_seeds
+from .tuning import tuned_policy
+
+CHUNK = 2048
+"""Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
+
+
+class TunedPolicy(NamedTuple):
+    """A policy with tuned values, some of which belong to the task."""
+
+    task_keywords: dict[str, Any]
+    control: str
+    make: Callable[[Task], Any]
+
+    def __call__(self, task: Task) -> Any:
+        """Make the policy for a task."""
+        return self.make(task)
+
+
+@cache
+def _all_baselines() -> dict[str, Baselines]:
+    found = {}
+    for module in pkgutil.iter_modules(policies.__path__):
+        task_module = importlib.import_module(
+            f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}"
+        )
+        found[task_module.TASK.id] = importlib.import_module(f"{policies.__name__}.{module.name}").BASELINES
+    return found
+
+
+def baselines_of(id: str) -> Baselines:
+    """Return what an environment is compared with."""
+    return _all_baselines()[task_class(id).id]
+
+
+def load_policy(id: str, name: str) -> Any:
+    """Return what makes a policy, reference estimator or bound for a task.
+
+    Args:
+        id: environment id.
+        name: one of the environment's own, or ``module:Class`` of a user's.
+
+    Raises:
+        ValueError: if there is no such name.
+    """
+    known = baselines_of(id)
+    for table in (known.policies, known.references, known.bounds):
+        if name in table:
+            return table[name]
+    if name.endswith("-tuned"):
+        return TunedPolicy(*tuned_policy(id, name.removesuffix("-tuned"), known.tunable))
+    if ":" in name:
+        module_name, _, attribute = name.partition(":")
+        try:
+            return getattr(importlib.import_module(module_name), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"cannot load policy {name!r}: {error}") from error
+    raise nearest("policy", name, known.names)
+
+
+def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+    """Control that a run uses: the policy's own, or the one that fits a model's action space."""
+    if kind != "policy":
+        return cls.controls[0]
+    own = getattr(maker, "control", None)
+    space = getattr(maker, "action_space", None)
+    if own is None and space is not None:
+        fitting = [c for c in cls.controls if make_task(cls.id, c).action_space == space]
+        if not fitting:
+            raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
+        own = control if control in fitting else fitting[0]
+    if own is None:
+        return control or cls.controls[0]
+    if control is not None and own != control:
+        raise ValueError(f"policy {name!r} is made for control {own!r}, not {control!r}")
+    return own
+
+
+def _run_chunk(
+    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress
+) -> dict[str, numpy.ndarray]:
+    """Errors and records of some episodes, ``(episodes, time, ...)``."""
+    series: dict[str, list[numpy.ndarray]] = {}
+
+    def keep(name: str, values: numpy.ndarray) -> None:
+        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
+
+    def record(state: Any) -> None:
+        error, covariance = task.error(state), task.covariance(state)
+        keep("error", error)
+        keep("cost", task.cost(state))
+        keep("capped_cost", capped_cost(task, state))
+        keep("nees", log_density(error, covariance)[1])
+        for name, values in task.records(state).items():
+            keep(name, values)
+
+    if kind == "policy":
+        run_policy(task, actor, seeds, record, tick)
+    elif kind == "reference":
+        run_reference(task, actor, seeds, record, tick)
+    else:
+        run_bound(task, actor, seeds, lambda mean_square: keep("mean_square", mean_square), tick)
+    return {name: numpy.stack(values, axis=1) for name, values in series.items()}
+
+
+def evaluate(
+    env: str,
+    policies: Sequence[str] | Mapping[str, Any],
+    scenario: Any = None,
+    episodes: int = 500,
+    seed: int = 0,
+    split: str = "test",
+    control: str | None = None,
+    progress: Progress | None = None,
+    **keywords: Any,
+) -> xarray.Dataset:
+    """Run policies, reference estimators and bounds over the same episodes.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        policies: names, or a mapping from a name to a name, a class, or an object with a ``predict`` method.
+        scenario: name of a scenario or a trajectory; default: the environment's training distribution.
+        episodes: Monte Carlo runs M.
+        seed: number of the experiment.
+        split: "test" (default), "validation" or "train"; splits share no episode.
+        control: demand this control; by default every policy runs in its own.
+        progress: called with the number of measurements done, now and then.
+        **keywords: parameters of the task.
+
+    Returns:
+        Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
+        truth), ``cost``, ``capped_cost``, ``nees``, whatever the task records (``nis``,
+        ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
+
+    Raises:
+        ValueError: for unknown names, or a policy that does not fit the control.
+    """
+    cls = task_class(env)
+    chosen = find_scenario(cls, scenario, keywords)
+    known = baselines_of(cls.id)
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
+    makers: dict[str, Any] = (
+        {
+            name: load_policy(cls.id, entry) if isinstance(entry, str) else entry
+            for name, entry in policies.items()
+        }
+        if isinstance(policies, Mapping)
+        else {name: load_policy(cls.id, name) for name in policies}
+    )
+    if not makers:
+        raise ValueError("name at least one policy")
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    seeds = episode_seeds(split, seed, episodes)
+    kinds = {name: known.kind(name) for name in makers}
+    controls: dict[str, str] = {}
+    tasks: dict[str, Task] = {}
+    # Every task is made before any episode runs, so that a wrong keyword costs nothing.
+    for name, maker in makers.items():
+        tuned_keywords = getattr(maker, "task_keywords", {})
+        controls[name] = _control_of(maker, kinds[name], control, cls, name)
+        tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
+    for name, task in tasks.items():
+        shown = getattr(getattr(makers[name], "observation_space", None), "shape", None)
+        if shown is not None and shown != (len(task.fields),):
+            raise ValueError(
+                f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
+                f"{len(task.fields)} fields"
+            )
+    tick = progress or (lambda _: None)
+    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
+    for name, maker in makers.items():
+        make = maker if callable(maker) else lambda _task, maker=maker: maker
+        chunks = [
+            _run_chunk(tasks[name], make(tasks[name]), kinds[name], seeds[i : i + CHUNK], tick)
+            for i in range(0, episodes, CHUNK)
+        ]
+        per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
+    return _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed)
+
+
+def _dataset(
+    per_policy: dict[str, dict[str, numpy.ndarray]],
+    kinds: dict[str, str],
+    controls: dict[str, str],
+    tasks: dict[str, Task],
+    scenario: Scenario,
+    seeds: Sequence[int],
+    split: str,
+    seed: int,
+) -> xarray.Dataset:
+    task = next(iter(tasks.values()))
+    names = list(per_policy)
+    times = numpy.arange(1, task.horizon + 1)
+    variables: dict[str, Any] = {}
+    for key in sorted({key for series in per_policy.values() for key in series}):
+        example = next(series[key] for series in per_policy.values() if key in series)
+        stacked = numpy.full((len(names), *example.shape), numpy.nan)
+        for i, name in enumerate(names):
+            if key in per_policy[name]:
+                stacked[i] = per_policy[name][key]
+        dims = ["policy", "episode", "time"]
+        if example.ndim == 3:
+            dims.append("component" if key in ("error", "mean_square") else "mode" if "mode" in key else key)
+        variables[key] = (dims, stacked)
+    dataset = xarray.Dataset(
+        variables,
+        coords={
+            "policy": names,
+            "kind": ("policy", [kinds[n] for n in names]),
+            "control": ("policy", [controls[n] for n in names]),
+            "episode": numpy.arange(len(seeds)),
+            "episode_seed": ("episode", numpy.array(seeds, dtype=numpy.uint64)),
+            "time": times,
+            "component": [c.name for c in task.components],
+            "unit": ("component", [c.unit for c in task.components]),
+        },
+        attrs={
+            "environment": task.id,
+            "scenario": scenario.name,
+            "split": split,
+            "seed": seed,
+            "windows": {
+                name: (first, min(last, task.horizon))
+                for name, (first, last) in (scenario.windows or {"all": (1, task.horizon)}).items()
+                if first <= task.horizon
+            },
+            "groups": dict(task.groups),
+            "cost": task.cost_description,
+            "huber_bound": task.huber_bound,
+        },
+    )
+    if "mode_probability" in dataset:
+        dataset = dataset.assign_coords(mode=list(task.modes))
+    return dataset

@@ -1,0 +1,186 @@
+"""Tuning of classical policies on training episodes, so that nothing learned is compared with a straw man.
+
+The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
+values; every candidate meets the same episodes of the training split, so differences are not noise. The
+best candidate is kept by its cost on the validation split only if it beats the untuned values there.
+"""
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy
+
+from ..envs.catalogue import find_scenario, make_task, nearest, task_class
+from .policy import Tunable
+from .rollout import run_policy
+from .seeds import episode_seeds
+
+FOLDER = Path("tuned")
+"""Where tuned values of one's own are kept, below the working directory."""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Outcome of a search."""
+
+    environment: str
+    policy: str
+    scenario: str
+    values: dict[str, float]
+    cost: float
+    """Mean cost on the validation split."""
+    untuned_cost: float
+    environment_steps: int
+    seed: int
+
+
+def mean_cost(
+    id: str, scenario: Any, tunable: Tunable, values: Mapping[str, float], seeds: Sequence[int]
+) -> float:
+    """Mean uncapped cost of a candidate over some episodes."""
+    keywords, make = tunable.apply(values)
+    task = make_task(id, tunable.control, scenario, **keywords)
+    total = 0.0
+
+    def record(state: Any) -> None:
+        nonlocal total
+        total += float(task.cost(state)[: len(seeds)].sum())
+
+    run_policy(task, make(task), seeds, record, lambda _: None)
+    return total / (len(seeds) * task.horizon)
+
+
+def tune(
+    id: str,
+    policy: str,
+    tunable: Tunable,
+    budget: int,
+    scenario: str | None = None,
+    seed: int = 0,
+    episodes: int = 256,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> Tuned:
+    """Search a policy's values.
+
+    Args:
+        id: environment id.
+        policy: name of the policy, for the record.
+        tunable: its limits and what values mean.
+        budget: environment steps to spend on candidates.
+        scenario: a training scenario; default: the environment's own.
+        seed: of the training episodes and of the search.
+        episodes: training episodes that every candidate meets.
+        progress: told of environment steps done.
+
+    Raises:
+        ValueError: for a held-out scenario, or a budget too small for one generation.
+    """
+    from scipy.optimize import differential_evolution
+
+    cls = task_class(id)
+    chosen = find_scenario(cls, scenario)
+    if not chosen.training:
+        allowed = [s.name for s in cls.scenarios.values() if s.training]
+        raise ValueError(
+            f"scenario {chosen.name!r} is held out: tune on a training scenario ({', '.join(allowed)})"
+        )
+    horizon = make_task(cls.id, tunable.control, chosen.name).horizon
+    names, limits = list(tunable.limits), list(tunable.limits.values())
+    evaluations = budget // (episodes * horizon)
+    population = 4 * len(names) + 4
+    if evaluations < 2 * population:
+        raise ValueError(
+            f"a budget of {budget} steps is {evaluations} candidates of {episodes} episodes; "
+            f"the search needs at least {2 * population}: give {2 * population * episodes * horizon} steps"
+        )
+    train = episode_seeds("train", seed, episodes)
+    best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
+    spent = 0
+
+    def objective(vector: numpy.ndarray) -> float:
+        nonlocal best, spent
+        if spent >= evaluations:
+            return math.inf
+        values = dict(zip(names, map(float, vector), strict=True))
+        cost = mean_cost(cls.id, chosen.name, tunable, values, train)
+        spent += 1
+        progress(episodes * horizon)
+        best = min(best, (cost, values), key=lambda pair: pair[0])
+        return cost
+
+    generator = numpy.random.default_rng(seed)
+    low, high = numpy.array(limits).T
+    members = low + (high - low) * generator.random((population, len(names)))
+    members[0] = [tunable.start[name] for name in names]
+    differential_evolution(
+        objective,
+        limits,
+        init=members,
+        maxiter=evaluations // population + 1,
+        rng=generator,
+        polish=False,
+        tol=0.0,
+        callback=lambda *_: spent >= evaluations,
+    )
+    # A winner among many candidates on the training episodes is flattered by them: ask fresh episodes.
+    fresh = episode_seeds("validation", seed, 4 * episodes)
+    untuned = mean_cost(cls.id, chosen.name, tunable, tunable.start, fresh)
+    cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh), best[1]
+    if untuned <= cost:
+        cost, values = untuned, dict(tunable.start)
+    rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
+    return Tuned(cls.id, policy, chosen.name, rounded, cost, untuned, spent * episodes * horizon, seed)
+
+
+def _file_name(id: str) -> str:
+    return f"{task_class(id).id.removeprefix('filtergym/')}.json"
+
+
+def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
+    """Return tuned values and where they stand: one's own in ``tuned/``, or those that are shipped.
+
+    Raises:
+        ValueError: if the policy was never tuned.
+    """
+    name = _file_name(id)
+    shipped: Any = files(__package__).joinpath("tuned", name)
+    for place in (FOLDER / name, shipped):
+        if place.is_file():
+            table = json.loads(place.read_text(encoding="utf-8"))
+            if policy in table:
+                return table[policy]["values"], str(place)
+    raise ValueError(f"no tuned values of policy {policy!r}: run filtergym tune {id} --policy {policy}")
+
+
+def tuned_policy(id: str, policy: str, tunables: Mapping[str, Tunable]) -> tuple[dict[str, Any], str, Any]:
+    """Return task keywords, control and maker of ``NAME-tuned``."""
+    if policy not in tunables:
+        raise nearest("tunable policy", policy, tunables)
+    tunable = tunables[policy]
+    keywords, make = tunable.apply(stored_values(id, policy)[0])
+    return keywords, tunable.control, make
+
+
+def merged_table(existing: str | None, outcome: Tuned, command: str) -> str:
+    """JSON text of a table of tuned values with one policy's replaced."""
+    table: dict[str, Any] = json.loads(existing) if existing else {}
+    table[outcome.policy] = {
+        "values": outcome.values,
+        "scenario": outcome.scenario,
+        "validation_cost": outcome.cost,
+        "untuned_validation_cost": outcome.untuned_cost,
+        "environment_steps": outcome.environment_steps,
+        "seed": outcome.seed,
+        "command": command,
+    }
+    return json.dumps(table, indent=1, sort_keys=True) + "\n"
+
+
+def table_path(id: str, folder: Path = FOLDER) -> Path:
+    """File of an environment's tuned values in a folder."""
+    return folder / _file_name(id)

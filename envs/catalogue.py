@@ -1,0 +1,126 @@
+"""Which environments there are, and how a task is made from names and keywords.
+
+Every module in :mod:`.tasks` that defines ``TASK`` is an environment; nothing else needs to know about it.
+"""
+
+import dataclasses
+import difflib
+import functools
+import importlib
+import pkgutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import gymnasium
+import numpy
+
+from . import parameters as check
+from . import tasks
+from .task import Scenario, Task
+from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
+
+
+@functools.cache
+def catalogue() -> dict[str, type[Task]]:
+    """Return every environment: Gymnasium id -> task class."""
+    modules = (
+        importlib.import_module(f"{tasks.__name__}.{m.name}") for m in pkgutil.iter_modules(tasks.__path__)
+    )
+    return {module.TASK.id: module.TASK for module in modules}
+
+
+def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
+    """Say which name is unknown and what was probably meant."""
+    valid = list(valid)
+    close = difflib.get_close_matches(str(name), valid, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"choose from {', '.join(valid)}"
+    return ValueError(f"unknown {kind} {name!r}: {hint}")
+
+
+def task_class(id: str) -> type[Task]:
+    """Return the task of an environment id; ``filtergym/`` may be left out."""
+    known = catalogue()
+    for candidate in (id, f"filtergym/{id}", f"filtergym/{id}-v0"):
+        if candidate in known:
+            return known[candidate]
+    raise nearest("environment", id, known)
+
+
+def parameter_names(cls: type[Task]) -> list[str]:
+    """Names of the keywords that an environment takes besides control, scenario and reward."""
+    return [f.name for f in dataclasses.fields(cls.Parameters)]
+
+
+def find_scenario(
+    cls: type[Task], scenario: str | Trajectory | None, keywords: Mapping[str, Any] | None = None
+) -> Scenario:
+    """Return a scenario by name (default: the environment's own), or make one from a user's trajectory.
+
+    Args:
+        cls: the environment.
+        scenario: a name, a trajectory, or the path of a CSV or NetCDF file with one.
+        keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
+    """
+    if isinstance(scenario, str) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
+        scenario = read_trajectory(Path(scenario))
+    if isinstance(scenario, Trajectory):
+        return cls.scenario_from_trajectory(scenario, keywords or {})
+    name = scenario or cls.default_scenario
+    if name not in cls.scenarios:
+        raise nearest("scenario", name, cls.scenarios)
+    return cls.scenarios[name]
+
+
+def make_task(
+    id: str,
+    control: str | None = None,
+    scenario: str | Trajectory | None = None,
+    xp: ModuleType = numpy,
+    device: Any = None,
+    **keywords: Any,
+) -> Task:
+    """Make a task.
+
+    Args:
+        id: environment id.
+        control: what the action steers; default: the first of the environment's controls.
+        scenario: name, or a :class:`~filtergym.envs.trajectory.Trajectory` where the environment takes one.
+        xp: array namespace, NumPy or ``array_api_compat.torch``.
+        device: where a torch task keeps its arrays.
+        **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
+
+    Raises:
+        ValueError: for an unknown name or a parameter out of its limits.
+    """
+    cls = task_class(id)
+    control = control or cls.controls[0]
+    if control not in cls.controls:
+        raise nearest("control", control, cls.controls)
+    chosen = find_scenario(cls, scenario, keywords)
+    known = parameter_names(cls)
+    for name in keywords:
+        if name not in known:
+            raise nearest("parameter", name, known)
+    values = {name: check.frozen(value) for name, value in {**chosen.parameters, **keywords}.items()}
+    parameters = cls.Parameters(**values)
+    check.integer("decision_interval", parameters.decision_interval, at_least=1)
+    if parameters.horizon % parameters.decision_interval:
+        raise ValueError(
+            f"horizon must be a multiple of decision_interval, got {parameters.horizon} and "
+            f"{parameters.decision_interval}"
+        )
+    return cls(parameters, control, xp, device)
+
+
+def register() -> None:
+    """Register every environment with Gymnasium; calling it again changes nothing."""
+    for id in catalogue():
+        if id not in gymnasium.registry:
+            gymnasium.register(
+                id,
+                entry_point="filtergym.envs.environment:TaskEnv",
+                vector_entry_point="filtergym.envs.environment:TaskVectorEnv",
+                kwargs={"task": id},
+            )

@@ -1,0 +1,1 @@
+"""One module for each environment: how an episode is drawn."""

@@ -1,0 +1,162 @@
+"""A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Positions and velocities of a flight at given times.
+
+    Args:
+        time: seconds, strictly increasing, ``(n,)`` with n >= 2.
+        position: x and y in metres, ``(n, 2)``.
+        velocity: m/s, ``(n, 2)``; by default the slope of a cubic spline through the positions.
+        name: what reports call it.
+
+    Raises:
+        ValueError: if the times do not increase, a value is not finite, or shapes do not match.
+    """
+
+    time: numpy.ndarray
+    position: numpy.ndarray
+    velocity: numpy.ndarray | None = None
+    name: str = "trajectory"
+
+    def __post_init__(self) -> None:
+        time = numpy.asarray(self.time, dtype=float)
+        if time.ndim != 1 or len(time) < 2:
+            raise ValueError(f"a trajectory needs at least two times in one row, got shape {time.shape}")
+        arrays = {"position": self.position}
+        if self.velocity is not None:
+            arrays["velocity"] = self.velocity
+        checked = {"time": time}
+        for name, values in arrays.items():
+            checked[name] = numpy.asarray(values, dtype=float)
+            if checked[name].shape != (len(time), 2):
+                raise ValueError(f"{name} must have shape ({len(time)}, 2), got {checked[name].shape}")
+        for name, values in checked.items():
+            bad = numpy.argwhere(~numpy.isfinite(values))
+            if len(bad):
+                raise ValueError(f"{name} has a value that is not finite in row {bad[0][0]}")
+            object.__setattr__(self, name, values)
+        steps = numpy.diff(time)
+        if (steps <= 0).any():
+            row = int(numpy.argmax(steps <= 0)) + 1
+            raise ValueError(
+                f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last time."""
+        return float(self.time[-1] - self.time[0])
+
+    def resampled(self, interval: float, count: int) -> numpy.ndarray:
+        """State at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
+
+        Between the given times a cubic runs through positions and velocities (Hermite), or, without
+        velocities, a cubic spline through the positions.
+
+        Returns:
+            x, y (m) and their rates (m/s), ``(4, count)``.
+        """
+        from scipy.interpolate import CubicHermiteSpline, CubicSpline, make_interp_spline
+
+        if self.velocity is not None:
+            curve = CubicHermiteSpline(self.time, self.position, self.velocity)
+        elif len(self.time) < 4:
+            curve = make_interp_spline(self.time, self.position, k=len(self.time) - 1)
+        else:
+            curve = CubicSpline(self.time, self.position)
+        wanted = self.time[0] + interval * numpy.arange(count)
+        inside = numpy.minimum(wanted, self.time[-1])
+        rate = curve(inside, 1)
+        position = curve(inside) + rate * (wanted - inside)[:, None]
+        return numpy.concatenate([position, rate], axis=1).T
+
+
+TRAJECTORY_SUFFIXES = (".csv", ".nc")
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory from a file.
+
+    Args:
+        path: CSV with a header line, or NetCDF with variables along one dimension: ``time`` (s), ``x``, ``y``
+            (m) and optionally ``vx``, ``vy`` (m/s).
+
+    Raises:
+        ValueError: if the file cannot be read, a column is missing, or a value is not a number.
+    """
+    columns: dict[str, numpy.ndarray]
+    try:
+        if path.suffix == ".nc":
+            import xarray
+
+            with xarray.open_dataset(path, engine="scipy", decode_times=False) as data:
+                columns = {str(name): data[name].values for name in data.variables}
+        else:
+            with path.open(encoding="utf-8-sig") as file:
+                names = [name.strip() for name in file.readline().split(",")]
+                values = numpy.loadtxt(file, delimiter=",", ndmin=2)
+            if values.shape[1] != len(names):
+                raise ValueError(f"{len(names)} column names but {values.shape[1]} columns")
+            columns = dict(zip(names, values.T, strict=True))
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"cannot read trajectory {path}: {error}") from error
+    missing = [name for name in ("time", "x", "y") if name not in columns]
+    if missing:
+        raise ValueError(
+            f"trajectory {path} lacks the column {', '.join(missing)}; it has {', '.join(columns)} and needs "
+            "time, x, y and optionally vx, vy"
+        )
+    position = numpy.column_stack([columns["x"], columns["y"]])
+    velocity = numpy.column_stack([columns["vx"], columns["vy"]]) if {"vx", "vy"} <= set(columns) else None
+    return Trajectory(columns["time"], position, velocity, name=path.stem)
+
+
+def flown_legs(
+    position: Sequence[float],
+    velocity: Sequence[float],
+    legs: Sequence[Sequence[float]],
+    interval: float,
+    count: int,
+) -> numpy.ndarray:
+    """State at ``count`` times of a flight of constant speed: straight legs and exact circular turns.
+
+    Args:
+        position: x and y at the start, m.
+        velocity: at the start, m/s.
+        legs: duration (s) and turn rate (deg/s, anticlockwise positive, 0 = straight) of each leg; after the
+            last one the flight goes straight on.
+        interval: sampling interval, s.
+        count: number of samples; the first is the start.
+
+    Returns:
+        x, y (m) and their rates (m/s), ``(4, count)``.
+    """
+    # Complex numbers carry a turn as one factor: v(t) = v e^{i w t}, and its integral is exact.
+    place, rate = complex(*position), complex(*velocity)
+    states: list[tuple[complex, complex]] = []
+    begin = 0.0
+    for duration, degrees in [*legs, (math.inf, 0.0)]:
+        turn = math.radians(degrees)
+
+        def after(time: float, turn: float = turn, place: complex = place, rate: complex = rate) -> tuple:
+            if turn == 0.0:
+                return place + rate * time, rate
+            rotation = complex(math.cos(turn * time), math.sin(turn * time))
+            return place + rate * (rotation - 1.0) / complex(0.0, turn), rate * rotation
+
+        while len(states) < count and len(states) * interval < begin + duration:
+            states.append(after(len(states) * interval - begin))
+        if len(states) == count:
+            break
+        place, rate = after(duration)
+        begin += duration
+    return numpy.array([(p.real, p.imag, v.real, v.imag) for p, v in states]).T

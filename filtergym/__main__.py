@@ -1,0 +1,269 @@
+"""The command line: ``filtergym`` or ``python -m filtergym``."""
+
+import ast
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from .baselines.evaluation import baselines_of, evaluate
+from .baselines.figures import evaluation_figures, save
+from .baselines.metrics import Record, tidy_records
+from .baselines.reproduction import paper_module, papers, save_reproduction
+from .baselines.tuning import FOLDER, merged_table, table_path, tune
+from .benchmark import Cell, run_benchmark
+from .envs.catalogue import catalogue, nearest, parameter_names, task_class
+from .results import writable_folder, write_records, write_text
+from .room import insert, measure_room, room_markdown
+from .tables import results_table
+
+app = typer.Typer(
+    help="Gymnasium environments for adaptive-filter benchmarking.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+# Wide enough for the results table where the output is a file; a terminal keeps its own width.
+console = Console(width=None if sys.stdout.isatty() else 150)
+
+
+def progress_bar() -> Progress:
+    """Return a progress bar on standard error, so that tables can be piped."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    )
+
+
+def parsed_settings(settings: list[str]) -> dict[str, Any]:
+    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
+    keywords: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or not name.strip().isidentifier() or not text.strip():
+            raise ValueError(f"--set needs name=value, such as --set horizon=50, got {setting!r}")
+        try:
+            keywords[name.strip()] = ast.literal_eval(text.strip())
+        except (ValueError, SyntaxError) as error:
+            if not text.strip().replace("-", "_").isidentifier():
+                raise ValueError(f"--set {name}: cannot read the value {text!r}") from error
+            keywords[name.strip()] = text.strip()
+    return keywords
+
+
+@app.command("list")
+def list_environments() -> None:
+    """List environments with their controls, scenarios, policies, references and bounds."""
+    for id, cls in catalogue().items():
+        known = baselines_of(id)
+        console.print(f"[bold]{id}[/bold]")
+        console.print(f"  {(cls.__doc__ or '').strip().splitlines()[0]}", highlight=False)
+        rows = {
+            "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
+            "scenarios": [
+                f"{s.name}{' (default, training)' if s.name == cls.default_scenario else ''}"
+                for s in cls.scenarios.values()
+            ],
+            "policies": list(known.policies),
+            "references": list(known.references),
+            "bounds": list(known.bounds),
+            "parameters": parameter_names(cls),
+        }
+        for title, names in rows.items():
+            console.print(f"  {title + ':':<12} {', '.join(names)}", highlight=False, soft_wrap=True)
+        for scenario in cls.scenarios.values():
+            console.print(f"    {scenario.name:<22} {scenario.description}", highlight=False, soft_wrap=True)
+
+
+@app.command("evaluate")
+def evaluate_policies(
+    environment: Annotated[str, typer.Argument(help="Environment id; `filtergym list` shows them.")],
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(help="Policy, reference or bound; repeat for several. Also module:Class."),
+    ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario; default: the training distribution.")
+    ] = None,
+    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    episodes: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 500,
+    seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
+    split: Annotated[str, typer.Option(help="test, validation or train.")] = "test",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
+    json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+) -> None:
+    """Run policies over the same noise and compare them.
+
+    Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
+    """
+    cls = task_class(environment)
+    known = baselines_of(cls.id)
+    if out is not None:
+        writable_folder(out)
+    if json is not None:
+        writable_folder(json.parent)
+    names = policy or list(known.benchmark or known.names)
+    keywords = parsed_settings(settings or [])
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        dataset = evaluate(
+            cls.id,
+            names,
+            scenario,
+            episodes,
+            seed,
+            split,
+            control,
+            progress=lambda done: bar.update(line, advance=done),
+            **keywords,
+        )
+    records = tidy_records(dataset)
+    console.print(results_table(records))
+    if json is not None:
+        write_records(json, records)
+    if out is not None:
+        write_records(out / "records.json", records)
+        for name, figure in evaluation_figures(dataset):
+            save(figure, out / f"{name}.png")
+        console.print(f"figures and records in {out}")
+
+
+@app.command("benchmark")
+def benchmark(
+    full: Annotated[bool, typer.Option("--full", help="Every scenario and ten times the episodes.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
+    seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
+    environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+) -> None:
+    """Run every environment with its policies; quick by default, resumes after an interruption."""
+    with progress_bar() as bar:
+
+        def started(cell: Cell, total: int) -> Any:
+            line = bar.add_task(f"{cell.environment.removeprefix('filtergym/')} {cell.scenario}", total=total)
+            return lambda done: bar.update(line, advance=done)
+
+        def finished(records: list[Record]) -> None:
+            console.print(results_table(records))
+
+        run_benchmark(out, full, seed, environment or (), started, finished)
+    console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+
+
+@app.command("tune")
+def tune_policy(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    policy: Annotated[str, typer.Option(help="Policy to tune.")],
+    budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
+    scenario: Annotated[
+        str | None, typer.Option(help="A training scenario; held-out ones are refused.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
+) -> None:
+    """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
+
+    Example: filtergym tune filtergym/ManeuveringTarget-v0 --policy imm --budget 4000000
+    """
+    cls = task_class(environment)
+    tunable = baselines_of(cls.id).tunable
+    if policy not in tunable:
+        raise nearest("tunable policy", policy, tunable)
+    writable_folder(out)
+    with progress_bar() as bar:
+        line = bar.add_task(f"tuning {policy}", total=budget)
+        outcome = tune(
+            cls.id,
+            policy,
+            tunable[policy],
+            budget,
+            scenario,
+            seed,
+            progress=lambda steps: bar.update(line, advance=steps),
+        )
+    table = Table("value", "untuned", "tuned", title=f"{policy} on {outcome.scenario}")
+    for name, value in outcome.values.items():
+        table.add_row(name, f"{tunable[policy].start[name]:g}", f"{value:g}")
+    table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
+    console.print(table)
+    path = table_path(cls.id, out)
+    command = f"filtergym tune {cls.id} --policy {policy} --budget {budget} --seed {seed}"
+    existing = path.read_text(encoding="utf-8") if path.exists() else None
+    write_text(path, merged_table(existing, outcome, command))
+    console.print(f"saved in {path}; use it as --policy {policy}-tuned")
+
+
+@app.command("room")
+def room(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    episodes: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 5000,
+    seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
+    into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
+) -> None:
+    """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
+
+    Example: filtergym room filtergym/ManeuveringTarget-v0
+    """
+    cls = task_class(environment)
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
+    console.print(results_table(records))
+    if into is not None:
+        command = f"filtergym room {cls.id} --episodes {episodes} --seed {seed} --into {into}"
+        insert(into, room_markdown(records, command))
+
+
+@app.command("reproduce")
+def reproduce(
+    paper: Annotated[str, typer.Argument(help=f"One of: {', '.join(papers())}.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Monte Carlo runs instead of the module's own.")
+    ] = None,
+) -> None:
+    """Run a paper's experiments again and give a verdict on each of its claims.
+
+    Example: filtergym reproduce imm-alpha-beta --out results/imm-alpha-beta
+    """
+    module = paper_module(paper)
+    if out is not None:
+        writable_folder(out)
+    with progress_bar() as bar:
+        line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
+        result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
+    table = Table("claim", "what was measured", "verdict", title=result.title, show_lines=True)
+    for claim in result.claims:
+        table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
+    console.print(table)
+    if out is not None:
+        save_reproduction(result, out, write_text)
+        console.print(f"report and figures in {out}")
+
+
+def main() -> None:
+    """Run the command line; a user's mistake ends in one sentence and exit code 2."""
+    try:
+        app()
+    except (ValueError, gymnasium.error.Error) as error:
+        Console(stderr=True, highlight=False).print(
+            f"Error: {error}", style="red", markup=False, soft_wrap=True
+        )
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Tables of results for the terminal."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.table import Table
+
+
+def with_interval(record: Any, scale: float = 1.0, digits: int = 3) -> str:
+    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``."""
+    if record is None or record.value is None:
+        return "-"
+
+    def text(value: float) -> str:
+        value *= scale
+        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:#.{digits}g}".rstrip(".")
+
+    if record.low is None or record.low == record.high:
+        return f"{record.value * scale:.{digits}g}"
+    return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
+
+
+def main_components(records: Sequence[Any], whole: str = "all") -> list[str]:
+    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    first = records[0]
+    names = [
+        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == whole
+    ]
+    return [g for g in names if any(other.startswith(f"{g}_") for other in names)] or names[:3]
+
+
+def results_table(records: Sequence[Any], whole: str = "all") -> Table:
+    """Compare policies: errors over the whole run, cost against the paper's algorithm, score.
+
+    Args:
+        records: tidy records of one environment and scenario.
+        whole: the window that spans the run.
+    """
+    first = records[0]
+    shown = main_components(records, whole)
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+    table = Table(
+        title=f"{first.environment}, scenario {first.scenario} "
+        f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)",
+        title_justify="left",
+    )
+    table.add_column("policy", no_wrap=True)
+    table.add_column("control")
+    for component in shown:
+        table.add_column(f"RMSE {component.replace('_', ' ')}, {units[component]}", justify="right")
+    table.add_column("cost vs paper, %", justify="right")
+    table.add_column("score", justify="right")
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    names = list(dict.fromkeys((r.policy, r.kind, r.control) for r in records))
+    section = "policy"
+    for name, kind, control in names:
+        if kind != section:
+            table.add_section()
+            section = kind
+        row = [name, control if kind == "policy" else f"({kind})"]
+        row += [with_interval(found.get((name, "rmse", component, whole))) for component in shown]
+        row.append(with_interval(found.get((name, "relative_cost_difference", "", whole)), 100.0))
+        score = found.get((name, "score", "", whole))
+        row.append("no room" if score is not None and score.value is None else with_interval(score))
+        table.add_row(*row)
+    table.caption = (
+        "score: 0 = the paper's algorithm, 1 = the reference that it is measured against.\n"
+        "References and bounds know what no policy can."
+    )
+    table.caption_justify = "left"
+    return table
