@@ -17,6 +17,10 @@ check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/python -m pip install --quiet --no-deps --force-reinstall --target $(VENV)/typed .
 	MYPYPATH=$(VENV)/typed $(BIN)/mypy -p filtergym
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+docs: $(VENV)/.dev  ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 format: $(VENV)/.dev  ## put the code into its form
 	$(BIN)/ruff format $(SOURCES)

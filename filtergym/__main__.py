@@ -34,15 +34,17 @@ console = Console(width=None if sys.stdout.isatty() else 150)
 
 
 def progress_bar() -> Progress:
-    """Return a progress bar on standard error, so that tables can be piped."""
+    """Return a progress bar on standard error, so that tables can be piped; none where nobody looks."""
+    errors = Console(stderr=True)
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=errors,
         transient=True,
+        disable=not errors.is_terminal,
     )
 
 

@@ -83,10 +83,10 @@ def run_benchmark(
     Returns:
         All records.
     """
-    writable_folder(folder)
+    wanted = cells(full, environments)
     unfinished = writable_folder(folder / "unfinished")
     records: list[Record] = []
-    for cell in cells(full, environments):
+    for cell in wanted:
         path = unfinished / f"{cell.name}.seed{seed}.json"
         names = baselines_of(cell.environment)
         horizon_total = _measurements(cell) * len(names.benchmark or names.names)

@@ -1,0 +1,109 @@
+"""The command line: what it prints, what it writes, and one clear sentence for every mistake."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+ENV = "filtergym/ManeuveringTarget-v0"
+
+
+def run(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "filtergym", *arguments], capture_output=True, text=True, cwd=cwd, check=False
+    )
+
+
+def test_list_names_everything(tmp_path):
+    result = run("list", cwd=tmp_path)
+    assert result.returncode == 0
+    for word in (ENV, "evidence", "benchmark-s2", "adaptive-rearm", "known-turn", "known-input-bound"):
+        assert word in result.stdout
+
+
+def test_evaluate_writes_tidy_records_and_figures(tmp_path):
+    result = run(
+        "evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--policy", "adaptive", "--episodes", "20",
+        "--seed", "1", "--out", "out", "--json", "new/records.json", "--set", "transition=[[0.8,0.2],[0.1,0.9]]",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    records = json.loads((tmp_path / "new" / "records.json").read_text())
+    assert set(records[0]) == {
+        "environment", "control", "scenario", "policy", "kind", "metric", "component", "window", "value", "low",
+        "high", "unit", "episodes", "seed", "split",
+    }  # fmt: skip
+    assert {r["policy"] for r in records} == {"imm", "adaptive"}
+    assert {r["seed"] for r in records} == {1}
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert made == {
+        "records.json", "rmse_over_time.png", "error_distribution.png", "mode_probabilities.png",
+    }  # fmt: skip
+
+
+def test_a_flight_from_a_file(tmp_path):
+    rows = "\n".join(f"{t},{20000 + 100 * t},{5000 + t}" for t in range(0, 200, 4))
+    (tmp_path / "flight.csv").write_text(f"time,x,y\n{rows}\n")
+    result = run(
+        "evaluate", ENV, "--scenario", "flight.csv", "--policy", "imm", "--episodes", "5", cwd=tmp_path
+    )
+    assert result.returncode == 0, result.stderr
+    assert "flight" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("evaluate", "Manoeuvre"), "unknown environment"),
+        (("evaluate", ENV, "--scenario", "papr"), "did you mean 'paper'"),
+        (("evaluate", ENV, "--policy", "adaptiv"), "did you mean 'adaptive'"),
+        (("evaluate", ENV, "--control", "gains"), "unknown control 'gains'"),
+        (("evaluate", ENV, "--policy", "imm", "--control", "gain"), "made for control 'weights'"),
+        (("evaluate", ENV, "--set", "gain=1"), "did you mean 'gains'"),
+        (("evaluate", ENV, "--set", "gains"), "--set needs name=value"),
+        (("evaluate", ENV, "--set", "gains=(0.3,"), "cannot read the value"),
+        (("evaluate", ENV, "--set", "gains=(0.3, 1.7)"), "gains[1] must be a finite number above"),
+        (("evaluate", ENV, "--set", "transition=((0.5, 0.4), (0.1, 0.9))"), "must sum to 1"),
+        (("evaluate", ENV, "--episodes", "0"), "episodes must be at least 1"),
+        (("evaluate", ENV, "--out", "/proc/nowhere"), "cannot write to folder"),
+        (("evaluate", ENV, "--scenario", "missing.csv"), "cannot read trajectory"),
+        (("tune", ENV, "--policy", "imm", "--scenario", "atc"), "held out"),
+        (("tune", ENV, "--policy", "random"), "unknown tunable policy"),
+        (("reproduce", "imm"), "unknown paper"),
+        (("benchmark", "--environment", "Nothing"), "unknown environment"),
+    ],
+)
+def test_a_mistake_gets_one_clear_sentence(tmp_path, arguments, expected):
+    result = run(*arguments, cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith("Error: ")
+    assert expected in result.stderr
+    assert result.stderr.strip().count("\n") == 0
+    left = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not left
+
+
+def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
+    from filtergym import benchmark
+
+    cells = [benchmark.Cell(ENV, scenario, 20) for scenario in ("paper", "random")]
+    monkeypatch.setattr(benchmark, "cells", lambda full, environments: cells)
+    ran = []
+    original = benchmark.run_cell
+
+    def run_cell(cell, *rest):
+        ran.append(cell.scenario)
+        if len(ran) == 2:
+            raise KeyboardInterrupt
+        return original(cell, *rest)
+
+    monkeypatch.setattr(benchmark, "run_cell", run_cell)
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.run_benchmark(tmp_path, full=False, seed=0)
+    assert not (tmp_path / "benchmark.json").exists()
+    records = benchmark.run_benchmark(tmp_path, full=False, seed=0)
+    assert ran == ["paper", "random", "random"]
+    assert {r.scenario for r in records} == {"paper", "random"}
+    assert len(json.loads((tmp_path / "benchmark.json").read_text())) == len(records)
+    assert not (tmp_path / "unfinished").exists()
