@@ -200,7 +200,7 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
             numpy.testing.assert_allclose(task.covariance(state)[..., lane], P, rtol=1e-9, atol=1e-9)
         u = d.feedforward * state.command[lane] - L @ estimate
         truth = state.truth[:, lane].copy()
-        truth[task._output] -= state.command[lane]
+        truth[task.output] -= state.command[lane]
         cost = (truth @ d.weight @ truth + d.control_weight * u**2) / task.cost_unit
         assert task.cost(state)[lane] == pytest.approx(cost, rel=1e-9)
         numpy.testing.assert_allclose(

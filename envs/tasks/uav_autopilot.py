@@ -57,6 +57,10 @@ COORDINATES: Mapping[str, tuple[Coordinate, ...]] = {
 the gust, "gust" the angle the gust adds to it."""
 OUTPUT = {"P": "position", "U": "pitch"}
 
+FARTHEST = 1e4
+"""Where a coordinate of a lost loop stops, in its own unit: far beyond what any stable loop reaches, and
+small enough for squares to stay numbers."""
+
 _PLANT_DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "P": {
         "sampling_interval": 0.25,
@@ -501,7 +505,9 @@ class UavAutopilot(Task[State]):
 
     ## Episode End
 
-    Truncation after ``horizon`` measurements acted on (600: 12 s for U, 150 s for P). No termination.
+    Truncation after ``horizon`` measurements acted on (600: 12 s for U, 150 s for P). No termination: a loop
+    that an unstable choice (such as raw readings of too few sensors) drives away stops at 10 000 units of
+    each coordinate and goes on being charged.
 
     ## Arguments
 
@@ -541,11 +547,13 @@ class UavAutopilot(Task[State]):
         self.components = tuple(Component(*c) for c in COORDINATES[p.plant])
         names = tuple(c.name for c in COORDINATES[p.plant])
         self.sensors: tuple[str, ...] = p.value("sensors")
-        self._measured = tuple(names.index(sensor) for sensor in self.sensors)
-        self._output = names.index(OUTPUT[p.plant])
+        self.measured = tuple(names.index(sensor) for sensor in self.sensors)
+        """Coordinate that each sensor reads."""
+        self.output = names.index(OUTPUT[p.plant])
+        """Coordinate that the command is for."""
         self._n, self._m = n, m = len(names), len(self.sensors)
         sigmas = numpy.array(p.value("sensor_sigmas"))
-        output_sigma = self._output_sigma()
+        output_sigma = self._sigma_of_output()
         self.cost_unit = output_sigma**2
         """What a cost of one is in units of the weighted squares, for comparison with theory."""
 
@@ -566,9 +574,10 @@ class UavAutopilot(Task[State]):
         self._other_noise = self.constant(pack(model.other_noise)[:, None])
         self._process_noise = self._scaled_noise + self._other_noise
         self._sensor_sigmas = self.constant(sigmas[:, None])
-        self._variances = tuple(float(s) for s in sigmas**2)
+        self.sensor_variances = tuple(float(s) for s in sigmas**2)
+        """Nominal, of each sensor."""
         self._sensor_entries = [
-            packed_covariance.position(n, i, j) for i in self._measured for j in self._measured
+            packed_covariance.position(n, i, j) for i in self.measured for j in self.measured
         ]
         self._R = self.constant(self.design.R[:, :, None])
         self._sensor_identity = self.constant(numpy.eye(m)[:, :, None])
@@ -606,7 +615,7 @@ class UavAutopilot(Task[State]):
         )
         self.fields = self._fields()
 
-    def _output_sigma(self) -> float:
+    def _sigma_of_output(self) -> float:
         """Nominal sigma of the output's sensor; of its default where the output is not measured."""
         p = self.parameters
         output = OUTPUT[p.plant]
@@ -767,6 +776,7 @@ class UavAutopilot(Task[State]):
         drive = xp.concat([drive[: self._split] * level, drive[self._split :]], axis=0)
         disturbance = xp.matmul(self._noise_factor, drive)
         truth = xp.matmul(self._true_F, state.truth) + self._true_B * control + disturbance
+        truth = xp.clip(truth, -FARTHEST, FARTHEST)
         reading = self._readings_of(truth) + self._sensor_sigmas * sensor_level * readout
         available = xp.ones_like(reading)
         for i in range(state.dropout_starts.shape[0]):
@@ -807,7 +817,7 @@ class UavAutopilot(Task[State]):
 
     def _readings_of(self, x: Array) -> Array:
         """Measured coordinates of ``(n, N)``, ``(m, N)``."""
-        return self.xp.stack([x[i] for i in self._measured], axis=0)
+        return self.xp.stack([x[i] for i in self.measured], axis=0)
 
     def observe(self, state: State) -> Array:
         """What the filter and the autopilot know, scaled."""
@@ -853,8 +863,8 @@ class UavAutopilot(Task[State]):
             state.mean,
             state.filter_covariance + scale * self._process_noise,
             state.measurement,
-            self._measured,
-            self._variances,
+            self.measured,
+            self.sensor_variances,
             state.available,
         )
         estimate, covariance = update.mean, update.covariance
@@ -874,7 +884,7 @@ class UavAutopilot(Task[State]):
     def _raw_estimate(self, measurement: Array) -> Array:
         """Readings in place of the measured coordinates, zero for the others."""
         zero = self.xp.zeros_like(measurement[0])
-        rows = [measurement[self._measured.index(i)] if i in self._measured else zero for i in range(self._n)]
+        rows = [measurement[self.measured.index(i)] if i in self.measured else zero for i in range(self._n)]
         return self.xp.stack(rows, axis=0)
 
     def cost(self, state: State) -> Array:
@@ -883,7 +893,7 @@ class UavAutopilot(Task[State]):
         total = self.design.control_weight * u * u
         for i, weight in enumerate(self._state_weights):
             if weight:
-                deviation = state.truth[i] - state.command if i == self._output else state.truth[i]
+                deviation = state.truth[i] - state.command if i == self.output else state.truth[i]
                 total = total + weight * deviation * deviation
         return total * (1.0 / self.cost_unit)
 
@@ -904,12 +914,16 @@ class UavAutopilot(Task[State]):
         return level * level * self._scaled_noise + self._other_noise
 
     def records(self, state: State) -> dict[str, Array]:
-        """Signals of the loop: output, command, control that follows, and NIS per available reading."""
+        """Signals of the loop: output, command, control that follows, NIS per available reading, and the
+        innovation over its sigma of the output's sensor (of the first where the output is not measured).
+        """
+        shown = self.measured.index(self.output) if self.output in self.measured else 0
         return {
-            "output": state.truth[self._output],
+            "output": state.truth[self.output],
             "command": state.command,
             "control": self.autopilot(state),
             "nis": state.nis,
+            "innovation": state.innovation[shown],
         }
 
 
