@@ -15,42 +15,21 @@ Reading: (3) is printed without U, which would bias the estimate by ``-U / (K - 
 Reading: (4) is damaged; ``Q^-1`` is the only exponent that makes (5) the Riccati equation.
 Reading: the paper refers to an equation (7) that does not exist; (6) is meant.
 
+Where (5) and (6) settle is computed by :func:`~filtergym.filters.linear_systems.steady_kalman_bucy` and
+:func:`~filtergym.filters.linear_systems.continuous_stationary_covariance`. A random constant has no steady
+filter: its variance falls for ever, like 1/t, and its gain goes to zero; use the time-varying (5).
+
 Everything here is design, computed once for one model: plain NumPy and SciPy, no batch axis.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy
 import scipy.integrate
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Matrix = NDArray[numpy.float64]
-
-
-def _square(name: str, matrix: ArrayLike, size: int | None = None) -> Matrix:
-    """Check a square matrix of real numbers."""
-    array = numpy.atleast_2d(numpy.asarray(matrix, float))
-    size = len(array) if size is None else size
-    if array.shape != (size, size) or not numpy.isfinite(array).all():
-        raise ValueError(f"{name} must be a finite {size} x {size} matrix, got {matrix!r}")
-    return array
-
-
-def _intensity(name: str, matrix: ArrayLike, size: int, definite: bool = False) -> Matrix:
-    """Check an intensity or a covariance: symmetric, no negative eigenvalue."""
-    array = _square(name, matrix, size)
-    scale = max(float(numpy.abs(array).max()), numpy.finfo(float).tiny)
-    lowest = float(numpy.linalg.eigvalsh(array)[0])
-    kind = "definite" if definite else "semidefinite"
-    if (
-        numpy.abs(array - array.T).max() > 1e-9 * scale
-        or lowest < -1e-9 * scale
-        or (definite and lowest <= 0)
-    ):
-        raise ValueError(f"{name} must be symmetric positive {kind}, got {matrix!r}")
-    return array
+from .linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
 
 
 def _times(times: ArrayLike) -> Matrix:
@@ -71,40 +50,7 @@ def _information(C: ArrayLike, Q: ArrayLike, size: int) -> Matrix:
     rows = numpy.atleast_2d(numpy.asarray(C, float))
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"C must have {size} columns, got {C!r}")
-    return rows.T @ numpy.linalg.solve(_intensity("Q", Q, len(rows), definite=True), rows)
-
-
-def van_loan(A: ArrayLike, BGBt: ArrayLike, step: float) -> tuple[Matrix, Matrix]:
-    """Exact sampling of a linear process driven by white noise.
-
-    ``exp([[-A, BGB^T], [0, A^T]] step) = [[., Phi^-1 Qd], [0, Phi^T]]`` (Van Loan, 1978). ``Phi^-1`` grows
-    without limit where modes decay, so a long step is halved until ``|A| step`` is at most one, then doubled.
-
-    Args:
-        A: ``(n, n)``, 1/s.
-        BGBt: intensity of the driving noise, ``(n, n)``.
-        step: sampling interval, s.
-
-    Returns:
-        Transition matrix ``Phi`` and covariance ``Qd`` of what the noise adds in one step, each ``(n, n)``.
-
-    Raises:
-        ValueError: a step that is not positive, a matrix of the wrong shape, an indefinite intensity.
-    """
-    A = _square("A", A)
-    n = len(A)
-    BGBt = _intensity("BGBt", BGBt, n)
-    if not (numpy.isfinite(step) and step > 0):
-        raise ValueError(f"step must be a positive number of seconds, got {step!r}")
-    halvings = max(0, math.ceil(math.log2(max(step * float(numpy.linalg.norm(A)), 0.5))))
-    short = step / 2**halvings
-    exponential = scipy.linalg.expm(short * numpy.block([[-A, BGBt], [numpy.zeros((n, n)), A.T]]))
-    Phi = exponential[n:, n:].T
-    Qd = Phi @ exponential[:n, n:]
-    for _ in range(halvings):
-        Qd = Phi @ Qd @ Phi.T + Qd
-        Phi = Phi @ Phi
-    return Phi, (Qd + Qd.T) / 2
+    return rows.T @ numpy.linalg.solve(intensity_matrix("Q", Q, len(rows), definite=True), rows)
 
 
 def riccati_scalar(a: float, w: float, s: float, R0: float, times: ArrayLike) -> Matrix:
@@ -165,11 +111,11 @@ def riccati_hamiltonian(
     Raises:
         ValueError: an indefinite intensity, a singular ``Q``, instants not in ascending order.
     """
-    A = _square("A", A)
+    A = square_matrix("A", A)
     n = len(A)
     information = _information(C, Q, n)
-    hamiltonian = numpy.block([[-A.T, information], [_intensity("BGBt", BGBt, n), A]])
-    R = _intensity("R0", R0, n)
+    hamiltonian = numpy.block([[-A.T, information], [intensity_matrix("BGBt", BGBt, n), A]])
+    R = intensity_matrix("R0", R0, n)
     if not restart > 0:
         raise ValueError(f"restart must be a positive number of seconds, got {restart!r}")
     covariances = []
@@ -193,10 +139,10 @@ def riccati_ode(
 
     Arguments, result and errors as in :func:`riccati_hamiltonian`.
     """
-    A = _square("A", A)
+    A = square_matrix("A", A)
     n = len(A)
-    information, BGBt = _information(C, Q, n), _intensity("BGBt", BGBt, n)
-    R0, instants = _intensity("R0", R0, n), _times(times)
+    information, BGBt = _information(C, Q, n), intensity_matrix("BGBt", BGBt, n)
+    R0, instants = intensity_matrix("R0", R0, n), _times(times)
 
     def slope(_: float, flat: Matrix) -> Matrix:
         R = flat.reshape(n, n)
@@ -210,55 +156,6 @@ def riccati_ode(
     if not solution.success:
         raise ArithmeticError(f"the Riccati equation could not be integrated: {solution.message}")
     return solution.y.T.reshape(-1, n, n)
-
-
-class SteadyState(NamedTuple):
-    """The filter that time-varying coefficients settle at."""
-
-    covariance: Matrix
-    """R of (5) with dR/dt = 0, ``(n, n)``."""
-    gain: Matrix
-    """K of (4), ``(n, m)``, 1/s."""
-
-
-def steady_state(A: ArrayLike, BGBt: ArrayLike, C: ArrayLike, Q: ArrayLike) -> SteadyState:
-    """Steady covariance and gain: the stabilising solution of the algebraic Riccati equation.
-
-    It exists exactly when the measurement sees every mode that does not decay by itself, and the noise
-    drives every mode on the imaginary axis. A random constant violates the second condition: its variance
-    falls for ever, like 1/t, and its gain goes to zero.
-
-    Args:
-        A: ``(n, n)``, 1/s.
-        BGBt: intensity of the process noise, ``(n, n)``.
-        C: measurement matrix, ``(m, n)``.
-        Q: intensity of the measurement noise, ``(m, m)``.
-
-    Raises:
-        ValueError: there is no stabilising solution; the message names the mode.
-    """
-    A = _square("A", A)
-    n = len(A)
-    BGBt = _intensity("BGBt", BGBt, n)
-    rows = numpy.atleast_2d(numpy.asarray(C, float))
-    _information(rows, Q, n)
-    small = 1e-9 * max(1.0, float(numpy.abs(A).max()))
-    for mode in numpy.linalg.eigvals(A):
-        if mode.real < -small:
-            continue
-        shifted = A - mode * numpy.eye(n)
-        if numpy.linalg.matrix_rank(numpy.vstack([shifted, rows]), tol=small) < n:
-            raise ValueError(
-                f"no steady state: the measurement does not see the mode {mode:.6g} 1/s, which does not decay"
-            )
-        if mode.real <= small and numpy.linalg.matrix_rank(numpy.hstack([shifted, BGBt]), tol=small) < n:
-            raise ValueError(
-                f"no steady state: no noise drives the mode {mode:.6g} 1/s, so the algebraic Riccati "
-                "equation has no stabilising solution (a random constant is learned ever better); use the "
-                "time-varying equation (5), or let the constant walk slowly"
-            )
-    R = scipy.linalg.solve_continuous_are(A.T, rows.T, BGBt, numpy.atleast_2d(Q))
-    return SteadyState(R, numpy.linalg.solve(numpy.atleast_2d(numpy.asarray(Q, float)), rows @ R).T)
 
 
 class Moments(NamedTuple):
@@ -286,9 +183,9 @@ def moments(
     Raises:
         ValueError: a wrong shape, an indefinite intensity, instants not in ascending order.
     """
-    A = _square("A", A)
+    A = square_matrix("A", A)
     n = len(A)
-    BGBt, covariance = _intensity("BGBt", BGBt, n), _intensity("Theta0", Theta0, n)
+    BGBt, covariance = intensity_matrix("BGBt", BGBt, n), intensity_matrix("Theta0", Theta0, n)
     mean = numpy.broadcast_to(numpy.asarray(m0, float), (n,))
     held = numpy.zeros((n + 1, n + 1))
     held[:n, :n], held[:n, n] = A, numpy.broadcast_to(numpy.asarray(U, float), (n,))
@@ -301,24 +198,6 @@ def moments(
         means.append(mean)
         covariances.append(covariance)
     return Moments(numpy.stack(means), numpy.stack(covariances))
-
-
-def stationary_covariance(A: ArrayLike, BGBt: ArrayLike) -> Matrix:
-    """Covariance at which (6) comes to rest: ``A T + T A^T = -BGB^T`` (Lyapunov).
-
-    Args:
-        A: ``(n, n)``, 1/s, every eigenvalue with a negative real part.
-        BGBt: intensity of the process noise, ``(n, n)``.
-
-    Raises:
-        ValueError: a mode that does not decay, so that no covariance is stationary.
-    """
-    A = _square("A", A)
-    BGBt = _intensity("BGBt", BGBt, len(A))
-    slowest = float(numpy.linalg.eigvals(A).real.max())
-    if slowest > -1e-12 * max(1.0, float(numpy.abs(A).max())):
-        raise ValueError(f"no stationary covariance: a mode of A has the real part {slowest:.6g} 1/s")
-    return scipy.linalg.solve_continuous_lyapunov(A, -BGBt)
 
 
 class SampledCovariance(NamedTuple):
@@ -368,7 +247,7 @@ def sampled_covariance(
     rows = numpy.atleast_2d(numpy.asarray(C, float))
     _information(rows, Q, n)
     Rd = numpy.atleast_2d(numpy.asarray(Q, float)) / step
-    P = _intensity("R0", R0, n)
+    P = intensity_matrix("R0", R0, n)
     fixed = None if gain is None else numpy.asarray(gain, float).reshape(n, len(rows))
     predicted, updated, gains = [], [], []
     for _ in range(round(duration / step)):

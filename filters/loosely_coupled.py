@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy
 
 from .array_namespace import Array
-from .kalman_bucy import Matrix, van_loan
+from .linear_systems import Matrix, van_loan
 
 
 def error_model(

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-import scipy.linalg
-from filtergym.filters import kalman_bucy
+from filtergym.filters import kalman_bucy, linear_systems
 
 SEEDS = range(5)
 AUGMENTED = (
@@ -23,20 +22,6 @@ def random_model(seed, n=3, m=2):
     B, C, H = rng.normal(size=(n, n)), rng.normal(size=(m, n)), rng.normal(size=(m, m)) + 2 * np.eye(m)
     R0 = rng.normal(size=(n, n))
     return A, B @ B.T, C, H @ H.T, R0 @ R0.T
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_van_loan_is_the_integral_of_the_noise(seed):
-    A, BGBt, *_ = random_model(seed)
-    Phi, Qd = kalman_bucy.van_loan(A, BGBt, 0.3)
-    nodes, weights = np.polynomial.legendre.leggauss(20)
-    exact = sum(
-        w * scipy.linalg.expm(A * t) @ BGBt @ scipy.linalg.expm(A * t).T
-        for t, w in zip(0.15 * (nodes + 1), 0.15 * weights, strict=True)
-    )
-    # Both are exact but for rounding.
-    np.testing.assert_allclose(Phi, scipy.linalg.expm(0.3 * A), rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(Qd, exact, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -77,45 +62,39 @@ def test_a_long_exponential_without_restart_is_lost():
     model = random_model(0)
     once = kalman_bucy.riccati_hamiltonian(*model, [30.0], restart=100.0)
     restarted = kalman_bucy.riccati_hamiltonian(*model, [30.0])
-    settled = kalman_bucy.steady_state(*model[:4]).covariance
+    settled = steady(*model[:4]).posterior
     np.testing.assert_allclose(restarted[0], settled, rtol=1e-9, atol=1e-10)
     assert np.abs(once[0] - settled).max() > 1e-3
+
+
+def steady(A, BGBt, C, Q):
+    return linear_systems.steady_kalman_bucy(A, C, BGBt, Q)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_steady_state_solves_the_equation_and_is_stable(seed):
     A, BGBt, C, Q, _ = random_model(seed)
-    R, K = kalman_bucy.steady_state(A, BGBt, C, Q)
+    settled = steady(A, BGBt, C, Q)
+    R, K = settled.posterior, settled.gain
     residual = A @ R + R @ A.T - R @ C.T @ np.linalg.inv(Q) @ C @ R + BGBt
     np.testing.assert_allclose(residual, 0, atol=1e-9 * np.abs(BGBt).max())
     np.testing.assert_allclose(K, R @ C.T @ np.linalg.inv(Q), rtol=1e-9)
-    assert np.linalg.eigvals(A - K @ C).real.max() < 0
+    assert settled.poles.real.max() < 0
 
 
-def test_golden_numbers():
-    q, r = 0.7, 1.9
-    double = [[0, 1], [0, 0]], np.diag([0, q]), [[1, 0]], [[r]]
-    R, _ = kalman_bucy.steady_state(*double)
-    root = math.sqrt(2)
-    expected = [[root * q**0.25 * r**0.75, math.sqrt(q * r)], [math.sqrt(q * r), root * q**0.75 * r**0.25]]
-    np.testing.assert_allclose(R, expected, rtol=1e-12)
-    np.testing.assert_allclose(
-        kalman_bucy.steady_state([[0, 1], [0, 0]], np.diag([0, 1]), [[1, 0]], [[1]]).gain,
-        [[root], [1]],
-        rtol=1e-12,
-    )
+def test_golden_numbers_of_the_first_order_example():
     np.testing.assert_allclose(kalman_bucy.riccati_scalar(0, 1, 1, 0, 1.0), math.tanh(1), rtol=1e-14)
-    settled = kalman_bucy.steady_state(-0.5, 1, 1, 0.01)
-    np.testing.assert_allclose([settled.covariance[0, 0], settled.gain[0, 0]], [0.095125, 9.5125], rtol=3e-6)
+    settled = steady(-0.5, 1, 1, 0.01)
+    np.testing.assert_allclose([settled.posterior[0, 0], settled.gain[0, 0]], [0.095125, 9.5125], rtol=3e-6)
 
 
-def test_without_a_stabilising_solution_the_error_says_why():
-    with pytest.raises(ValueError, match=r"no noise drives the mode .* no stabilising solution"):
-        kalman_bucy.steady_state(*AUGMENTED)
-    with pytest.raises(ValueError, match=r"does not see the mode 0\.5"):
-        kalman_bucy.steady_state(np.diag([0.5, -1]), np.eye(2), [[0, 1]], [[1]])
+def test_the_augmented_scheme_has_no_steady_state_unless_its_constant_walks():
+    with pytest.raises(ValueError, match=r"no noise reaches .* eigenvalues 0.*let the gain vary with time"):
+        steady(*AUGMENTED)
+    with pytest.raises(ValueError, match=r"cannot detect the state: the modes with eigenvalues 0\.5"):
+        steady(np.diag([0.5, -1]), np.eye(2), [[0, 1]], [[1]])
     walking = AUGMENTED[1] + np.diag([0, 1e-4, 0])
-    assert kalman_bucy.steady_state(AUGMENTED[0], walking, *AUGMENTED[2:]).gain[1, 0] > 0
+    assert steady(AUGMENTED[0], walking, *AUGMENTED[2:]).gain[1, 0] > 0
     # The variance of the constant falls like 1/t: t R is nearly the same at 100 and at 200 s.
     late = kalman_bucy.riccati_hamiltonian(*AUGMENTED, START, [100.0, 200.0])[:, 1, 1]
     assert 1.9 < late[0] / late[1] < 2.1
@@ -133,7 +112,7 @@ def test_moments_by_small_steps_and_their_rest(seed):
         m, Theta = m + 1e-4 * (A @ middle + U), Theta + 1e-4 * (A @ slope + slope @ A.T + BGBt)
     np.testing.assert_allclose(found.mean[1], m, atol=1e-6)
     np.testing.assert_allclose(found.covariance[1], Theta, atol=1e-5)
-    rest = kalman_bucy.stationary_covariance(A, BGBt)
+    rest = linear_systems.continuous_stationary_covariance(A, BGBt)
     np.testing.assert_allclose(found.covariance[2], rest, atol=1e-10)
     # The sum over l as the paper prints it.
     printed = [
@@ -144,8 +123,8 @@ def test_moments_by_small_steps_and_their_rest(seed):
 
 
 def test_a_drifting_process_has_no_stationary_covariance():
-    with pytest.raises(ValueError, match="real part 0"):
-        kalman_bucy.stationary_covariance(AUGMENTED[0], AUGMENTED[1])
+    with pytest.raises(ValueError, match="pole at 0"):
+        linear_systems.continuous_stationary_covariance(AUGMENTED[0], AUGMENTED[1])
 
 
 def test_the_sampled_filter_agrees_at_first_order():
@@ -181,9 +160,12 @@ def test_a_fixed_gain_is_charged_its_own_covariance():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: kalman_bucy.van_loan([[0]], [[-1]], 0.1), "BGBt must be symmetric positive semidefinite"),
-        (lambda: kalman_bucy.van_loan([[0]], [[1]], 0), "step must be a positive"),
-        (lambda: kalman_bucy.van_loan([[0]], np.eye(2), 0.1), "BGBt must be a finite 1 x 1"),
+        (
+            lambda: linear_systems.van_loan([[0]], [[-1]], 0.1),
+            "intensity must be symmetric positive semidefinite",
+        ),
+        (lambda: linear_systems.van_loan([[0]], [[1]], 0), "T must be a positive"),
+        (lambda: linear_systems.van_loan([[0]], np.eye(2), 0.1), "intensity must be a finite 1 x 1"),
         (lambda: kalman_bucy.riccati_scalar(0, -1, 1, 0, 1), "w must not be negative"),
         (lambda: kalman_bucy.riccati_ode(0, 1, 1, 0, 0, 1), "Q must be symmetric positive definite"),
         (lambda: kalman_bucy.riccati_hamiltonian(0, 1, 1, 1, 0, [2, 1]), "ascending order"),
@@ -202,7 +184,7 @@ def test_the_filter_follows_the_process_and_not_the_reference():
     """Example (a): reference table, consistency and the orthogonality identity, over 4000 runs."""
     runs, step, steps = 4000, 0.005, 1000
     rng = np.random.default_rng(11)
-    phi, qd = (float(x[0, 0]) for x in kalman_bucy.van_loan(-0.5, 1, step))
+    phi, qd = (float(x[0, 0]) for x in linear_systems.van_loan(-0.5, 1, step))
     push = (1 - phi) / 0.5  # zero-order hold of U = 1
     sampled = kalman_bucy.sampled_covariance(-0.5, 1, 1, 0.01, 0, step, steps * step)
     X, Xh, Xr = np.zeros(runs), np.zeros(runs), 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from filtergym.envs.tasks.loosely_coupled_navigation import TASK, LooselyCoupledNavigationParameters
-from filtergym.filters import kalman_bucy, loosely_coupled
+from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
 
 PAPER = LooselyCoupledNavigationParameters()
 MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])
@@ -60,7 +60,7 @@ def random_actions(task, lanes, steps, seed):
 
 def plain_riccati_root_mean_square(intensity):
     """Exact root mean square error of the plain scheme with the Riccati gain over 2.5 to 5 s."""
-    Phi, Qd = kalman_bucy.van_loan(*MODEL[:2], 0.01)
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     variance, P, squares = 0.0, START, []
     for _ in range(500):
         variance += intensity * 0.01
@@ -172,7 +172,7 @@ def test_the_bank_equals_naive_filters(seed):
     task = make("random", "weights", axes=2, noise_changes=(2, 2), outage_probability=1.0)
     drawn, actions = numbers(task, lanes, steps, seed), random_actions(task, lanes, steps, seed)
     run = list(states(task, drawn, lambda k, seen: actions[k]))
-    Phi, Qd = kalman_bucy.van_loan(*MODEL[:2], 0.01)
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     for lane in range(lanes):
         for axis in range(2):
             x = np.full(2, run[0][0].ins[axis, lane] - run[0][0].increment[axis, lane])
@@ -307,12 +307,14 @@ def test_ins_noise_has_the_drawn_intensities():
         q11 = state.white_step[i] ** 2 + s.coupling**2 * q33
         white = (
             q11
-            - kalman_bucy.van_loan(*loosely_coupled.error_model(0, math.sqrt(variance), 1, 0)[:2], 0.01)[1][
-                0, 0
-            ]
+            - linear_systems.van_loan(*loosely_coupled.error_model(0, math.sqrt(variance), 1, 0)[:2], 0.01)[
+                1
+            ][0, 0]
         ) / 0.01
         assert 0.04 * 10**-0.5 * (1 - 1e-6) < white < 0.04 * 10**0.5 * (1 + 1e-6)
-        Qd = kalman_bucy.van_loan(*loosely_coupled.error_model(0, math.sqrt(variance), 1, white)[:2], 0.01)[1]
+        Qd = linear_systems.van_loan(
+            *loosely_coupled.error_model(0, math.sqrt(variance), 1, white)[:2], 0.01
+        )[1]
         np.testing.assert_allclose([q11, s.coupling * q33, q33], [Qd[0, 0], Qd[0, 2], Qd[2, 2]], rtol=1e-9)
 
 
@@ -323,7 +325,7 @@ def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
     noise = np.array([[0.0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
     after = task.sense(task.begin(np.full((20, 5), 0.5), normals), noise)
     error = np.stack([(after.ins - after.reference)[0], after.drift[0], after.coloured[0]])
-    Phi, Qd = kalman_bucy.van_loan(*MODEL[:2], 0.01)
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     # The last lane has no source and stays free of error.
     np.testing.assert_array_equal(error[:, 4], 0.0)
     np.testing.assert_allclose(error[:, :2], Phi @ np.sqrt(START)[:, [1, 2]], rtol=1e-12, atol=1e-15)
@@ -476,10 +478,10 @@ def test_the_cost_is_differentiable_in_the_actions(control):
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"white_intensity": -0.1}, "white_intensity must be a finite number and at least 0"),
-        ({"receiver_intensity": 0.0}, "receiver_intensity must be a finite number and above 0"),
+        ({"white_intensity": -0.1}, "white_intensity must be a finite number at least 0"),
+        ({"receiver_intensity": 0.0}, "receiver_intensity must be a finite number above 0"),
         ({"step": 2.0, "duration": 1.0}, r"step must be at most the duration of 1\.0 s, got 2\.0"),
-        ({"step": -0.01}, "step must be a finite number and above 0"),
+        ({"step": -0.01}, "step must be a finite number above 0"),
         ({"axes": 4}, "axes must be 1, 2 or 3"),
         ({"horizon": 0}, "horizon must be an integer"),
         ({"coloured": 0.0, "white_intensity": 0.0}, "must not both be 0"),
@@ -510,7 +512,7 @@ def test_parameters_from_json_and_duration():
 def test_the_augmented_covariance_against_matrices(library, seed):
     rng = np.random.default_rng(seed)
     s = loosely_coupled.sampling(0.7, 0.05)
-    Phi, Qd = kalman_bucy.van_loan(*loosely_coupled.error_model(0, 1.3, 0.7, 0.2)[:2], 0.05)
+    Phi, Qd = linear_systems.van_loan(*loosely_coupled.error_model(0, 1.3, 0.7, 0.2)[:2], 0.05)
     root = rng.normal(size=(3, 3))
     P = root @ root.T
     entries = [P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]]

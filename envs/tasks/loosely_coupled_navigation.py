@@ -11,9 +11,8 @@ Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 an
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -322,8 +321,6 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
     controls = ("gain", "mode", "weights")
     Parameters = LooselyCoupledNavigationParameters
     scenarios = SCENARIOS
-    components: ClassVar[tuple[Component, ...]] = (Component("x", "m"),)
-    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {"position": ("x",)}
     modes = ("plain-white", "plain-reduced", "augmented")
     cost_description = "squared error of position over the nominal variance of a measurement"
     huber_bound = 30.0
@@ -341,16 +338,15 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         super().__init__(parameters, control, xp, device)
         p = self.parameters
         names = AXES[: p.axes]
-        self.components = tuple(Component(name, "m") for name in names)  # type: ignore[misc]
-        self.groups = {"position": names}  # type: ignore[misc]
+        components = ("position",) if p.axes == 1 else tuple(f"position_{name}" for name in names)
+        self.components = tuple(Component(name, "m") for name in components)
+        self.groups = {} if p.axes == 1 else {"position": components}
         self.noise = NoiseLayout(uniforms=20, initial_normals=2 * p.axes, normals=3 * p.axes)
 
         self.sampling = ins_gnss.sampling(p.correlation_time, p.step)
         self.growth = tuple(intensity * p.step for intensity in p.equivalent_intensities)
         self.settled_gains = tuple(ins_gnss.settled_gain(q, p.receiver_variance) for q in self.growth)
-        self.paper_policy = PaperPolicy(  # type: ignore[misc]
-            "gain", (self.action_of_gain(self.settled_gains[1]),) * p.axes
-        )
+        self.paper_policy = PaperPolicy("gain", (self.action_of_gain(self.settled_gains[1]),) * p.axes)
         self._coloured_growth = (p.coloured * self.sampling.coloured) ** 2
         self._white_growth = p.white_intensity * p.step + p.coloured**2 * self.sampling.residual
         self._plain_growth = self.constant(self.growth)[:, None, None]
@@ -679,7 +675,10 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         return state.estimate_covariance
 
     def records(self, state: LooselyCoupledNavigationState) -> dict[str, Array]:
-        """NIS over its dimension (NaN without a measurement), gain and K, or the weights; noise levels."""
+        """NIS (NaN without a measurement), gain and K, or the weights; noise levels.
+
+        In a bank the NIS is the mean over its filters by the weights in force: that of the filter believed.
+        """
         p, xp = self.parameters, self.xp
         squares = state.normalised * state.normalised
         nis = squares[:, 0]
@@ -695,7 +694,7 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         else:
             found = {"mode_probability": state.action}
             nis = state.action[0] * nis[0] + state.action[1] * nis[1] + state.action[2] * nis[2]
-        found["nis"] = xp.where(state.available > 0.0, nis / p.axes, math.nan)
+        found["nis"] = xp.where(state.available > 0.0, nis, math.nan)
         found["available"] = state.available
         found["receiver_deviation"] = state.deviation
         found["reported_deviation"] = state.reported
