@@ -405,6 +405,16 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         gain = self.xp.exp((0.5 * math.log(self.parameters.smallest_gain)) * (1.0 - action))
         return self.xp.where(action <= -1.0, 0.0, gain)
 
+    def actions_of_gains(self, gains: Any) -> Any:
+        """Return the same of a NumPy array of gains in [0, 1]; small ones are taken as zero."""
+        smallest = self.parameters.smallest_gain
+        logarithm = numpy.log(numpy.maximum(gains, smallest)) / math.log(smallest)
+        return numpy.where(gains <= smallest, -1.0, 1.0 - 2.0 * logarithm)
+
+    def diagonal(self, variance: Array) -> Array:
+        """Covariance ``(axes, axes, N)`` of independent axes with variances ``(axes, N)``."""
+        return self._eye * variance
+
     def begin(self, uniforms: Array, normals: Array) -> LooselyCoupledNavigationState:
         """Draw the episode: noise levels, changes, disturbances, rate errors.
 
@@ -470,7 +480,7 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             average_square=each + 1.0,
             average_product=each,
             estimate=reference,
-            estimate_covariance=zeros * self._eye,
+            estimate_covariance=self.diagonal(zeros),
             action=each[:, 0] if bank else zeros,
             gain=zeros[:0] if bank else zeros,
         )
@@ -511,13 +521,13 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             )
         if p.jamming_probability:
             louder = math.sqrt(p.jamming_factor) * deviation
-            deviation = xp.where(_within(clock, state.jamming), louder, deviation)
+            deviation = xp.where(within(clock, state.jamming), louder, deviation)
         measurement = reference + deviation * noise[2 * n : 3 * n]
         if p.spoofing_probability:
             pull = (p.spoofing_rate * p.step) * (clock - state.spoofing[0] + 1.0)
-            measurement = measurement + xp.where(_within(clock, state.spoofing), pull, 0.0)
+            measurement = measurement + xp.where(within(clock, state.spoofing), pull, 0.0)
         if p.outage_probability:
-            available = xp.where(_within(clock, state.outage), 0.0, xp.ones_like(clock))
+            available = xp.where(within(clock, state.outage), 0.0, xp.ones_like(clock))
             measurement = available * measurement
         return state._replace(
             clock=clock,
@@ -613,7 +623,7 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             position=estimate[None],
             variance=variance[None],
             estimate=estimate,
-            estimate_covariance=self._eye * variance,
+            estimate_covariance=self.diagonal(variance),
             action=action,
             gain=gain,
         )
@@ -711,7 +721,7 @@ def _log_uniform(u: Array, interval: tuple[float, float], xp: Any) -> Array:
     return interval[0] * xp.exp(math.log(interval[1] / interval[0]) * u)
 
 
-def _within(clock: Array, window: Array) -> Array:
+def within(clock: Array, window: Array) -> Array:
     """Whether the clock stands in a window, ``(N,)``."""
     return (clock >= window[0]) & (clock < window[1])
 
