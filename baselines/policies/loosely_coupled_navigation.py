@@ -180,6 +180,64 @@ class InnovationAdaptive(TimeVarying):
         return memory._replace(squares=squares, weight=memory.weight + 1.0), R
 
 
+class _Offset(NamedTuple):
+    """Memory of :class:`AugmentedGain`."""
+
+    offset: numpy.ndarray
+    """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""
+    drift: numpy.ndarray
+    """Estimate of beta, ``(axes, N)``, m/s."""
+    coloured: numpy.ndarray
+    """Estimate of eta, ``(axes, N)``, m/s."""
+    covariance: ins_gnss.AugmentedCovariance
+    """``(N,)`` each."""
+
+
+class AugmentedGain(TimeVarying):
+    """An augmented filter inside the policy, which steers the plain scheme towards its own estimate.
+
+    The correction of a sample is gain times innovation, and the agent sees the innovation before it chooses:
+    with ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate goes where it is
+    wanted; otherwise it waits for an innovation of the other sign, which comes after two samples on average.
+    So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
+    """
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
+        task, p = self.loose, self.loose.parameters
+        s = task.sampling
+        none = numpy.zeros((p.axes, len(observation)))
+        zero = none[0]
+        first = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
+        memory = _Offset(none, none, none, first)
+        if state is not None:
+            covariance = ins_gnss.AugmentedCovariance(
+                *(numpy.where(start, a, b) for a, b in zip(first, state.covariance, strict=True))
+            )
+            offset, drift, coloured = (numpy.where(start, 0.0, row) for row in state[:3])
+            memory = _Offset(offset, drift, coloured, covariance)
+        R = p.receiver_variance * numpy.exp(2.0 * observation[:, self.reported])
+        available = numpy.where(observation[:, self.available] > 0.5, 1.0, 0.0)
+        innovation = signed_exponential(observation[:, self.innovation].T, numpy) * numpy.sqrt(R)
+
+        offset = memory.offset - (s.step * memory.drift + s.drive * memory.coloured)
+        P = ins_gnss.predict_augmented(memory.covariance, s, *task.modelled_growth)
+        K, P = ins_gnss.update_augmented(P, R, available)
+        own = available * (innovation - offset)
+        wanted = offset + K.position * own
+        usable = (available > 0.0) & (innovation != 0.0)
+        gain = numpy.where(usable, wanted / numpy.where(usable, innovation, 1.0), 0.0)
+        gain = numpy.clip(gain, 0.0, 1.0)
+        gain = numpy.where(gain <= p.smallest_gain, 0.0, gain)
+        after = _Offset(
+            wanted - gain * innovation,
+            memory.drift - K.drift * own,
+            s.decay * memory.coloured - K.coloured * own,
+            P,
+        )
+        return task.actions_of_gains(gain.T), after
+
+
 # --- the bank
 
 
@@ -399,6 +457,7 @@ BASELINES = Baselines(
         "time-varying": TimeVarying,
         "time-varying-white": TimeVaryingWhite,
         "innovation-adaptive": InnovationAdaptive,
+        "augmented-gain": AugmentedGain,
         "augmented": Augmented,
         "ins-only": InsOnly,
         "gnss-only": GnssOnly,
@@ -416,6 +475,7 @@ BASELINES = Baselines(
         "best-constant",
         "time-varying",
         "innovation-adaptive",
+        "augmented-gain",
         "augmented",
         "ins-only",
         "gnss-only",

@@ -347,8 +347,11 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         self.growth = tuple(intensity * p.step for intensity in p.equivalent_intensities)
         self.settled_gains = tuple(ins_gnss.settled_gain(q, p.receiver_variance) for q in self.growth)
         self.paper_policy = PaperPolicy("gain", (self.action_of_gain(self.settled_gains[1]),) * p.axes)
-        self._coloured_growth = (p.coloured * self.sampling.coloured) ** 2
-        self._white_growth = p.white_intensity * p.step + p.coloured**2 * self.sampling.residual
+        # What the modelled coloured rate error and the displacement gain in a step, m^2/s^2 and m^2.
+        self.modelled_growth = (
+            (p.coloured * self.sampling.coloured) ** 2,
+            p.white_intensity * p.step + p.coloured**2 * self.sampling.residual,
+        )
         self._plain_growth = self.constant(self.growth)[:, None, None]
         self._eye = self.constant(numpy.eye(p.axes))[:, :, None]
         self._phase = self.constant([math.pi / 2 * i for i in range(p.axes)])[:, None]
@@ -555,8 +558,7 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             P = ins_gnss.predict_augmented(
                 ins_gnss.AugmentedCovariance(state.variance[2, 0], *(rest[i] for i in range(5))),
                 s,
-                self._coloured_growth,
-                self._white_growth,
+                *self.modelled_growth,
             )
             variance = xp.concat([state.variance[:2] + self._plain_growth, P.position[None, None]])
             rest = xp.stack(P[1:])
