@@ -166,7 +166,8 @@ def unobserved_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[com
 
 
 def _list(modes: list[complex]) -> str:
-    return ", ".join(f"{m.real:.6g}" if abs(m.imag) < 1e-9 else f"{m.real:.6g}{m.imag:+.6g}j" for m in modes)
+    texts = [f"{m.real:.6g}" if abs(m.imag) < 1e-9 else f"{m.real:.6g}{m.imag:+.6g}j" for m in modes]
+    return ", ".join(dict.fromkeys(texts))
 
 
 class SteadyFilter(NamedTuple):

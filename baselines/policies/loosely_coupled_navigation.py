@@ -307,6 +307,8 @@ class Matched:
         R = state.deviation**2
         innovation = used * ((state.ins - state.measurement) - delta)
         normalised = innovation / xp.sqrt(P.position + R)
+        # No innovation where no measurement is used, so no NIS either.
+        normalised = xp.where(used > 0.0, normalised, math.nan)
         gain, P = ins_gnss.update_augmented(P, R, used)
         error = (
             delta + gain.position * innovation,
