@@ -10,7 +10,7 @@ benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark
 
 test: $(VENV)/.dev  ## run the whole test suite
-	$(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)

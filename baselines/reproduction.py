@@ -7,6 +7,7 @@ defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress call
 
 import importlib
 import pkgutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,16 +90,25 @@ def as_markdown(result: Reproduction) -> str:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
+    """Lines of a Markdown table; a bar within a cell is escaped."""
     return [
         "| " + " | ".join(header) + " |",
         "|" + "---|" * len(header),
-        *("| " + " | ".join(row) + " |" for row in rows),
+        *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows),
     ]
 
 
 def save_reproduction(result: Reproduction, folder: Path, write_text: Callable[[Path, str], None]) -> None:
-    """Write ``report.md`` and the figures."""
-    for name, figure in result.figures.items():
-        save(figure, folder / f"{name}.png")
-    write_text(folder / "report.md", as_markdown(result))
+    """Write ``report.md`` and the figures, all of them or none.
+
+    Args:
+        result: what to write.
+        folder: where; it must exist.
+        write_text: writes a text file.
+    """
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as waiting:
+        for name, figure in result.figures.items():
+            save(figure, Path(waiting) / f"{name}.png")
+        write_text(Path(waiting) / "report.md", as_markdown(result))
+        for path in Path(waiting).iterdir():
+            path.replace(folder / path.name)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy
 
+from ..envs.environment import checked_action
 from ..envs.lanes import Lanes
 from ..envs.task import Array, Task
 
@@ -37,7 +38,7 @@ def run_policy(
     start = numpy.ones(lanes.count, dtype=bool)
     for _ in range(lanes.decisions_per_episode):
         answer, memory = policy.predict(lanes.observe(), memory, start, deterministic=True)
-        action = lanes.widened(numpy.asarray(answer))
+        action = lanes.widened(checked_action(task.action_space, answer, lanes.count))
 
         def update(state: Any, action: Array = action) -> Any:
             return task.act(state, action)

@@ -1,45 +1,62 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
-from collections.abc import Sequence
-from typing import Any
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from .catalogue import make_task, nearest
+from .backend import array_backend, host_array, is_tensor, tensor_on
+from .catalogue import find_scenario, make_task, nearest
 from .lanes import Lanes
 from .reward import REWARDS, paper_task, reward
 from .task import Array, Field, Task
 from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from .rendering import EpisodePicture
 
 
 def _observation_space(task: Task) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (len(task.fields),), numpy.float64)
 
 
-def _checked_action(space: gymnasium.Space, action: Any, count: int | None) -> numpy.ndarray:
-    """Return the action as an array, or say what arrived and what was expected."""
-    array = numpy.asarray(action)
+def _all_finite(values: Array) -> bool:
+    # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
+    with numpy.errstate(over="ignore", invalid="ignore"):
+        return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
+
+
+def checked_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
+    """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
+    if is_tensor(action):
+        array, values = action, action.detach()
+        floating, real = (
+            values.is_floating_point(),
+            str(values.dtype) != "torch.bool" and not values.is_complex(),
+        )
+    else:
+        array = values = numpy.asarray(action)
+        floating, real = values.dtype.kind == "f", values.dtype.kind in "fiu"
     if isinstance(space, gymnasium.spaces.Discrete):
         shape: tuple[int, ...] = () if count is None else (count,)
         n = int(space.n)
-        if array.shape != shape or array.dtype.kind not in "iu" or (array < 0).any() or (array >= n).any():
-            raise ValueError(
-                f"expected integer actions from 0 to {n - 1} of shape {shape}, "
-                f"got {array.dtype} of shape {array.shape}: {numpy.array2string(array, threshold=8)}"
-            )
+        if array.shape != shape or floating or not real or (values < 0).any() or (values >= n).any():
+            raise _unexpected_action(f"integer actions from 0 to {n - 1} of shape {shape}", values)
         return array
     assert space.shape is not None
     shape = space.shape if count is None else (count, *space.shape)
-    # The sum is finite unless an entry is not, and costs a third of asking for every entry.
-    if array.shape != shape or array.dtype.kind not in "fiu" or not numpy.isfinite(array.sum()):
-        raise ValueError(
-            f"expected finite actions of shape {shape}, "
-            f"got {array.dtype} of shape {array.shape}: {numpy.array2string(array, threshold=8)}"
-        )
+    if array.shape != shape or not real or not _all_finite(values):
+        raise _unexpected_action(f"finite actions of shape {shape}", values)
     return array
+
+
+def _unexpected_action(expected: str, action: Array) -> ValueError:
+    shown = numpy.array2string(host_array(action), threshold=8)
+    return ValueError(f"expected {expected}, got {action.dtype} of shape {tuple(action.shape)}: {shown}")
 
 
 class _Face:
@@ -58,8 +75,13 @@ class _Face:
         self.detailed_info = detailed_info
         self.lanes = Lanes(task, count, paper_task(task) if reward_kind == "relative" else None)
 
-    def _pay(self, action: Array, info: dict[str, Array]) -> Array:
-        """Step the lanes and return the mean reward over the measurements of this decision."""
+    def _pay(
+        self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
+    ) -> Array:
+        """Step the lanes and return the mean reward over the measurements of this decision.
+
+        ``watch`` is called with the state after the action, once for each measurement.
+        """
         task = self.task
         rewards: list[Array] = []
 
@@ -67,7 +89,12 @@ class _Face:
             rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
             if self.detailed_info:
                 batch_last = {"error": task.error(state), "cost": task.cost(state), **task.records(state)}
-                info.update({name: values.T for name, values in batch_last.items()})
+                # A copy: some of these arrays are the state's own, and the caller may overwrite them.
+                for name, values in batch_last.items():
+                    batch_first = values.T if values.ndim == 2 else values
+                    info[name] = task.xp.asarray(batch_first, copy=True)
+            if watch is not None:
+                watch(state)
 
         self.lanes.step(lambda state: task.act(state, action), record)
         total = rewards[0]
@@ -113,6 +140,14 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         self._open(make_task(task, control, scenario, **keywords), reward, 1, detailed_info)
         self.render_mode = render_mode
+        self.picture: EpisodePicture | None = None
+        """What keeps and draws the episode; None without a render mode."""
+        if render_mode is not None:
+            # Only here: matplotlib takes longer to import than an episode takes to run.
+            from . import rendering
+
+            name = find_scenario(type(self.task), scenario).name
+            self.picture = rendering.EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
         self.observation_space = _observation_space(self.task)
         self.action_space = self.task.action_space
 
@@ -123,17 +158,60 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         super().reset(seed=seed)
         self.lanes.seed(0, self.np_random)
         self.lanes.restart()
+        if self.picture is not None:
+            self.picture.begin(self.lanes.state)
+            self._show()
         return self.lanes.observe()[0], {}
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
         if self.lanes.state is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        array = _checked_action(self.action_space, action, None)
+        array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._pay(self.lanes.widened(array[None]), info)
+        watch: Callable[[Any], None] | None = None
+        if self.picture is not None:
+            picture, shown = self.picture, self.lanes.observe()[0]
+
+            def watch(state: Any) -> None:
+                picture.keep(state, array, shown)
+
+        paid = self._pay(self.lanes.widened(array[None]), info, watch)
+        self._show()
         info = {name: values[0] for name, values in info.items()}
         return self.lanes.observe()[0], float(paid[0]), False, bool(self.lanes.finished[0]), info
+
+    def _show(self) -> None:
+        """Draw into the window of render mode "human"."""
+        if self.picture is not None and self.render_mode == "human":
+            self.picture.show(self.lanes.state)
+
+    def render(self) -> numpy.ndarray | None:
+        """Draw the episode so far.
+
+        Returns:
+            ``(height, width, 3)`` bytes in render mode "rgb_array"; None in "human", whose window is drawn by
+            every reset and step anyway.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.picture is None:
+            gymnasium.logger.warn(
+                'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
+            )
+            return None
+        if self.lanes.state is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        if self.render_mode == "human":
+            self._show()
+            return None
+        return self.picture.frame(self.lanes.state)
+
+    def close(self) -> None:
+        """Close the window."""
+        if self.picture is not None:
+            self.picture.close()
 
 
 class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -146,13 +224,19 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, or a trajectory.
         reward: "cost" (default), "log-likelihood" or "relative".
+        backend: "numpy", or "torch": observations, rewards, masks and ``info`` are tensors, actions may be.
+            Episodes are the same, drawn by the same NumPy generators; float64 results differ by rounding.
+            Gradients flow from rewards and observations back to actions that require them, over all steps
+            since the last reset; pass detached actions where none are wanted.
+        device: where the torch backend computes, such as "cpu" (default) or "cuda".
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
         detailed_info: whether ``info`` carries truth error, cost and what an evaluation records.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for an unknown name or a value out of its limits.
+        ValueError: for an unknown name, a value out of its limits, or a device that is not there.
+        ImportError: for the torch backend without torch.
     """
 
     def __init__(
@@ -162,6 +246,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: str | None = None,
         scenario: str | Trajectory | None = None,
         reward: str = "cost",
+        backend: str = "numpy",
+        device: Any = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         detailed_info: bool = False,
@@ -169,7 +255,11 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        self._open(make_task(task, control, scenario, **keywords), reward, num_envs, detailed_info)
+        xp, self.device = array_backend(backend, device)
+        self.backend = backend
+        self._open(
+            make_task(task, control, scenario, xp, self.device, **keywords), reward, num_envs, detailed_info
+        )
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
@@ -203,6 +293,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if mask is None:
             chosen: Sequence[int] = range(self.num_envs)
         else:
+            mask = host_array(mask) if is_tensor(mask) else mask
             if (
                 not isinstance(mask, numpy.ndarray)
                 or mask.dtype != bool
@@ -235,39 +326,57 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         array = self._actions(actions)
         info: dict[str, Any] = {}
         paid = self._pay(self.lanes.widened(array), info)[: self.num_envs]
-        if self.detailed_info:
-            info = {name: values[: self.num_envs] for name, values in info.items()}
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self.lanes.restart(numpy.flatnonzero(waiting).tolist())
-            paid = self.task.xp.where(self.task.xp.asarray(waiting, device=self.task.device), 0.0, paid)
+            paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
         finished = self.lanes.decisions >= self.last_decision
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
-            last = self.lanes.observe()
             done = numpy.flatnonzero(finished)
-            info = self._final_info(info, last, done)
+            info = self._masked(info, ~finished) | {
+                "final_obs": self._final_observations(self.lanes.observe(), done),
+                "_final_obs": self._mask(finished),
+                "final_info": self._masked(info, finished),
+                "_final_info": self._mask(finished),
+            }
             self.lanes.restart(done.tolist())
             self._finished = self._never
         else:
+            info = self._masked(info, ~waiting)
             self._finished = finished
-        return self.lanes.observe(), paid, self._never.copy(), finished, info
+        return self.lanes.observe(), paid, self._mask(self._never), self._mask(finished), info
+
+    def _masked(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
+        """Gymnasium's form of what some sub-environments report: a mask beside every key."""
+        if not mask.any():
+            return {}
+        masked = {}
+        for name, values in info.items():
+            masked[name], masked[f"_{name}"] = values[: self.num_envs], self._mask(mask)
+        return masked
 
     def _actions(self, actions: Any) -> Array:
-        return _checked_action(self.single_action_space, actions, self.num_envs)
+        array = checked_action(self.single_action_space, actions, self.num_envs)
+        if self.backend == "numpy":
+            return host_array(array)
+        tensor = tensor_on(array, self.device)
+        # As in NumPy, where clipping whole numbers to limits that are floats gives floats.
+        whole = isinstance(self.single_action_space, gymnasium.spaces.Box) and not tensor.is_floating_point()
+        return tensor.double() if whole else tensor
 
-    def _final_info(self, info: dict[str, Any], last: Array, done: numpy.ndarray) -> dict[str, Any]:
-        """Gymnasium's form: objects for the finished ones, None elsewhere, and a mask beside every key."""
-        mask = numpy.zeros(self.num_envs, dtype=bool)
-        mask[done] = True
-        final_obs = numpy.full(self.num_envs, None, dtype=object)
+    def _mask(self, lanes: numpy.ndarray) -> Array:
+        """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
+        return lanes.copy() if self.backend == "numpy" else tensor_on(lanes, self.device)
+
+    def _final_observations(self, last: Array, done: numpy.ndarray) -> Array:
+        """Gymnasium's form: an object for each finished sub-environment, None elsewhere.
+
+        With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
+        transfer for each lane.
+        """
+        if self.backend != "numpy":
+            return last
+        final = numpy.full(self.num_envs, None, dtype=object)
         for lane in done:
-            final_obs[lane] = last[lane]
-        final_info = {}
-        for name, values in info.items():
-            final_info[name], final_info[f"_{name}"] = values, mask
-        return {
-            "final_obs": final_obs,
-            "_final_obs": mask,
-            "final_info": final_info,
-            "_final_info": mask.copy(),
-        }
+            final[lane] = last[lane]
+        return final

@@ -38,8 +38,9 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     if isinstance(old, tuple):
         parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one.
-    merged = old.copy() if isinstance(old, numpy.ndarray) else old.clone()
+    # A copy, because states are never changed in place: someone may still hold the old one. In the type of
+    # the new one: float32 actions leave float32 in a state, and a fresh lane must not be rounded to it.
+    merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
     merged[..., lanes] = new[..., : len(lanes)]
     return merged
 
@@ -208,6 +209,9 @@ class Lanes:
             if due:
                 self._store(self._rows(due, [self._children[lane] for lane in due]), due)
         row = self._ring[self._clock % self._slots]
+        if not isinstance(row, numpy.ndarray):
+            # Autograd may keep it until the backward pass, when the ring has long been written over.
+            row = row.clone()
         self.state = self.task.measure(posterior, row)
         if self.paper is not None:
             self.paper_state = self.paper.measure(paper_posterior, row)

@@ -10,12 +10,17 @@ Array = Any
 """A NumPy array or a torch tensor."""
 
 
+_BY_TYPE: dict[type, ModuleType] = {numpy.ndarray: numpy}
+"""Namespaces of the types of array seen so far."""
+
+
 def namespace(array: Array) -> ModuleType:
     """Return the array API namespace of ``array``.
 
-    NumPy 2 implements the standard itself, and asking ``array_api_compat`` costs as much as three small
-    array operations, so NumPy arrays take the short way.
+    NumPy 2 implements the standard itself. Asking ``array_api_compat`` costs as much as three small array
+    operations, and ``torch.compile`` cannot follow it, so each type is asked for once.
     """
-    if isinstance(array, numpy.ndarray | numpy.generic):
-        return numpy
-    return array_api_compat.array_namespace(array)
+    kind = type(array)
+    if kind not in _BY_TYPE:
+        _BY_TYPE[kind] = numpy if issubclass(kind, numpy.generic) else array_api_compat.array_namespace(array)
+    return _BY_TYPE[kind]

@@ -72,6 +72,8 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
     identity = xp.eye(n, dtype=mean.dtype, device=mean.device)[..., None]
     rest = identity - product(K, H)
     joseph = product(product(rest, covariance), transpose(rest)) + product(product(K, R), transpose(K))
+    # Rounding makes the product slightly asymmetric, and that grows over many updates.
+    joseph = 0.5 * (joseph + transpose(joseph))
     log_likelihood, squared_distance = log_density(innovation, S)
     return Update(mean + apply(K, innovation), joseph, log_likelihood, squared_distance)
 

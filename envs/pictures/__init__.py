@@ -1,1 +1,1 @@
-"""One module for each environment: how an episode is drawn."""
+"""What is drawn of an environment: one module for each, named like its task; see :mod:`..rendering`."""

@@ -1,0 +1,138 @@
+"""Animated pictures of an episode under a policy, for documentation.
+
+``python -m filtergym.baselines.animation ManeuveringTarget --scenario paper --policy imm --out DIR``
+"""
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium
+import numpy
+import typer
+from PIL import Image
+
+from ..envs.catalogue import task_class
+from ..envs.environment import TaskEnv
+from .evaluation import baselines_of, load_policy
+
+SHADES = 7
+"""Steps from a colour of the figure to white, for smooth edges."""
+
+
+def episode_frames(
+    env: str, policy: str, scenario: Any = None, seed: int = 0, every: int = 2, **keywords: Any
+) -> list[Image.Image]:
+    """Play an episode and draw it.
+
+    Args:
+        env: environment id.
+        policy: name of one of its policies, or ``module:Class``.
+        scenario: name of a scenario, or a trajectory.
+        seed: of the episode, as in ``reset``.
+        every: actions from one frame to the next; the last action is always shown.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, and for reference estimators and bounds, which do not act.
+    """
+    if every < 1:
+        raise ValueError(f"every must be at least 1, got {every}")
+    cls = task_class(env)
+    if baselines_of(cls.id).kind(policy) != "policy":
+        raise ValueError(f"{policy!r} is no policy: it does not act in the environment")
+    maker = load_policy(cls.id, policy)
+    control = getattr(maker, "control", None)
+    world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
+    assert world.picture is not None
+    world.picture.caption = f"policy {policy}"
+    actor = maker(world.task)
+    observation, _ = world.reset(seed=seed)
+    frames, memory, finished = [Image.fromarray(_frame(world))], None, False
+    taken = 0
+    while not finished:
+        action, memory = actor.predict(observation, memory)
+        observation, _, _, finished, _ = world.step(action)
+        taken += 1
+        if finished or taken % every == 0:
+            frames.append(Image.fromarray(_frame(world)))
+    world.close()
+    return frames
+
+
+def _frame(world: TaskEnv) -> Any:
+    frame = world.render()
+    assert frame is not None
+    return frame
+
+
+def _palette() -> Image.Image:
+    """Colours of the figures and their shades: one palette for all frames, or colours would flicker.
+
+    A palette chosen from the pixels would drop what is small, such as the radar's mark.
+    """
+    from matplotlib.colors import to_rgb
+
+    # Imported here for the same reason as in the environment.
+    from ..envs import rendering
+
+    white = numpy.ones(3)
+    share = numpy.arange(SHADES)[:, None] / SHADES
+    shades = [(1.0 - share) * to_rgb(colour) + share * white for colour in rendering.COLOURS]
+    image = Image.new("P", (1, 1))
+    image.putpalette(
+        numpy.rint(255.0 * numpy.concatenate([white[None], *shades])).astype(int).ravel().tolist()
+    )
+    return image
+
+
+def write_animation(frames: list[Image.Image], path: Path, frames_per_second: float = 6.0) -> None:
+    """Write frames as an endless GIF whose last frame stays for two seconds.
+
+    Args:
+        frames: at least one.
+        path: of the file, which is complete or not there.
+        frames_per_second: speed.
+    """
+    palette = _palette()
+    drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        drawn[0].save(
+            unfinished,
+            format="GIF",
+            save_all=True,
+            append_images=drawn[1:],
+            duration=durations,
+            loop=0,
+            optimize=True,
+        )
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def animate(
+    env: Annotated[str, typer.Argument(help="environment id")],
+    policy: Annotated[list[str], typer.Option(help="policy; may be given several times")],
+    out: Annotated[Path, typer.Option(help="folder for the GIFs")] = Path("results"),
+    scenario: Annotated[str | None, typer.Option(help="scenario; default: the training distribution")] = None,
+    seed: Annotated[int, typer.Option(help="seed of the episode")] = 0,
+    every: Annotated[int, typer.Option(help="actions from one frame to the next")] = 2,
+) -> None:
+    """Write one animated GIF for each policy, all of the same episode."""
+    try:
+        name = task_class(env).id.rpartition("/")[2]
+        for one in policy:
+            path = out / f"{name}-{one.rpartition(':')[2]}.gif"
+            write_animation(episode_frames(env, one, scenario, seed, every), path)
+            typer.echo(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+    except (ValueError, OSError, gymnasium.error.Error) as error:
+        typer.echo(f"error: {error}", err=True)
+        raise typer.Exit(2) from error
+
+
+if __name__ == "__main__":
+    typer.run(animate)

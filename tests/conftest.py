@@ -1,0 +1,71 @@
+"""Every environment of the catalogue, for the tests that hold for all of them.
+
+A test that asks for ``env_id`` runs once for every environment; one that asks for ``control`` too, once for
+every control of every environment. A new environment is covered without an edit.
+"""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import catalogue, make_task
+
+DECISIONS = 5
+"""Length of the short episodes, in decisions."""
+
+
+def pytest_generate_tests(metafunc):
+    """Fill in the catalogue."""
+    if "env_id" not in metafunc.fixturenames:
+        return
+    if "control" in metafunc.fixturenames:
+        cases = [(id, control) for id, cls in catalogue().items() for control in cls.controls]
+        metafunc.parametrize(("env_id", "control"), cases)
+    else:
+        metafunc.parametrize("env_id", list(catalogue()))
+
+
+@pytest.fixture
+def short(env_id):
+    """Keywords that make episodes of an environment five decisions long."""
+    interval = make_task(env_id).decision_interval
+    return {"horizon": DECISIONS * interval}
+
+
+@pytest.fixture
+def random_actions():
+    """Draw actions for a batch, each independent of how many others there are."""
+
+    def draw(space, count, step):
+        return np.stack([_one(space, np.random.default_rng([step, i])) for i in range(count)])
+
+    return draw
+
+
+def _one(space, rng):
+    if isinstance(space, gym.spaces.Discrete):
+        return rng.integers(space.n)
+    return rng.uniform(space.low, space.high).astype(space.dtype)
+
+
+@pytest.fixture
+def assert_blind():
+    """Check that neither observation nor estimator depends on the truth of a state, given its measurement."""
+
+    def check(task, state, other_truth, actions):
+        """``other_truth``: the fields of the state that are truth, with other values."""
+        changed = state._replace(**other_truth)
+        assert (task.cost(changed) != task.cost(state)).all(), "the truth was not changed enough to matter"
+        np.testing.assert_array_equal(task.observe(changed), task.observe(state))
+        after, changed_after = task.act(state, actions), task.act(changed, actions)
+        for name in set(state._fields) - set(other_truth):
+            _assert_identical(getattr(changed_after, name), getattr(after, name), name)
+
+    return check
+
+
+def _assert_identical(one, other, name):
+    if isinstance(one, tuple):
+        for part, other_part in zip(one, other, strict=True):
+            _assert_identical(part, other_part, name)
+    elif one is not None:
+        np.testing.assert_array_equal(one, other, err_msg=name)

@@ -1,0 +1,283 @@
+"""What holds for every single environment, task, policy and control of the catalogue."""
+
+import json
+import warnings
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.baselines.evaluation import baselines_of, evaluate
+from filtergym.envs.catalogue import catalogue, make_task, register
+from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from gymnasium.utils.env_checker import check_env
+
+ALLOWED_WARNINGS = (
+    "A Box observation space minimum value is -infinity",  # innovations have no bound
+    "A Box observation space maximum value is infinity",
+    "we recommend using a symmetric and normalized space",  # weights lie between 0 and 1
+)
+
+
+@pytest.mark.parametrize("detailed_info", [False, True])
+def test_gymnasium_check(env_id, control, detailed_info, short):
+    env = gym.make(env_id, control=control, detailed_info=detailed_info, disable_env_checker=True, **short)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped, skip_render_check=True)
+    unexpected = [
+        str(w.message) for w in caught if not any(text in str(w.message) for text in ALLOWED_WARNINGS)
+    ]
+    assert unexpected == []
+
+
+def run(env, actions, seed=21):
+    """Observations and rewards of fixed actions."""
+    shown, paid = [env.reset(seed=seed)[0]], []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        shown.append(observation)
+        paid.append(reward)
+        assert not terminated
+    return np.stack(shown), np.array(paid), truncated
+
+
+def test_episode_ends_by_truncation_at_the_horizon(env_id, control, short, random_actions):
+    env = gym.make(env_id, control=control, **short)
+    actions = random_actions(env.action_space, 5, 0)
+    assert not run(env, actions[:4])[2]
+    assert run(env, actions)[2]
+
+
+def test_spec_survives_json(env_id, control, short, random_actions):
+    env = gym.make(env_id, control=control, scenario="random", **short)
+    text = env.spec.to_json()
+    json.loads(text)
+    copy = gym.make(gym.envs.registration.EnvSpec.from_json(text))
+    actions = random_actions(env.action_space, 5, 1)
+    for one, other in zip(run(env, actions), run(copy, actions), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_parameters_survive_json(env_id):
+    # Lists from a file mean the same as tuples from Python.
+    task = make_task(env_id)
+    values = {name: getattr(task.parameters, name) for name in task.Parameters.__dataclass_fields__}
+    again = make_task(env_id, **json.loads(json.dumps(values)))
+    assert again.parameters == task.parameters
+
+
+def test_registration_twice_changes_nothing(env_id):
+    before = gym.spec(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        register()
+    assert gym.spec(env_id) is before
+
+
+def test_spawned_processes(env_id, short, random_actions):
+    # A process that starts afresh imports the package by the name before the colon.
+    make = partial(gym.make, f"filtergym:{env_id}", disable_env_checker=True, **short)
+    there = gym.vector.AsyncVectorEnv([make, make], context="spawn")
+    here = gym.make_vec(env_id, num_envs=2, **short)
+    try:
+        np.testing.assert_array_equal(there.reset(seed=8)[0], here.reset(seed=8)[0])
+        for step in range(3):
+            actions = random_actions(here.single_action_space, 2, step)
+            for one, other in zip(there.step(actions)[:4], here.step(actions)[:4], strict=True):
+                np.testing.assert_array_equal(one, other)
+    finally:
+        there.close()
+
+
+def test_fields_describe_the_observation(env_id, control):
+    env = TaskEnv(env_id, control=control)
+    fields = env.observation_fields
+    assert len(fields) == env.observation_space.shape[0]
+    assert len({field.name for field in fields}) == len(fields)
+    assert all(field.name and field.unit and field.description for field in fields)
+
+
+@pytest.mark.parametrize("scenario_index", range(12))
+def test_every_scenario_runs(env_id, scenario_index, random_actions):
+    scenarios = list(catalogue()[env_id].scenarios)
+    if scenario_index >= len(scenarios):
+        pytest.skip("there are fewer scenarios")
+    env = TaskEnv(env_id, scenario=scenarios[scenario_index])
+    horizon = env.task.horizon
+    observation, _ = env.reset(seed=0)
+    for step in range(5):
+        observation, reward, *_ = env.step(random_actions(env.action_space, 1, step)[0])
+        assert np.isfinite(observation).all()
+        assert np.isfinite(reward)
+    for first, last in env.task.scenarios[scenarios[scenario_index]].windows.values():
+        assert 1 <= first <= last <= horizon
+
+
+def test_one_scenario_is_for_training(env_id):
+    scenarios = catalogue()[env_id].scenarios
+    assert scenarios["random"].training
+    assert not scenarios["paper"].training
+
+
+def test_float64_actions_lose_nothing(env_id, control, short):
+    env = TaskEnv(env_id, control=control, **short)
+    if not isinstance(env.action_space, gym.spaces.Box):
+        pytest.skip("integers have no precision")
+    fine = np.full(env.action_space.shape, 0.3, dtype=np.float64)
+    fine[0] = 0.1
+    outcomes = []
+    for action in (fine, fine.astype(np.float32)):
+        env.reset(seed=0)
+        outcomes.append(env.step(action)[0])
+    assert (outcomes[0] != outcomes[1]).any(), "0.1 is another number in float32"
+    np.testing.assert_allclose(outcomes[0], outcomes[1], rtol=1e-5, atol=1e-5)
+
+
+def test_relative_reward_of_the_papers_algorithm_is_zero(env_id, short):
+    task = make_task(env_id)
+    env = TaskVectorEnv(env_id, 4, control=task.paper_policy.control, reward="relative", **short)
+    env.reset(seed=0)
+    action = np.tile(np.asarray(task.paper_policy.action), (4, 1))
+    if isinstance(env.single_action_space, gym.spaces.Discrete):
+        action = action[:, 0].astype(int)
+    for _ in range(8):
+        np.testing.assert_array_equal(env.step(action)[1], 0.0)
+
+
+def test_relative_reward_is_the_difference_of_costs(env_id, control, short, random_actions):
+    task = make_task(env_id)
+    ours, relative = (
+        TaskVectorEnv(env_id, 3, control=control, reward=r, **short) for r in ("cost", "relative")
+    )
+    paper = TaskVectorEnv(env_id, 3, control=task.paper_policy.control, **short)
+    for env in (ours, relative, paper):
+        env.reset(seed=1)
+    paper_action = np.tile(np.asarray(task.paper_policy.action), (3, 1))
+    for step in range(5):
+        actions = random_actions(ours.single_action_space, 3, step)
+        mine, difference, papers = (
+            ours.step(actions)[1],
+            relative.step(actions)[1],
+            paper.step(paper_action)[1],
+        )
+        np.testing.assert_allclose(difference, mine - papers, rtol=1e-12, atol=1e-12)
+
+
+def test_papers_policy_equals_the_papers_constant_action(env_id):
+    """The policy that sees observations, and the same algorithm inside the task."""
+    known = baselines_of(env_id)
+    paper = make_task(env_id).paper_policy
+
+    class Constant:
+        control = paper.control
+
+        def __init__(self, task):
+            self.discrete = isinstance(task.action_space, gym.spaces.Discrete)
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            action = np.tile(np.asarray(paper.action), (len(observation), 1))
+            return (action[:, 0].astype(int) if self.discrete else action), state
+
+    result = evaluate(
+        env_id, {"policy": known.policies[known.score_paper], "inside": Constant}, "paper", episodes=4
+    )
+    policy, inside = (result.error.sel(policy=name).values for name in ("policy", "inside"))
+    # A bank that mixes amplifies rounding: 1e-6 m and m/s, or a millionth of large errors.
+    np.testing.assert_allclose(policy, inside, rtol=1e-6, atol=1e-6)
+
+
+def test_policies_answer_one_and_many(env_id):
+    known = baselines_of(env_id)
+    for name, maker in known.policies.items():
+        task = make_task(env_id, getattr(maker, "control", None))
+        policy = maker(task)
+        assert policy.control == task.control
+        env = TaskVectorEnv(env_id, 3, control=task.control)
+        observation, _ = env.reset(seed=0)
+        state, single_state = None, None
+        start = np.ones(3, dtype=bool)
+        for _ in range(12):
+            action, state = policy.predict(observation, state, start, deterministic=True)
+            first = observation[0]
+            single, single_state = policy.predict(first, single_state, start[:1], deterministic=True)
+            assert np.shape(action) == env.action_space.shape, name
+            assert np.shape(single) == env.single_action_space.shape, name
+            if name != "random":
+                np.testing.assert_allclose(single, action[0], rtol=1e-14, atol=1e-14, err_msg=name)
+            observation, *_ = env.step(np.asarray(action))
+            start = np.zeros(3, dtype=bool)
+
+
+def test_policies_forget_at_the_start_of_an_episode(env_id):
+    known = baselines_of(env_id)
+    for name, maker in known.policies.items():
+        if name == "random":
+            continue
+        task = make_task(env_id, getattr(maker, "control", None))
+        policy = maker(task)
+        rng = np.random.default_rng(0)
+        rows = rng.normal(size=(15, 2, len(task.fields)))
+        state = None
+        for k in range(10):
+            _, state = policy.predict(rows[k], state, np.full(2, k == 0))
+        fresh = None
+        for k in range(10, 15):
+            # The first row starts anew, the second goes on.
+            action, state = policy.predict(rows[k], state, np.array([k == 10, False]))
+            expected, fresh = policy.predict(rows[k], fresh, np.full(2, k == 10))
+            np.testing.assert_allclose(action[0], expected[0], rtol=1e-14, err_msg=name)
+
+
+def test_stable_baselines3_evaluates_a_baseline(env_id, short):
+    evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
+    known = baselines_of(env_id)
+    policy_class = known.policies[known.score_paper]
+    env = gym.make(env_id, control=policy_class.control, **short)
+    mean, deviation = evaluation.evaluate_policy(
+        policy_class(env.unwrapped.task), env, n_eval_episodes=3, warn=False
+    )
+    assert np.isfinite([mean, deviation]).all()
+
+
+def test_baselines_are_named_consistently(env_id):
+    known = baselines_of(env_id)
+    assert known.score_paper in known.policies
+    assert known.score_bound in known.references or known.score_bound in known.bounds
+    assert set(known.benchmark) <= set(known.names)
+    assert len(set(known.names)) == len(known.names)
+    for table in (known.references, known.bounds):
+        assert all(maker.knows for maker in table.values())
+    assert {getattr(p, "control", None) for p in known.policies.values()} <= {
+        None,
+        *catalogue()[env_id].controls,
+    }
+
+
+def test_evaluation_replays_what_gymnasium_shows(env_id, short):
+    """An evaluation's errors are those of the environment under the evaluation's episode seeds."""
+    known = baselines_of(env_id)
+    maker = known.policies[known.score_paper]
+    result = evaluate(env_id, [known.score_paper], episodes=3, seed=5, **short)
+    env = gym.make(env_id, control=maker.control, detailed_info=True, disable_env_checker=True, **short)
+    policy = maker(env.unwrapped.task)
+    interval = env.unwrapped.task.decision_interval
+    for episode, seed in enumerate(result.episode_seed.values):
+        observation, _ = env.reset(seed=int(seed))
+        state = None
+        for decision in range(5):
+            action, state = policy.predict(observation, state, np.array([decision == 0]))
+            observation, _, _, _, info = env.step(action)
+            expected = result.error.isel(policy=0, episode=episode, time=(decision + 1) * interval - 1)
+            np.testing.assert_array_equal(info["error"], expected.values)
+
+
+def test_evaluation_is_paired_and_repeatable(env_id, short):
+    known = baselines_of(env_id)
+    names = [known.score_paper, "random"]
+    both = evaluate(env_id, names, episodes=3, seed=0, **short)
+    alone = evaluate(env_id, names[:1], episodes=3, seed=0, **short)
+    np.testing.assert_array_equal(both.error.sel(policy=names[0]), alone.error.sel(policy=names[0]))
+    other = evaluate(env_id, names[:1], episodes=3, seed=1, **short)
+    assert (other.error.values != alone.error.values).any(axis=(0, 2, 3)).all()
+    assert not set(other.episode_seed.values) & set(alone.episode_seed.values)

@@ -1,0 +1,217 @@
+"""Bad input gets one clear error that names the value and what was expected."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.baselines.evaluation import evaluate, load_policy
+from filtergym.baselines.seeds import episode_seeds
+from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+
+ID = "filtergym/ManeuveringTarget-v0"
+
+
+@pytest.mark.parametrize("make", [TaskEnv, TaskVectorEnv, make_task])
+class TestNames:
+    def test_environment(self, make):
+        with pytest.raises(ValueError, match=r"unknown environment .*Manoeuvring.*did you mean '" + ID):
+            make("filtergym/ManoeuvringTarget-v0")
+
+    def test_control(self, make):
+        with pytest.raises(ValueError, match=r"unknown control 'wieghts': did you mean 'weights'"):
+            make(ID, control="wieghts")
+
+    def test_control_of_every_environment(self, make):
+        for id, cls in catalogue().items():
+            with pytest.raises(ValueError, match=f"unknown control 'zzz'.*{cls.controls[0]}"):
+                make(id, control="zzz")
+
+    def test_scenario(self, make):
+        with pytest.raises(ValueError, match=r"unknown scenario 'papper': did you mean 'paper'"):
+            make(ID, scenario="papper")
+
+    def test_parameter(self, make):
+        with pytest.raises(ValueError, match=r"unknown parameter 'range_sigmas': did you mean 'range_sigma'"):
+            make(ID, range_sigmas=50.0)
+
+
+def test_short_names_of_environments():
+    assert task_class("ManeuveringTarget") is task_class("ManeuveringTarget-v0") is task_class(ID)
+
+
+@pytest.mark.parametrize("make", [TaskEnv, TaskVectorEnv])
+def test_reward(make):
+    with pytest.raises(ValueError, match=r"unknown reward 'costs': did you mean 'cost'"):
+        make(ID, reward="costs")
+
+
+def test_names_through_gymnasium():
+    with pytest.raises(ValueError, match="did you mean 'paper'"):
+        gym.make(ID, scenario="papr")
+    with pytest.raises(ValueError, match="did you mean 'gain'"):
+        gym.make_vec(ID, num_envs=2, control="gains")
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        (
+            {"transition": ((0.9, 0.2), (0.1, 0.9))},
+            r"transition\[0\] must sum to 1, got \(0.9, 0.2\) with sum 1.1",
+        ),
+        ({"transition": ((0.9, 0.1), (0.2, 0.9))}, r"transition\[1\] must sum to 1"),
+        ({"transition": ((1.1, -0.1), (0.1, 0.9))}, r"transition\[0\]\[0\] must be .* at most 1"),
+        ({"transition": ((0.9, 0.1),)}, "transition must have 2 rows"),
+        ({"transition": ((0.9, 0.1, 0.0), (0.1, 0.9, 0.0))}, r"transition\[0\] must be 2 numbers"),
+        ({"transition": 0.9}, "transition must have 2 rows"),
+        ({"gains": (0.0, 0.7)}, r"gains\[0\] must be .*above 0.*got 0.0"),
+        ({"gains": (0.3, 1.0)}, r"gains\[1\] must be .*below 1.*got 1.0"),
+        ({"gains": (0.3, float("nan"))}, r"gains\[1\] must be a finite number"),
+        ({"gains": (0.3,)}, "at least two filters"),
+        ({"gains": "0.3"}, "gains must be a sequence of numbers"),
+        ({"gains": (0.2, 0.5, 0.8)}, "transition must have 3 rows"),
+        ({"initial_probabilities": (0.5, 0.6)}, "initial_probabilities.*sum to 1"),
+        ({"alpha_range": (0.9, 0.1)}, "alpha_range must be in ascending order"),
+        ({"alpha_range": (0.0, 0.9)}, r"alpha_range\[0\]"),
+        ({"range_sigma": -1.0}, "range_sigma must be .*above 0"),
+        ({"range_sigma": "wide"}, "range_sigma must be a finite number.*'wide'"),
+        ({"sampling_interval": float("inf")}, "sampling_interval must be a finite number"),
+        ({"bearing_sigma": 90.0}, "bearing_sigma must be .*below 90"),
+        ({"horizon": 0}, "horizon must be an integer of at least 1, got 0"),
+        ({"horizon": 10.5}, "horizon must be an integer"),
+        ({"horizon": True}, "horizon must be an integer"),
+        ({"decision_interval": 0}, "decision_interval must be an integer of at least 1"),
+        ({"decision_interval": 7}, "horizon must be a multiple of decision_interval, got 100 and 7"),
+        ({"flight": "loop"}, "flight must be one of 'maneuver', 'random'"),
+        ({"flight": "legs"}, "needs at least one leg"),
+        ({"flight": "track", "track": ((0.0,),)}, "four rows"),
+        ({"maneuver_steps": (55, 50)}, "maneuver_steps must be in ascending order"),
+        ({"speed": (60.0, 300.0, 400.0)}, "speed must be 2 numbers"),
+    ],
+)
+def test_parameter_values(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make(ID, **keywords)
+
+
+BAD_ACTIONS = {
+    "gain": [
+        [np.nan], [np.inf], [[0.0]], 0.0, [0.0, 0.0], ["up"], None, [],
+    ],
+    "weights": [[0.5], [np.nan, 0.5], [[0.5, 0.5]], 1],
+    "evidence": [[0.5], [0.5, -np.inf], [0.0, 0.0, 0.0]],
+    "mode": [2, -1, 0.0, 0.5, [0], np.nan, "0"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("control", "action"), [(control, action) for control, many in BAD_ACTIONS.items() for action in many]
+)
+def test_bad_actions_say_what_arrived_and_change_nothing(control, action):
+    env, reference = (gym.make(ID, control=control, disable_env_checker=True).unwrapped for _ in range(2))
+    env.reset(seed=0), reference.reset(seed=0)
+    with pytest.raises(ValueError, match=r"expected (finite|integer) actions .*shape .*got"):
+        env.step(action)
+    good = np.int64(1) if control == "mode" else np.full(env.action_space.shape, 0.5)
+    np.testing.assert_array_equal(env.step(good)[0], reference.step(good)[0])
+
+
+@pytest.mark.parametrize("shape", [(2,), (3, 1), (2, 2), (1, 2)])
+def test_bad_vector_actions(shape):
+    env = gym.make_vec(ID, num_envs=2, control="gain")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(2, 1\), got float64 of shape"):
+        env.step(np.zeros(shape))
+
+
+def test_one_bad_action_among_many():
+    env = gym.make_vec(ID, num_envs=3, control="weights")
+    env.reset(seed=0)
+    actions = np.full((3, 2), 0.5)
+    actions[1, 0] = np.nan
+    with pytest.raises(ValueError, match="finite"):
+        env.step(actions)
+    env = gym.make_vec(ID, num_envs=3, control="mode")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="from 0 to 1"):
+        env.step(np.array([0, 1, 2]))
+
+
+def test_actions_that_cancel_are_not_taken_for_finite_ones():
+    env = gym.make_vec(ID, num_envs=2, control="gain")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="finite"):
+        env.step(np.array([[np.inf], [-np.inf]]))
+
+
+def test_large_finite_actions_are_taken_at_the_edge():
+    env, edge = (gym.make_vec(ID, num_envs=2, control="gain") for _ in range(2))
+    env.reset(seed=0), edge.reset(seed=0)
+    large = np.full((2, 1), 3e38, dtype=np.float32)
+    np.testing.assert_array_equal(env.step(large)[0], edge.step(np.ones((2, 1), dtype=np.float32))[0])
+
+
+def test_steps_before_a_reset():
+    with pytest.raises(gym.error.ResetNeeded):
+        TaskEnv(ID).step([0.0])
+
+
+class TestPolicies:
+    def test_unknown(self):
+        with pytest.raises(ValueError, match=r"unknown policy 'adaptve': did you mean 'adaptive'"):
+            evaluate(ID, ["adaptve"], episodes=1)
+
+    @pytest.mark.parametrize(
+        ("policy", "control"), [("imm", "gain"), ("adaptive", "weights"), ("zero", "mode")]
+    )
+    def test_that_do_not_fit_the_control(self, policy, control):
+        with pytest.raises(ValueError, match=f"policy '{policy}' is made for control .*, not '{control}'"):
+            evaluate(ID, [policy], episodes=1, control=control)
+
+    def test_not_importable(self):
+        with pytest.raises(ValueError, match="cannot load policy 'nowhere:Policy'"):
+            load_policy(ID, "nowhere:Policy")
+        with pytest.raises(ValueError, match="cannot load policy 'math:Policy'"):
+            load_policy(ID, "math:Policy")
+
+    def test_none(self):
+        with pytest.raises(ValueError, match="at least one policy"):
+            evaluate(ID, [], episodes=1)
+
+    def test_bad_action_of_a_users_policy(self):
+        class Wrong:
+            control = "gain"
+
+            def __init__(self, task):
+                pass
+
+            def predict(self, observation, state=None, episode_start=None, deterministic=True):
+                return np.full((len(observation), 1), np.nan), state
+
+        with pytest.raises(ValueError, match="finite"):
+            evaluate(ID, {"wrong": Wrong}, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scenario": "papper"}, "did you mean 'paper'"),
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"seed": -1}, "seed must not be negative"),
+        ({"split": "tset"}, "did you mean 'test'"),
+        ({"control": "wieghts"}, "did you mean 'weights'"),
+        ({"gains": (0.3, 1.5)}, "gains"),
+        ({"gain": (0.3, 0.5)}, "did you mean 'gains'"),
+    ],
+)
+def test_evaluation_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(ID, ["random"], **{"episodes": 1, **arguments})
+
+
+def test_splits_and_seeds_share_no_episode():
+    drawn = [
+        s for split in ("train", "validation", "test") for n in (0, 1) for s in episode_seeds(split, n, 500)
+    ]
+    assert len(set(drawn)) == 3000
+    assert episode_seeds("test", 0, 5, first=3) == episode_seeds("test", 0, 8)[3:]

@@ -1,0 +1,78 @@
+"""Stored trajectories: a change of dynamics, observation or reward must bump the version of the id.
+
+One file for each id and control, ``golden/<Name>-<control>.json``: seed, actions, and what they led to in the
+default scenario. A new environment or control gets its files by
+
+    python tests/test_golden_trajectories.py
+
+which writes those that are missing and leaves the others alone. To accept a change, bump the version, delete
+the file and run it again.
+"""
+
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from filtergym.envs.catalogue import catalogue
+
+FOLDER = Path(__file__).parent / "golden"
+SEED = 7
+DECISIONS = 30
+
+
+def stored_file(env_id, control):
+    """Where the trajectory of an id and control lies."""
+    return FOLDER / f"{env_id.split('/')[-1]}-{control}.json"
+
+
+def trajectory(env_id, control, actions):
+    """Observations and rewards that the actions lead to."""
+    env = gym.make(env_id, control=control, disable_env_checker=True)
+    shown, paid = [env.reset(seed=SEED)[0].tolist()], []
+    discrete = isinstance(env.action_space, gym.spaces.Discrete)
+    for action in actions:
+        observation, reward, *_ = env.step(action if discrete else np.array(action))
+        shown.append(observation.tolist())
+        paid.append(reward)
+    fields = [field.name for field in env.unwrapped.observation_fields]
+    return {"fields": fields, "observations": shown, "rewards": paid}
+
+
+def test_trajectory_is_the_stored_one(env_id, control):
+    path = stored_file(env_id, control)
+    assert path.exists(), (
+        f"{path.name} is missing: run `python tests/test_golden_trajectories.py` and look at what it wrote"
+    )
+    stored = json.loads(path.read_text())
+    now = trajectory(env_id, control, stored["actions"])
+    assert now["fields"] == stored["fields"]
+    # Processors differ below this.
+    np.testing.assert_allclose(now["observations"], stored["observations"], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(now["rewards"], stored["rewards"], rtol=1e-6, atol=1e-6)
+
+
+def test_no_file_is_left_over():
+    wanted = {stored_file(id, control).name for id, cls in catalogue().items() for control in cls.controls}
+    assert {path.name for path in FOLDER.glob("*.json")} == wanted
+
+
+def write_missing():
+    """Write the trajectories that are not there yet."""
+    FOLDER.mkdir(exist_ok=True)
+    for env_id, cls in catalogue().items():
+        for control in cls.controls:
+            path = stored_file(env_id, control)
+            if path.exists():
+                continue
+            space = gym.make(env_id, control=control).action_space
+            space.seed(SEED)
+            actions = [space.sample().tolist() for _ in range(DECISIONS)]
+            record = {"seed": SEED, "actions": actions, **trajectory(env_id, control, actions)}
+            rows = [f'"{key}": {json.dumps(value)}' for key, value in record.items()]
+            path.write_text("{\n" + ",\n".join(rows).replace("], [", "],\n[") + "\n}\n")
+            print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    write_missing()

@@ -1,0 +1,123 @@
+"""Every public function of the filters on torch float64 tensors: the same numbers as on NumPy arrays."""
+
+import inspect
+
+import numpy as np
+import pytest
+from filtergym.filters import alpha_beta, bounds, gaussian, imm, kalman, polar, small_matrices
+
+torch = pytest.importorskip("torch")
+
+rng = np.random.default_rng(0)
+
+
+def positive_definite(n, *batch):
+    root = rng.normal(size=(n, n, *batch))
+    return np.einsum("ij...,kj...->ik...", root, root) + 0.1 * np.eye(n).reshape(n, n, *(1 for _ in batch))
+
+
+N = 5
+P2 = alpha_beta.Covariance(*(np.abs(rng.normal(size=(2, N))) + least for least in (2.0, 0.0, 2.0)))
+MU = rng.dirichlet(np.ones(3), size=N).T
+TRANSITION = rng.dirichlet(np.ones(3), size=3)
+MIXING = imm.predict_mode_probabilities(TRANSITION, MU).mixing
+MEANS, COVARIANCES = rng.normal(size=(4, 3, N)), positive_definite(4, 3, N)
+GAIN = np.array([[0.2], [0.5], [0.8]])
+S2, X4, P4, Z2 = (
+    positive_definite(2, N),
+    rng.normal(size=(4, N)),
+    positive_definite(4, N),
+    rng.normal(size=(2, N)),
+)
+F4, Q4, H24, R2 = rng.normal(size=(4, 4)), positive_definite(4), rng.normal(size=(2, 4)), positive_definite(2)
+ALPHA, BETA = rng.uniform(0.1, 0.9, N), rng.uniform(0.1, 0.9, N)
+
+CALLS = [
+    (alpha_beta.benedict_bordner_beta, (ALPHA,)),
+    (alpha_beta.predict, (Z2, Z2, 6.0)),
+    (alpha_beta.update, (Z2, Z2, Z2, ALPHA, BETA, 6.0)),
+    (alpha_beta.predict_covariance, (P2, 6.0)),
+    (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
+    (alpha_beta.variance_reduction, (ALPHA, BETA)),
+    (alpha_beta.acceleration_lag, (ALPHA, BETA, 6.0, Z2)),
+    (
+        alpha_beta.propagate_error,
+        (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),
+    ),
+    (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
+    (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
+    (bounds.predicted_bound, (P4, F4[..., None], Q4[..., None])),
+    (bounds.posterior_cramer_rao_bound, (P4, H24, R2)),
+    (gaussian.log_density, (Z2, S2)),
+    (imm.predict_mode_probabilities, (TRANSITION, MU)),
+    (imm.predict_mode_probabilities, (np.array([[1.0, 0.0, 0.0]] * 3), MU)),
+    (imm.mix, (MEANS, COVARIANCES, MIXING)),
+    (imm.combine, (MEANS, COVARIANCES, MU)),
+    (imm.log_probabilities, (np.array([[0.0], [1.0]]),)),
+    (imm.normalised_exponential, (MEANS[:, 0],)),
+    (imm.mode_posterior, (np.log(MU), -1e5 + MEANS[0])),
+    (kalman.predict, (X4, P4, F4, Q4, X4)),
+    (kalman.update, (X4, P4, Z2, H24, R2)),
+    (polar.cartesian_variances, (1e4 * Z2, 100.0, 0.004)),
+    (small_matrices.product, (P4, P4)),
+    (small_matrices.apply, (P4, X4)),
+    (small_matrices.transpose, (P4,)),
+    (small_matrices.outer, (X4, X4)),
+    (small_matrices.cholesky, (P4,)),
+    (small_matrices.solve_lower, (small_matrices.cholesky(P4), X4)),
+]
+
+
+def converted(value, change):
+    """The same structure with every array changed."""
+    if isinstance(value, np.ndarray | torch.Tensor):
+        return change(value)
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*(converted(part, change) for part in value))
+    if isinstance(value, list | tuple):
+        return type(value)(converted(part, change) for part in value)
+    return value
+
+
+def leaves(value):
+    return [leaf for part in value for leaf in leaves(part)] if isinstance(value, list | tuple) else [value]
+
+
+@pytest.mark.parametrize(("function", "arguments"), CALLS, ids=lambda value: getattr(value, "__name__", ""))
+def test_torch_equals_numpy(function, arguments):
+    before = converted(arguments, np.copy)
+    expected = leaves(function(*arguments))
+    for one, other in zip(leaves(arguments), leaves(before), strict=True):
+        np.testing.assert_array_equal(one, other, err_msg="an argument was changed in place")
+    result = leaves(function(*converted(arguments, lambda a: torch.from_numpy(a.copy()))))
+    assert len(result) == len(expected)
+    for one, other in zip(result, expected, strict=True):
+        assert one.dtype == torch.float64
+        # Elementwise arithmetic is the same; exp and log of the two libraries differ in the last bit.
+        np.testing.assert_allclose(one.numpy(), other, rtol=1e-12, atol=1e-13)
+
+
+def test_gradients_pass_through_every_function():
+    for function, arguments in CALLS:
+        tensors = []
+
+        def watched(array, tensors=tensors):
+            tensors.append(torch.from_numpy(array.copy()).requires_grad_())
+            return tensors[-1]
+
+        result = leaves(function(*converted(arguments, watched)))
+        sum(part.sum() for part in result).backward()
+        gradients = [tensor.grad for tensor in tensors if tensor.grad is not None]
+        assert gradients, function.__name__
+        assert all(torch.isfinite(gradient).all() for gradient in gradients), function.__name__
+
+
+@pytest.mark.parametrize("module", [alpha_beta, bounds, gaussian, imm, kalman, polar, small_matrices])
+def test_no_function_is_forgotten(module):
+    public = {
+        name
+        for name, value in vars(module).items()
+        if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
+    }
+    called = {function.__name__ for function, _ in CALLS if function.__module__ == module.__name__}
+    assert public - called <= {"white_acceleration"}  # plain numbers in, nested lists out

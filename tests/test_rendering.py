@@ -1,0 +1,261 @@
+"""Pictures of episodes: frames, videos, windows, and what must not move."""
+
+import itertools
+import os
+import subprocess
+import sys
+
+import gymnasium
+import numpy
+import pytest
+from filtergym.baselines.animation import episode_frames, write_animation
+from filtergym.envs import rendering
+from filtergym.envs.environment import TaskEnv
+from filtergym.envs.pictures.maneuvering_target import ManeuveringTargetPicture, ellipse_axes
+
+import filtergym  # noqa: F401  # registers the environments
+
+ID = "filtergym/ManeuveringTarget-v0"
+CONTROLS = ("gain", "mode", "weights", "evidence")
+
+
+def played(steps, seed=1, **keywords):
+    """Environment after some random actions."""
+    env = TaskEnv(ID, render_mode="rgb_array", **keywords)
+    env.action_space.seed(seed)
+    env.reset(seed=seed)
+    for _ in range(steps):
+        env.step(env.action_space.sample())
+    return env
+
+
+@pytest.fixture(params=["own", "general"])
+def any_picture(request, monkeypatch):
+    """Draw with the task's own picture, and with the one for tasks that have none."""
+    if request.param == "general":
+        monkeypatch.setattr(rendering, "picture_of", rendering.Picture)
+
+
+def test_matplotlib_is_imported_only_for_a_render_mode():
+    code = (
+        "import sys, filtergym, gymnasium\n"
+        f"gymnasium.make({ID!r}).reset(seed=0)\n"
+        "assert 'matplotlib' not in sys.modules\n"
+        f"gymnasium.make({ID!r}, render_mode='rgb_array')\n"
+        "assert 'matplotlib' in sys.modules and 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.usefixtures("any_picture")
+def test_frames_are_images_that_change(control):
+    env = gymnasium.make(ID, control=control, render_mode="rgb_array", horizon=4)
+    env.reset(seed=3)
+    frames = [env.render()]
+    for _ in range(4):
+        env.step(env.action_space.sample())
+        frames.append(env.render())
+    assert {f.shape for f in frames} == {(608, 960, 3)}
+    assert {f.dtype for f in frames} == {numpy.dtype(numpy.uint8)}
+    for before, after in itertools.pairwise(frames):
+        assert (before != after).any()
+    numpy.testing.assert_array_equal(frames[-1], env.render())
+    frames[-1][:] = 0
+    assert env.render().any(), "a frame must not share the canvas's memory"
+    env.close()
+
+
+@pytest.mark.parametrize("control", ["gain", "evidence"])
+@pytest.mark.usefixtures("any_picture")
+def test_reused_figure_shows_what_a_new_one_shows(control):
+    reused, drawn_once = (played(60, control=control, scenario="paper") for _ in range(2))
+    reused.reset(seed=7)
+    reused.render()
+    reused.action_space.seed(1)
+    reused.reset(seed=1)
+    for _ in range(60):
+        reused.render()
+        reused.step(reused.action_space.sample())
+    numpy.testing.assert_array_equal(reused.render(), drawn_once.render())
+
+
+def test_rendering_leaves_the_episode_alone():
+    plain, drawn = TaskEnv(ID), TaskEnv(ID, render_mode="rgb_array")
+    numpy.testing.assert_array_equal(plain.reset(seed=5)[0], drawn.reset(seed=5)[0])
+    for alpha in numpy.linspace(-1.0, 1.0, 5):
+        drawn.render()
+        one, other = plain.step(numpy.array([alpha])), drawn.step(numpy.array([alpha]))
+        numpy.testing.assert_array_equal(one[0], other[0])
+        assert one[1:4] == other[1:4]
+
+
+def test_axes_stay_where_they_are_and_hold_the_track():
+    env = played(0, scenario="paper")
+    env.render()
+    picture = env.picture.picture
+    panels = env.picture._figure.axes
+
+    def places():
+        return [tuple(axes.get_position().bounds) for axes in panels], picture.track.viewLim.extents.tolist()
+
+    first = places()
+    for _ in range(100):
+        env.step(env.action_space.sample())
+        env.render()
+        assert places() == first
+    left, bottom, right, top = picture.track.viewLim.extents
+    x, y = env.picture.history["true_x"], env.picture.history["true_y"]
+    assert left < min(x)
+    assert max(x) < right
+    assert bottom < min(y)
+    assert max(y) < top
+    # Equal axes: as many kilometres for each pixel along x as along y.
+    box = picture.track.get_window_extent()
+    assert (right - left) / box.width == pytest.approx((top - bottom) / box.height, rel=1e-9)
+
+
+def test_history_is_what_info_reports():
+    env = TaskEnv(ID, scenario="paper", render_mode="rgb_array", detailed_info=True, decision_interval=2)
+    env.reset(seed=2)
+    for decision in range(1, 4):
+        _, _, _, _, info = env.step(numpy.array([0.2 * decision], dtype=numpy.float64))
+        history = env.picture.history
+        assert {len(values) for values in history.values()} == {2 * decision}
+        # The picture's series are plain copies and one hypotenuse: nothing but the last bit may differ.
+        numpy.testing.assert_allclose(
+            history["position_error"][-1], numpy.linalg.norm(info["error"][:2]), rtol=1e-14
+        )
+        assert history["error.velocity_y"][-1] == info["error"][3]
+        assert history["alpha"][-1] == info["alpha"]
+        assert history["action.0"][-2:] == [0.2 * decision] * 2
+        # Both innovations are over their own sigma, so their squares add up to the NIS.
+        squared = history["innovation_x"][-1] ** 2 + history["innovation_y"][-1] ** 2
+        assert squared == pytest.approx(float(info["nis"]), rel=1e-12)
+    assert "scan 6 of 100" in env.picture.title
+    assert "scenario paper" in env.picture.title
+    env.reset(seed=2)
+    assert "scan 0 of 100" in env.picture.title
+    assert not env.picture.history
+
+
+def test_manoeuvres_are_marked_where_they_are_flown():
+    env = played(0, scenario="paper")
+    assert env.picture.picture.shaded() == [(49.5, 55.5)]
+    straight = played(0, scenario="paper", acceleration=(0.0, 0.0))
+    assert straight.picture.picture.shaded() == []
+
+
+def test_ellipse_axes_of_a_turned_covariance():
+    angle = numpy.radians(30.0)
+    turn = numpy.array([[numpy.cos(angle), -numpy.sin(angle)], [numpy.sin(angle), numpy.cos(angle)]])
+    large, small, direction = ellipse_axes(turn @ numpy.diag([9.0, 4.0]) @ turn.T)
+    assert (large, small) == pytest.approx((3.0, 2.0), rel=1e-12)
+    assert direction % 180.0 == pytest.approx(30.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high", "expected"),
+    [
+        ((-4.0, 4.0), -3.0, 4.0, (-4.0, 4.0)),
+        ((-4.0, 4.0), -4.1, 0.0, (-8.0, 8.0)),
+        ((0.0, 500.0), 0.0, 1001.0, (0.0, 2500.0)),
+        ((0.0, 500.0), 0.0, 2501.0, (0.0, 5000.0)),
+        ((-1.0, 1.0), 0.0, 700.0, (-1000.0, 1000.0)),
+        ((0.0, 1.0), -5.0, 0.5, (0.0, 1.0)),
+    ],
+)
+def test_limits_grow_on_a_ladder(limits, low, high, expected):
+    assert rendering.grown(limits, low, high) == pytest.approx(expected, rel=1e-12)
+
+
+def test_picture_is_found_by_the_name_of_the_task_module():
+    task = TaskEnv(ID).task
+    assert isinstance(rendering.picture_of(task), ManeuveringTargetPicture)
+    stranger = type("Stranger", (type(task),), {"__module__": "somewhere.else_entirely"})
+    assert type(rendering.picture_of(stranger(task.parameters, "gain"))) is rendering.Picture
+
+
+def test_record_video_writes_the_episode(tmp_path):
+    pytest.importorskip("moviepy")
+    from moviepy import VideoFileClip
+
+    env = gymnasium.make(ID, render_mode="rgb_array", horizon=12)
+    env = gymnasium.wrappers.RecordVideo(env, str(tmp_path))
+    env.reset(seed=0)
+    finished = False
+    while not finished:
+        *_, finished, _ = env.step(env.action_space.sample())
+    env.close()
+    (video,) = tmp_path.glob("*.mp4")
+    with VideoFileClip(str(video)) as clip:
+        assert clip.size == [960, 608] or clip.size == (960, 608)
+        # The reset's frame and one for each of twelve steps, at ten a second.
+        assert clip.duration == pytest.approx(1.3, abs=0.11)
+
+
+def test_render_before_reset_and_without_a_mode():
+    with pytest.raises(gymnasium.error.ResetNeeded, match="reset before the first render"):
+        TaskEnv(ID, render_mode="rgb_array").render()
+    env = TaskEnv(ID)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+    with pytest.raises(ValueError, match="rgb_array"):
+        TaskEnv(ID, render_mode="rgb_aray")
+
+
+@pytest.mark.parametrize("backend", ["agg", "TkAgg"])
+def test_human_mode_says_what_is_missing(backend):
+    if backend == "TkAgg" and not sys.platform.startswith("linux"):
+        pytest.skip("only X and Wayland can be taken away by environment variables")
+    code = (
+        "import filtergym, gymnasium\n"
+        "try:\n"
+        f"    gymnasium.make({ID!r}, render_mode='human').reset()\n"
+        "except gymnasium.error.Error as error:\n"
+        "    assert 'needs a display' in str(error) and 'rgb_array' in str(error), error\n"
+        "else:\n"
+        "    raise SystemExit('no error')\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if "DISPLAY" not in name}
+    subprocess.run([sys.executable, "-c", code], check=True, env={**environment, "MPLBACKEND": backend})
+
+
+def test_human_mode_draws_each_step_into_one_window(monkeypatch):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")  # stands in for a window: it has a figure manager, and nothing is shown
+    monkeypatch.setattr(rendering, "_require_window", lambda: None)
+    monkeypatch.setattr(rendering.Figure, "show", lambda figure: None)
+    already = set(pyplot.get_fignums())
+    env, other = (TaskEnv(ID, render_mode="human", horizon=3) for _ in range(2))
+    env.picture.frames_per_second = other.picture.frames_per_second = 1000.0
+    env.reset(seed=0)
+    other.reset(seed=1)
+    assert len(set(pyplot.get_fignums()) - already) == 2
+    env.step(env.action_space.sample())
+    assert env.render() is None
+    shown = env.picture._panels[0].lines[0].get_xdata()
+    assert len(shown) == 1
+    # The user closes a window: the episode goes on.
+    pyplot.close(env.picture._figure)
+    env.step(env.action_space.sample())
+    env.close()
+    other.close()
+    assert set(pyplot.get_fignums()) == already
+
+
+def test_animation_is_a_small_looping_file(tmp_path):
+    from PIL import Image
+
+    frames = episode_frames(ID, "imm", "paper", seed=3, every=5, horizon=21)
+    assert len(frames) == 6  # the reset, scans 5, 10, 15, 20, and the last
+    path = tmp_path / "new" / "imm.gif"
+    write_animation(frames, path)
+    assert [p.name for p in path.parent.iterdir()] == ["imm.gif"]
+    with Image.open(path) as image:
+        assert image.n_frames == 6
+        assert image.size == (960, 608)
+        assert image.info["loop"] == 0
+    with pytest.raises(ValueError, match="does not act"):
+        episode_frames(ID, "known-turn")

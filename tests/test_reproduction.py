@@ -1,0 +1,75 @@
+"""What every reproduction of a paper shares: finding it, writing its page, saving it whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+from filtergym.baselines.reproduction import (
+    Claim,
+    Grid,
+    Reproduction,
+    as_markdown,
+    paper_module,
+    papers,
+    save_reproduction,
+)
+from matplotlib.figure import Figure
+
+from filtergym.results import write_text
+
+
+def example() -> Reproduction:
+    figure = Figure(figsize=(1, 1))
+    figure.subplots().plot([0, 1])
+    return Reproduction(
+        "A paper",
+        [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
+        [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
+        {"figure_1": figure, "figure_2": figure},
+        {"figure_1": "The error."},
+    )
+
+
+def test_every_module_is_a_paper_with_the_whole_interface() -> None:
+    assert "imm-alpha-beta" in papers()
+    for name in papers():
+        module = paper_module(name)
+        assert module.TITLE
+        assert module.STEPS > 0
+        assert callable(module.reproduce)
+
+
+def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
+    with pytest.raises(ValueError, match=r"unknown paper 'imm-alpha-gamma'.*'imm-alpha-beta'"):
+        paper_module("imm-alpha-gamma")
+
+
+def test_the_page_holds_claims_tables_and_figures() -> None:
+    lines = as_markdown(example()).splitlines()
+    assert lines[0] == "# A paper"
+    # A bar inside a cell must not open another cell.
+    assert "| **C1.** It is small. | \\|e\\| = 3.1 ± 0.2 m | 10 runs | **not reproduced** |" in lines
+    table = lines[lines.index("## Errors") + 2 :][:4]
+    assert table == ["| run | m |", "|---|---|", "| first | 3.0 |", "| second | 3.2 |"]
+    assert "![The error.](figure_1.png)" in lines
+    assert "![figure 2](figure_2.png)" in lines
+
+
+def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path) -> None:
+    save_reproduction(example(), tmp_path, write_text)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["figure_1.png", "figure_2.png", "report.md"]
+    assert (tmp_path / "report.md").read_text(encoding="utf-8") == as_markdown(example())
+    assert (tmp_path / "figure_2.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
+    class Unpaintable:
+        def savefig(self, *_: object, **__: object) -> None:
+            raise RuntimeError("no ink")
+
+    (tmp_path / "report.md").write_text("the last one", encoding="utf-8")
+    result = example()
+    result.figures["figure_2"] = Unpaintable()
+    with pytest.raises(RuntimeError, match="no ink"):
+        save_reproduction(result, tmp_path, write_text)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
+    assert (tmp_path / "report.md").read_text(encoding="utf-8") == "the last one"

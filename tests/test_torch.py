@@ -1,0 +1,274 @@
+"""The torch backend: the same episodes as NumPy, differentiable, and clear about what is missing."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy
+import pytest
+from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.environment import TaskVectorEnv
+from filtergym.envs.task import huber
+
+torch = pytest.importorskip("torch")
+xp = pytest.importorskip("array_api_compat.torch")
+
+DECISIONS = 12
+LANES = 5
+# Both backends do the same float64 operations in the same order; only exp, log and trigonometry differ, by
+# one unit in the last place, and the recursions amplify that. Observations are of order one (4e-13 seen over
+# whole episodes of ManeuveringTarget), rewards go to 1e4 and are compared relative to their size.
+TOLERANCE = 1e-10
+
+CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
+CONTINUOUS = [
+    (id, control)
+    for id, control in CONTROLS
+    if isinstance(make_task(id, control).action_space, gymnasium.spaces.Box)
+]
+MODES = [mode.value for mode in gymnasium.vector.AutoresetMode]
+
+
+def scenarios(id):
+    return sorted({catalogue()[id].default_scenario, "paper"} & set(catalogue()[id].scenarios))
+
+
+CELLS = [(id, control, scenario) for id, control in CONTROLS for scenario in scenarios(id)]
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+
+
+def pair(id, device="cpu", **keywords):
+    """The same environment on NumPy and on torch."""
+    make = gymnasium.make_vec
+    keywords = {"num_envs": LANES, **keywords}
+    return make(id, **keywords), make(id, backend="torch", device=device, **keywords)
+
+
+def sampled(env):
+    """Random actions in float64: float32 arithmetic would hide behind its own rounding of 1e-7."""
+    action = env.action_space.sample()
+    return action.astype(float) if action.dtype.kind == "f" else action
+
+
+def assert_close(tensor, array):
+    assert isinstance(tensor, torch.Tensor)
+    numpy.testing.assert_allclose(tensor.detach().cpu().numpy(), array, rtol=TOLERANCE, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("id", "control", "scenario"), CELLS)
+def test_torch_equals_numpy(id, control, scenario, device):
+    reference, env = pair(id, device, control=control, scenario=scenario, detailed_info=True)
+    reference.action_space.seed(1)
+    expected, _ = reference.reset(seed=11)
+    observation, _ = env.reset(seed=11)
+    assert observation.dtype == torch.float64
+    assert observation.device.type == device
+    assert_close(observation, expected)
+    for _ in range(DECISIONS):
+        action = sampled(reference)
+        observation, reward, terminated, truncated, info = env.step(torch.tensor(action, device=device))
+        expected = reference.step(action)
+        assert_close(observation, expected[0])
+        assert_close(reward, expected[1])
+        assert reward.shape == (LANES,)
+        for mask, values in ((terminated, expected[2]), (truncated, expected[3])):
+            assert mask.dtype == torch.bool
+            assert mask.device.type == device
+            assert (mask.cpu().numpy() == values).all()
+        # Errors are in metres and the like, hence only relative to the largest of their kind.
+        for name, values in expected[4].items():
+            numpy.testing.assert_allclose(
+                info[name].cpu().numpy(), values, rtol=0.0, atol=TOLERANCE * max(1.0, numpy.abs(values).max())
+            )
+
+
+@pytest.mark.parametrize("reward", ["log-likelihood", "relative"])
+@pytest.mark.parametrize("id", list(catalogue()))
+def test_other_rewards_equal_numpy(id, reward):
+    reference, env = pair(id, reward=reward)
+    reference.action_space.seed(2)
+    reference.reset(seed=5)
+    env.reset(seed=5)
+    for _ in range(DECISIONS):
+        action = sampled(reference)
+        assert_close(env.step(action)[1], reference.step(action)[1])
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("id", list(catalogue()))
+def test_autoreset_equals_numpy(id, mode):
+    last = 4
+    reference, env = pair(id, autoreset_mode=mode, max_episode_steps=last, detailed_info=True)
+    reference.action_space.seed(3)
+    reference.reset(seed=7)
+    env.reset(seed=7)
+    restarted = numpy.array([True, False, True, False, True])
+    ends = 0
+    for _ in range(3 * last):
+        action = sampled(reference)
+        expected = reference.step(action)
+        observation, reward, _, truncated, info = env.step(torch.tensor(action))
+        assert_close(observation, expected[0])
+        assert_close(reward, expected[1])
+        assert (truncated.numpy() == expected[3]).all()
+        ends += int(truncated.sum())
+        if mode == "SameStep" and truncated.any():
+            finished = info["_final_obs"].numpy()
+            assert (finished == expected[4]["_final_obs"]).all()
+            assert_close(
+                info["final_obs"][info["_final_obs"]], numpy.stack(expected[4]["final_obs"][finished])
+            )
+            assert set(info["final_info"]) == set(expected[4]["final_info"])
+        if mode == "Disabled" and truncated.any():
+            with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
+                env.step(torch.tensor(action))
+            # In two parts, so that a mask that is a tensor meets lanes that must not be disturbed.
+            for part in (restarted, ~restarted):
+                values, _ = reference.reset(options={"reset_mask": part.copy()})
+                shown, _ = env.reset(options={"reset_mask": torch.tensor(part)})
+                assert_close(shown, values)
+    assert ends >= 2 * LANES
+
+
+def test_lanes_that_restart_do_not_disturb_the_others():
+    _, env = pair("filtergym/ManeuveringTarget-v0", autoreset_mode="Disabled", control="weights")
+    before, _ = env.reset(seed=1)
+    kept = before.clone()
+    after, _ = env.reset(seed=9, options={"reset_mask": torch.tensor([True] + [False] * (LANES - 1))})
+    assert torch.equal(before, kept)
+    assert torch.equal(after[1:], kept[1:])
+    assert not torch.equal(after[0], kept[0])
+
+
+@pytest.mark.parametrize("id", list(catalogue()))
+def test_actions_may_be_arrays_lists_or_whole_numbers(id):
+    def paid(convert):
+        _, env = pair(id)
+        env.action_space.seed(4)
+        env.reset(seed=3)
+        action = sampled(env)
+        return env.step(convert(numpy.round(action) if action.dtype.kind == "f" else action))[1]
+
+    first = paid(torch.tensor)
+    assert_close(paid(lambda a: a), first.numpy())
+    assert_close(paid(lambda a: a.tolist()), first.numpy())
+    assert_close(paid(lambda a: torch.tensor(a.astype(numpy.int64))), first.numpy())
+
+
+@pytest.mark.parametrize(("id", "control"), CONTINUOUS)
+def test_gradient_of_an_episode_equals_finite_differences(id, control):
+    """Loss: mean Huber cost of a short episode on fixed noise, through bank, mixing and update.
+
+    Central differences with step h have an error of h^2 times the third derivative plus rounding over h:
+    1e-5 balances them near 1e-10 of the loss, and 1e-5 of the largest gradient leaves room for curvature.
+    """
+    horizon, lanes, step = 6, 8, 1e-5
+    task = make_task(id, control, xp=xp)
+    generator = numpy.random.default_rng(0)
+    noise = task.noise
+
+    uniforms = task.constant(generator.random((noise.uniforms, lanes)))
+    normals = task.constant(generator.standard_normal((noise.initial_normals, lanes)))
+    rows = task.constant(
+        numpy.concatenate(
+            [
+                generator.standard_normal((horizon + 1, noise.normals, lanes)),
+                generator.random((horizon + 1, noise.row_uniforms, lanes)),
+            ],
+            axis=1,
+        )
+    )
+    space = task.action_space
+    low, high = space.low[:, None] + 0.3, space.high[:, None] - 0.3  # away from where clipping has a kink
+    actions = torch.tensor(
+        generator.uniform(low, high, (horizon, *low.shape[:1], lanes)),
+        dtype=torch.float64,
+        requires_grad=True,
+    )
+
+    def loss(actions):
+        state = task.measure(task.begin(uniforms, normals), rows[0])
+        total = 0.0
+        for k in range(horizon):
+            state = task.act(state, actions[k])
+            total = total + huber(task.cost(state), task.huber_bound, xp)
+            state = task.measure(state, rows[k + 1])
+        return total.mean()
+
+    (gradient,) = torch.autograd.grad(loss(actions), actions)
+    assert torch.isfinite(gradient).all()
+    largest = gradient.abs().max()
+    assert largest > 0.0
+    with torch.no_grad():
+        for _ in range(12):
+            where = tuple(int(generator.integers(n)) for n in actions.shape)
+            moved = torch.zeros_like(actions)
+            moved[where] = step
+            slope = (loss(actions + moved) - loss(actions - moved)) / (2.0 * step)
+            assert abs(slope - gradient[where]) <= 1e-5 * largest, where
+
+
+def test_gradient_through_the_vector_environment_crosses_an_autoreset():
+    """What comes back to the caller is attached to the actions, also while other episodes start."""
+    _, env = pair("filtergym/ManeuveringTarget-v0", max_episode_steps=3, autoreset_mode="SameStep")
+    env.reset(seed=2)
+    actions = torch.zeros((6, LANES, 1), dtype=torch.float64, requires_grad=True)
+    rewards = torch.stack([env.step(action)[1] for action in actions])
+    (gradient,) = torch.autograd.grad(rewards[:3].sum(), actions, retain_graph=True)
+    assert torch.isfinite(gradient).all()
+    assert (gradient[:3] != 0.0).all()
+    # An episode's reward owes nothing to the actions of the episode before it.
+    (gradient,) = torch.autograd.grad(rewards[3:].sum(), actions)
+    assert (gradient[:3] == 0.0).all()
+    assert (gradient[3:] != 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("control", "action", "message"),
+    [
+        ("gain", torch.full((LANES, 1), float("nan")), "expected finite actions of shape"),
+        ("gain", torch.zeros(LANES + 1, 1), r"got torch.float32 of shape \(6, 1\)"),
+        ("gain", torch.zeros(LANES, 1, dtype=torch.bool), "got torch.bool"),
+        ("mode", torch.zeros(LANES), "expected integer actions from 0 to 1"),
+        ("mode", torch.full((LANES,), 2), "expected integer actions from 0 to 1"),
+        ("mode", torch.zeros(LANES, dtype=torch.bool), "expected integer actions from 0 to 1"),
+    ],
+)
+def test_wrong_tensors_are_refused(control, action, message):
+    for env in pair("filtergym/ManeuveringTarget-v0", control=control):
+        env.reset(seed=0)
+        with pytest.raises(ValueError, match=message):
+            env.step(action)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"backend": "pytorch"}, "unknown backend 'pytorch': did you mean 'torch'"),
+        ({"backend": "torch", "device": "gpu"}, "device 'gpu' cannot be used"),
+        ({"backend": "torch", "device": "cuda:99"}, "device 'cuda:99' cannot be used"),
+        ({"backend": "numpy", "device": "cuda"}, "works on the CPU only"),
+    ],
+)
+def test_wrong_backends_and_devices_are_refused(keywords, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        TaskVectorEnv("filtergym/ManeuveringTarget-v0", 2, **keywords)
+    assert "\n" not in str(caught.value)
+
+
+def test_torch_is_imported_only_when_asked_for_and_missed_in_one_sentence():
+    program = """
+import sys
+import gymnasium, filtergym
+env = gymnasium.make_vec("filtergym/ManeuveringTarget-v0", num_envs=2)
+env.reset(seed=0); env.step(env.action_space.sample())
+assert "torch" not in sys.modules
+sys.modules["torch"] = None   # as if it were not installed
+try:
+    gymnasium.make_vec("filtergym/ManeuveringTarget-v0", num_envs=2, backend="torch")
+except ImportError as error:
+    print(error)
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.strip().endswith("pip install 'filtergym[agents]'")
