@@ -174,11 +174,9 @@ def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: fl
     rate = beta / T
     rest = 1.0 - alpha
     rows = xp.concat([rest * P[:d], P[d:] - rate * P[:d]], axis=0)
-    moved = xp.concat([rest * rows[:, :d], rows[:, d:] - rate * rows[:, :d]], axis=1)
-    noise = [alpha * alpha * R, alpha * rate * R, rate * rate * R]
-    zero = xp.zeros_like(noise[0][0])
-    gained = [
-        [noise[i // d + j // d][i % d] if i % d == j % d else zero for j in range(2 * d)]
-        for i in range(2 * d)
-    ]
-    return moved + xp.stack([xp.stack(row, axis=0) for row in gained], axis=0)
+    trailing = (slice(None), slice(None), *[None] * (P.ndim - 2))
+    diagonal = xp.eye(d, dtype=P.dtype, device=P.device)[trailing] * R
+    cross = (alpha * rate) * diagonal
+    left = rest * rows[:, :d] + xp.concat([alpha * alpha * diagonal, cross], axis=0)
+    right = rows[:, d:] - rate * rows[:, :d] + xp.concat([cross, rate * rate * diagonal], axis=0)
+    return xp.concat([left, right], axis=1)

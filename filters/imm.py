@@ -60,21 +60,19 @@ def mix(mean: Array, covariance: Array, mixing: Array) -> tuple[Array, Array]:
     Returns:
         ``x^{0j}`` and ``P^{0j}``, of the same shapes.
     """
-    xp = namespace(mean)
-    columns = [combine(mean, covariance, mixing[:, j]) for j in range(mean.shape[1])]
-    return xp.stack([m for m, _ in columns], axis=-2), xp.stack([P for _, P in columns], axis=-2)
+    return combine(mean[:, :, None], covariance[:, :, :, None], mixing)
 
 
 def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
     """Mean and covariance of a Gaussian mixture, equations (15) and (16).
 
     Args:
-        mean: ``(n, M, N)``.
-        covariance: ``(n, n, M, N)``.
-        weights: ``(M, N)``, summing to one over the M components.
+        mean: ``(n, M, ...)``.
+        covariance: ``(n, n, M, ...)``.
+        weights: ``(M, ...)``, summing to one over the M components.
 
     Returns:
-        ``(n, N)`` and ``(n, n, N)``; the covariance holds the spread of the means.
+        ``(n, ...)`` and ``(n, n, ...)``, trailing axes broadcast; the covariance holds the spread of the means.
     """
     count = weights.shape[0]
     centre = weights[0] * mean[:, 0]

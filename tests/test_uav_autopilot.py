@@ -154,7 +154,7 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         plant,
         "random",
         control,
-        dropouts=12,
+        dropout_period=50,
         disturbance_times=((10, 20), (30, 40)),
         sensor_times=((10, 50),),
     )
@@ -255,7 +255,7 @@ def test_monte_carlo_of_the_reference_table(
             sums += numpy.stack(
                 [
                     record["output"] ** 2,
-                    record["control"] ** 2,
+                    record["control_signal"] ** 2,
                     task.cost(state) * task.cost_unit,
                     nees / n,
                     shown,
@@ -335,7 +335,7 @@ def test_shapes_names_and_finiteness_in_every_scenario(plant: str, control: str)
 def test_observation_is_recomputed_from_the_measurements_alone(plant: str, control: str) -> None:
     """Two different truths, sensor noise chosen so that the readings agree: the agent sees the same."""
     N, steps = 8, 80
-    task = make(plant, "random", control, dropouts=8)
+    task = make(plant, "random", control, dropout_period=75)
     noise, other, a = Noise(task, N, 0, steps + 1), Noise(task, N, 1, steps + 1), actions(task, 0, steps, N)
     drives = task.noise.normals - len(task.sensors)
     one = task.begin(noise.uniforms, noise.initial)
@@ -525,7 +525,7 @@ def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone(
         ({"step_size": 1.0, "command_amplitude": (0.5, 1.0)}, "exclude each other"),
         ({"disturbance_times": ((100, 200),)}, "one range more"),
         ({"disturbance_levels": ((1, 1), (0, 1)), "disturbance_times": ((5, 9),)}, "above 0.0"),
-        ({"dropouts": 50}, "do not fit"),
+        ({"dropout_period": 15}, "longer than the longest dropout, 15, got 15"),
         ({"command_period": 40}, "longer than a doublet"),
         ({"horizon": 0}, "horizon must be an integer of at least 1"),
     ],

@@ -175,8 +175,8 @@ class UavAutopilotParameters:
     """Range of the first measurement of the second and further parts."""
     changing_sensors: tuple[str, ...] | None = None
     """Sensors that these factors apply to; None: all, drawn independently."""
-    dropouts: int = 0
-    """Dropouts of each sensor in an episode, one in each of as many equal parts."""
+    dropout_period: int = 0
+    """Each sensor drops out once in every so many measurements; zero: never."""
     dropout_length: tuple[int, int] = (1, 15)
     """Range of their length in measurements. Ours: up to half a settling time."""
 
@@ -197,7 +197,7 @@ class UavAutopilotParameters:
         for name in ("horizon", "decision_interval", "step_time", "command_period", "doublet_width"):
             check.integer(name, getattr(self, name), at_least=1)
         check.integer("average_window", self.average_window, at_least=1)
-        check.integer("dropouts", self.dropouts, at_least=0)
+        check.integer("dropout_period", self.dropout_period, at_least=0)
         check.number("sampling_interval", self.value("sampling_interval"), above=0.0)
         sensors = self.value("sensors")
         if not sensors or not isinstance(sensors, tuple) or len(set(sensors)) != len(sensors):
@@ -258,10 +258,10 @@ class UavAutopilotParameters:
         for name in self.changing_sensors or ():
             check.choice("each of changing_sensors", name, sensors)
         check.interval("dropout_length", self.dropout_length, at_least=1)
-        if self.dropouts and self.horizon // self.dropouts <= self.dropout_length[1]:
+        if 0 < self.dropout_period <= self.dropout_length[1]:
             raise ValueError(
-                f"{self.dropouts} dropouts of up to {self.dropout_length[1]} measurements do not fit into a "
-                f"horizon of {self.horizon}"
+                f"dropout_period must be longer than the longest dropout, {self.dropout_length[1]}, "
+                f"got {self.dropout_period}"
             )
 
     @property
@@ -598,13 +598,14 @@ class UavAutopilot(Task[State]):
         self._signal_unit = 1.0 / output_sigma
 
         self._manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
+        self._dropouts = -(-p.horizon // p.dropout_period) if p.dropout_period else 0
         self.noise = NoiseLayout(
             uniforms=3 * self._manoeuvres
             + len(p.disturbance_levels)
             + len(p.disturbance_times)
             + m * len(p.sensor_levels)
             + len(p.sensor_times)
-            + 2 * p.dropouts * m,
+            + 2 * self._dropouts * m,
             initial_normals=n,
             normals=self._drive_count + m,
         )
@@ -667,9 +668,9 @@ class UavAutopilot(Task[State]):
         ]
         sensor_times = [self._time(drawn.take(1)[0], bounds) for bounds in p.sensor_times]
         starts, stops = [], []
-        for i in range(p.dropouts):
+        for i in range(self._dropouts):
             length = self._time(drawn.take(m), p.dropout_length)
-            room = p.horizon // p.dropouts
+            room = p.dropout_period
             start = i * room + 1.0 + xp.floor(drawn.take(m) * (room - length))
             starts.append(start)
             stops.append(start + length)
@@ -914,14 +915,14 @@ class UavAutopilot(Task[State]):
         return level * level * self._scaled_noise + self._other_noise
 
     def records(self, state: State) -> dict[str, Array]:
-        """Signals of the loop: output, command, control that follows, NIS per available reading, and the
+        """Signals of the loop: output, command, control signal that follows, NIS per available reading, and the
         innovation over its sigma of the output's sensor (of the first where the output is not measured).
         """
         shown = self.measured.index(self.output) if self.output in self.measured else 0
         return {
             "output": state.truth[self.output],
             "command": state.command,
-            "control": self.autopilot(state),
+            "control_signal": self.autopilot(state),
             "nis": state.nis,
             "innovation": state.innovation[shown],
         }
