@@ -17,13 +17,44 @@ integrating or unstable mode; :func:`steady_kalman` refuses the rest, with the m
 One model at a time, plain NumPy and SciPy: this is work done once, before a filter runs.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy
+from numpy.typing import ArrayLike, NDArray
 
-Matrix = numpy.ndarray
+Matrix = NDArray[numpy.float64]
 _MARGIN = 1e-9
 """Distance from the limit of stability that counts as on it: eigenvalues are known to rounding only."""
+
+
+def square_matrix(name: str, matrix: ArrayLike, size: int | None = None) -> Matrix:
+    """Check a square matrix of finite numbers; a number is a matrix of one row.
+
+    Raises:
+        ValueError: for anything else, or a size other than ``size``.
+    """
+    array = numpy.atleast_2d(numpy.asarray(matrix, float))
+    size = len(array) if size is None else size
+    if array.shape != (size, size) or not numpy.isfinite(array).all():
+        raise ValueError(f"{name} must be a finite {size} x {size} matrix, got {matrix!r}")
+    return array
+
+
+def intensity_matrix(name: str, matrix: ArrayLike, size: int, definite: bool = False) -> Matrix:
+    """Check an intensity or a covariance: symmetric, no negative eigenvalue.
+
+    Raises:
+        ValueError: for anything else; with ``definite`` also for an eigenvalue of zero.
+    """
+    array = square_matrix(name, matrix, size)
+    scale = max(float(numpy.abs(array).max()), numpy.finfo(float).tiny)
+    lowest = float(numpy.linalg.eigvalsh(array)[0])
+    asymmetric = numpy.abs(array - array.T).max() > 1e-9 * scale
+    if asymmetric or lowest < -1e-9 * scale or (definite and lowest <= 0):
+        kind = "definite" if definite else "semidefinite"
+        raise ValueError(f"{name} must be symmetric positive {kind}, got {matrix!r}")
+    return array
 
 
 def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
@@ -47,11 +78,13 @@ def zero_order_hold(A: Matrix, B: Matrix, T: float) -> tuple[Matrix, Matrix]:
     return exponential[:n, :n], exponential[:n, n:]
 
 
-def van_loan(A: Matrix, intensity: Matrix, T: float) -> tuple[Matrix, Matrix]:
+def van_loan(A: ArrayLike, intensity: ArrayLike, T: float) -> tuple[Matrix, Matrix]:
     """Transition matrix and process-noise covariance of a continuous model.
 
     ``Q = integral over [0, T] of exp(A s) W exp(A^T s) ds`` from one exponential of
-    ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404.
+    ``[[-A, W], [0, A^T]] T``: Van Loan, IEEE Trans. Automatic Control 23 (1978) 395-404. Its upper left block
+    grows without limit where modes decay, so a long interval is halved until ``|A| T`` is at most one, then
+    doubled: ``Q(2 T) = F Q F^T + Q``, ``F(2 T) = F F``.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -60,17 +93,28 @@ def van_loan(A: Matrix, intensity: Matrix, T: float) -> tuple[Matrix, Matrix]:
 
     Returns:
         F and Q, both ``(n, n)``; Q is symmetric to the last bit.
+
+    Raises:
+        ValueError: an interval that is not positive, a matrix of the wrong shape, an indefinite intensity.
     """
     from scipy.linalg import expm
 
+    A = square_matrix("A", A)
     n = len(A)
+    intensity = intensity_matrix("intensity", intensity, n)
+    if not (math.isfinite(T) and T > 0):
+        raise ValueError(f"T must be a positive number of seconds, got {T!r}")
+    halvings = max(0, math.ceil(math.log2(max(T * float(numpy.linalg.norm(A)), 0.5))))
     block = numpy.zeros((2 * n, 2 * n))
     block[:n, :n] = -A
     block[:n, n:] = intensity
     block[n:, n:] = A.T
-    exponential = expm(block * T)
+    exponential = expm(block * (T / 2**halvings))
     F = exponential[n:, n:].T
     Q = F @ exponential[:n, n:]
+    for _ in range(halvings):
+        Q = F @ Q @ F.T + Q
+        F = F @ F
     return F, 0.5 * (Q + Q.T)
 
 
@@ -122,7 +166,8 @@ def unobserved_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[com
 
 
 def _list(modes: list[complex]) -> str:
-    return ", ".join(f"{m.real:.6g}" if abs(m.imag) < 1e-9 else f"{m.real:.6g}{m.imag:+.6g}j" for m in modes)
+    texts = [f"{m.real:.6g}" if abs(m.imag) < 1e-9 else f"{m.real:.6g}{m.imag:+.6g}j" for m in modes]
+    return ", ".join(dict.fromkeys(texts))
 
 
 class SteadyFilter(NamedTuple):
@@ -134,7 +179,7 @@ class SteadyFilter(NamedTuple):
     """Covariance before the update, ``(n, n)``; of a continuous filter the same as ``posterior``."""
     posterior: Matrix
     """Covariance after the update, ``(n, n)``."""
-    poles: Matrix
+    poles: numpy.ndarray
     """Eigenvalues of the error's recursion, ``(I - K H) F``, or of ``A - K H``."""
 
 
@@ -157,7 +202,8 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
     if quiet:
         raise ValueError(
             f"no noise reaches the integrating modes with eigenvalues {_list(quiet)}: the Riccati equation "
-            "has no stabilising solution and the gain on them decays to zero; give them some process noise"
+            "has no stabilising solution and the gain on them decays to zero; give them some process noise, "
+            "or let the gain vary with time"
         )
 
 
@@ -183,8 +229,10 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
     return SteadyFilter(gain, predicted, posterior, numpy.linalg.eigvals(rest @ F))
 
 
-def steady_kalman_bucy(A: Matrix, H: Matrix, intensity: Matrix, R: Matrix) -> SteadyFilter:
+def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: ArrayLike) -> SteadyFilter:
     """Steady continuous Kalman filter (4), (5), from the continuous algebraic Riccati equation.
+
+    A random constant in the state violates what it needs: its variance falls for ever, like 1/t.
 
     Args:
         A: ``(n, n)``, 1/s.
@@ -197,35 +245,13 @@ def steady_kalman_bucy(A: Matrix, H: Matrix, intensity: Matrix, R: Matrix) -> St
     """
     from scipy.linalg import solve_continuous_are
 
+    A = square_matrix("A", A)
+    H = numpy.atleast_2d(numpy.asarray(H, float))
+    intensity, R = intensity_matrix("intensity", intensity, len(A)), square_matrix("R", R, len(H))
     _check_filter(A, H, intensity, R, continuous=True)
     P = solve_continuous_are(A.T, H.T, intensity, R)
     gain = numpy.linalg.solve(R, H @ P).T
     return SteadyFilter(gain, P, P, numpy.linalg.eigvals(A - gain @ H))
-
-
-def kalman_bucy_covariance(
-    A: Matrix, H: Matrix, intensity: Matrix, R: Matrix, initial: Matrix, t: float
-) -> Matrix:
-    """Solution P(t) of the Riccati equation (5), exact.
-
-    With ``[X; Y](0) = [I; P(0)]`` and ``d/dt [X; Y] = [[-A^T, H^T R^-1 H], [W, A]] [X; Y]``, ``P = Y X^-1``.
-    Long times lose digits to the growth of X; step in pieces of a few time constants.
-
-    Args:
-        A: ``(n, n)``, 1/s.
-        H: ``(m, n)``.
-        intensity: W, ``(n, n)``.
-        R: intensity of the measurement noise, ``(m, m)``.
-        initial: P(0), ``(n, n)``.
-        t: time, s.
-    """
-    from scipy.linalg import expm
-
-    n = len(A)
-    hamiltonian = numpy.block([[-A.T, H.T @ numpy.linalg.solve(R, H)], [intensity, A]])
-    both = expm(hamiltonian * t) @ numpy.vstack([numpy.eye(n), initial])
-    P = numpy.linalg.solve(both[:n].T, both[n:].T)
-    return 0.5 * (P + P.T)
 
 
 def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix, continuous: bool) -> None:
@@ -293,7 +319,7 @@ def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
     return 0.5 * (X + X.T)
 
 
-def continuous_stationary_covariance(A: Matrix, intensity: Matrix) -> Matrix:
+def continuous_stationary_covariance(A: ArrayLike, intensity: ArrayLike) -> Matrix:
     """Covariance of ``dx/dt = A x + w``: the Lyapunov equation ``A X + X A^T + W = 0``.
 
     Raises:
@@ -301,8 +327,11 @@ def continuous_stationary_covariance(A: Matrix, intensity: Matrix) -> Matrix:
     """
     from scipy.linalg import solve_continuous_lyapunov
 
+    A = square_matrix("A", A)
+    intensity = intensity_matrix("intensity", intensity, len(A))
     growth = float(numpy.max(numpy.linalg.eigvals(A).real))
-    if growth >= 0.0:
+    # A double pole at zero may be computed on either side of it.
+    if growth > -1e-12 * max(1.0, float(numpy.abs(A).max())):
         raise ValueError(f"only a stable loop has stationary variances, got a pole at {growth:.6g} 1/s")
     X = solve_continuous_lyapunov(A, -intensity)
     return 0.5 * (X + X.T)
