@@ -198,7 +198,7 @@ def evaluate(
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
-    return _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed)
+    return _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
 
 
 def _dataset(
@@ -210,6 +210,7 @@ def _dataset(
     seeds: Sequence[int],
     split: str,
     seed: int,
+    keywords: dict[str, Any],
 ) -> xarray.Dataset:
     task = next(iter(tasks.values()))
     names = list(per_policy)
@@ -240,6 +241,7 @@ def _dataset(
         attrs={
             "environment": task.id,
             "scenario": scenario.name,
+            "keywords": dict(keywords),
             "split": split,
             "seed": seed,
             "windows": {

@@ -34,9 +34,14 @@ def _axes(rows: int = 1, width: float = 8.0, height: float = 3.6) -> Any:
 
 
 def _logarithmic(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers."""
+    """Label a logarithmic axis with plain numbers, every digit where it spans less than a decade."""
+
+    def label(x: float, _: int) -> str:
+        low, high = axis.get_view_interval()
+        return f"{x:g}" if f"{x:.0e}"[0] in ("25" if high > 10.0 * low else "2345678") else ""
+
     axis.set_major_formatter("{x:g}")
-    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in "25" else "")
+    axis.set_minor_formatter(label)
 
 
 def _shade_windows(axis: Any, dataset: xarray.Dataset) -> None:
@@ -148,11 +153,41 @@ def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
     return figure
 
 
+def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
+    """Mean over episodes of the probability of the true class, with 95 % bands."""
+    bootstrap = Bootstrap(dataset.sizes["episode"], resamples=200)
+    figure, axes = _axes()
+    _shade_windows(axes[0], dataset)
+    for name, style in styles(dataset["policy"].values.tolist()).items():
+        values = dataset["true_class_probability"].sel(policy=name).values
+        if numpy.isnan(values).all():
+            continue
+        means = bootstrap.means(values)
+        low, high = numpy.percentile(means[1:], [2.5, 97.5], axis=0)
+        axes[0].plot(dataset["time"], means[0], label=name, **style)
+        axes[0].fill_between(dataset["time"], low, high, color=style["color"], alpha=0.18, lw=0)
+    axes[0].set_ylim(-0.02, 1.02)
+    axes[0].set_ylabel("weight of the true class")
+    axes[0].set_xlabel("measurement")
+    axes[0].grid(alpha=0.25, lw=0.4)
+    axes[0].margins(x=0.01)
+    title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
+    figure.suptitle(
+        f"{title}: {dataset.sizes['episode']} episodes, 95 % bands", fontsize=10, x=0.01, ha="left"
+    )
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
 def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
     """Every figure of an evaluation with the name of its file."""
     yield "rmse_over_time", draw_error_over_time(dataset)
     yield "error_distribution", draw_error_distribution(dataset)
-    if "mode_probability" in dataset:
+    if "true_class_probability" in dataset:
+        # Where the truth differs from episode to episode, a mean over episodes of each mode says nothing.
+        yield "true_class_probability", draw_true_class_probability(dataset)
+    elif "mode_probability" in dataset:
         yield "mode_probabilities", draw_mode_probabilities(dataset)
 
 

@@ -63,6 +63,25 @@ def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
     return units | {name: units[parts[0]] for name, parts in dataset.attrs["groups"].items()}
 
 
+def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
+    """Mean over episodes and times of what is there: NaN stands for no measurement, or no event.
+
+    A ratio of two sums, so that an episode counts by what it has; NaN where nothing is there at all.
+
+    Args:
+        values: ``(episodes, time)``.
+        bootstrap: over the episodes.
+    """
+    present = ~numpy.isnan(values)
+    sums = numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
+
+    def ratio(means: numpy.ndarray) -> numpy.ndarray:
+        nothing = numpy.full(len(means), math.nan)
+        return numpy.divide(means[:, 0], means[:, 1], out=nothing, where=means[:, 1] > 0.0)
+
+    return bootstrap.estimate(sums, ratio)
+
+
 def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     run = dataset.sel(policy=name)
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
@@ -86,12 +105,11 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
     for metric in ("nees", "nis"):
         if metric in run and not numpy.isnan(run[metric].values).all():
             for window, times in slices.items():
-                values = run[metric].values[:, times].mean(axis=1)
                 yield Measure(
                     metric,
                     "state" if metric == "nees" else "measurement",
                     window,
-                    bootstrap.estimate(values),
+                    mean_of_present(run[metric].values[:, times], bootstrap),
                     "1",
                 )
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():

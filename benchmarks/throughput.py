@@ -4,8 +4,10 @@
 
 **What is timed.** The public ``step`` of the vector environment: action check, filters, reward, observation,
 autoreset (NEXT_STEP; every 100 steps or at the end of the episode, whichever comes first; for long episodes
-that is more resets than they really have). One thread. A rate is the median over repeats of 101 steps; other
-jobs on the machine only lower it. Actions are random and drawn beforehand, in float32 as the space has them.
+that is more resets than they really have). One thread. A rate is the median over repeats of 101 steps. Where
+other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
+process was given; both are shown, and shares and ratios use the latter for both sides. Actions are random and
+drawn beforehand, in float32 as the space has them.
 
 **Floors**, as rates that no implementation of the same arithmetic on this machine and thread can be expected
 to pass by much:
@@ -29,6 +31,7 @@ import argparse
 import itertools
 import os
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -171,15 +174,24 @@ def _cycle(task: Any, state: Any, action: Any, row: Any) -> tuple[Any, Any, Any]
     return state, cost, task.observe(state)
 
 
-def seconds(call: Callable[[], object], repeats: int, calls: int = 1) -> float:
-    """Median time of one call, s."""
-    taken = []
+class Duration(NamedTuple):
+    """Time of one call, s."""
+
+    wall: float
+    processor: float
+    """Time that the process was given."""
+
+
+def duration(call: Callable[[], object], repeats: int, calls: int = 1) -> Duration:
+    """Median time of one call."""
+    wall, processor = [], []
     for _ in range(repeats):
-        begin = time.perf_counter()
+        begin, begin_processor = time.perf_counter(), time.process_time()
         for _ in range(calls):
             call()
-        taken.append((time.perf_counter() - begin) / calls)
-    return statistics.median(taken)
+        wall.append((time.perf_counter() - begin) / calls)
+        processor.append((time.process_time() - begin_processor) / calls)
+    return Duration(statistics.median(wall), statistics.median(processor))
 
 
 def memory_floor(work: Work, count: int) -> float:
@@ -188,7 +200,7 @@ def memory_floor(work: Work, count: int) -> float:
     numbers = max(1, round((work.read + work.written) * width / 16))  # half is read, half is written
     source, target = numpy.ones(numbers), numpy.empty(numbers)
     calls = max(1, 2_000_000 // numbers)
-    return count / seconds(lambda: numpy.copyto(target, source), 7, calls)
+    return count / duration(lambda: numpy.copyto(target, source), 7, calls).processor
 
 
 def elementwise_costs() -> tuple[float, float]:
@@ -196,13 +208,13 @@ def elementwise_costs() -> tuple[float, float]:
     size = 1024
     a, b = numpy.linspace(-1.0, 1.0, size), numpy.empty(size)
     return (
-        seconds(lambda: numpy.multiply(a, a, out=b), 21, 1000) / size,
-        seconds(lambda: numpy.exp(a, out=b), 21, 200) / size,
+        duration(lambda: numpy.multiply(a, a, out=b), 21, 1000).processor / size,
+        duration(lambda: numpy.exp(a, out=b), 21, 200).processor / size,
     )
 
 
-def vector_rate(id: str, control: str, count: int, repeats: int, **backend: Any) -> float:
-    """Environment steps per second through the public vector ``step``."""
+def vector_rates(id: str, control: str, count: int, repeats: int, **backend: Any) -> tuple[float, float]:
+    """Environment steps through the public vector ``step`` per second, by the wall and by the processor."""
     steps = min(STEPS, make_task(id, control).horizon // make_task(id, control).decision_interval)
     env = gymnasium.make_vec(id, num_envs=count, control=control, max_episode_steps=steps, **backend)
     env.reset(seed=0)
@@ -218,13 +230,13 @@ def vector_rate(id: str, control: str, count: int, repeats: int, **backend: Any)
 
     if count <= 4096:
         episodes()  # warm caches and clocks
-    rate = count * (steps + 1) / seconds(episodes, repeats)
+    taken = duration(episodes, repeats if count <= 4096 else 3)
     env.close()
-    return rate
+    return count * (steps + 1) / taken.wall, count * (steps + 1) / taken.processor
 
 
-def single_step(id: str, control: str, repeats: int) -> float:
-    """Microseconds of ``step`` of the environment that ``gymnasium.make`` makes, wrappers included."""
+def single_step(id: str, control: str, repeats: int) -> Duration:
+    """Time of ``step`` of the environment that ``gymnasium.make`` makes, wrappers included."""
     env = gymnasium.make(id, control=control)
     env.action_space.seed(0)
     action = env.action_space.sample()
@@ -232,9 +244,9 @@ def single_step(id: str, control: str, repeats: int) -> float:
     taken = []
     for _ in range(repeats):
         env.reset(seed=0)
-        taken.append(seconds(lambda: env.step(action), 1, steps))
+        taken.append(duration(lambda: env.step(action), 1, steps))
     env.close()
-    return 1e6 * statistics.median(taken)
+    return Duration(*(statistics.median(times) for times in zip(*taken, strict=True)))
 
 
 def compiled_rates(id: str, control: str, count: int) -> tuple[float, float, float]:
@@ -265,7 +277,7 @@ def compiled_rates(id: str, control: str, count: int) -> tuple[float, float, flo
                     current, _cost, _shown = cycle(task, current, action, row)
 
             roll()
-            rates.append(20 * count / seconds(roll, 7))
+            rates.append(20 * count / duration(roll, 7).processor)
     return rates[0], rates[1], compiling
 
 
@@ -283,9 +295,12 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
         backends += [(f"torch {d}", {"backend": "torch", "device": d}) for d in devices]
     cells = [(id, control) for id in ids for control in catalogue()[id].controls]
     sizes = FULL if full else QUICK
-    console = Console()
+    # Wide enough for the tables where the output is a file.
+    console = Console(width=None if sys.stdout.isatty() else 150)
 
-    single = Table("environment", "control", "step, µs", title="Single environment, gymnasium.make")
+    single = Table(
+        "environment", "control", "step, µs", "of processor time", title="Single environment, gymnasium.make"
+    )
     vector = Table(title="Vector environment, gymnasium.make_vec: millions of steps per second, one thread")
     for name in (
         "environment",
@@ -293,6 +308,7 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
         "backend",
         "N",
         "rate",
+        "by processor",
         "memory floor",
         "arithmetic floor",
         "share",
@@ -313,14 +329,15 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
         )
         for id, control in cells:
             short = id.removeprefix("filtergym/")
-            single.add_row(short, control, f"{single_step(id, control, 5 * repeats):.0f}")
+            taken = single_step(id, control, 5 * repeats)
+            single.add_row(short, control, f"{1e6 * taken.wall:.0f}", f"{1e6 * taken.processor:.0f}")
             progress.advance(bar)
             work = work_of_step(id, control)
             arithmetic = None
             if work.operations is not None and work.functions is not None:
                 arithmetic = 1.0 / (work.operations * operation + work.functions * function)
             for count, (name, backend) in itertools.product(sizes, backends):
-                rate = vector_rate(id, control, count, repeats, **backend)
+                by_wall, rate = vector_rates(id, control, count, repeats, **backend)
                 memory = memory_floor(work, count)
                 # The arithmetic of a batch that is padded is done for the padding too.
                 padded = (
@@ -334,7 +351,9 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
                     ratio = f"{rate / statistics.median(peer_runs):.0f}"
                 cuda = "cuda" in name
                 floors = ("-", "-", "-") if cuda else (_millions(memory), _millions(padded), f"{share:.0%}")
-                vector.add_row(short, control, name, str(count), _millions(rate), *floors, ratio)
+                vector.add_row(
+                    short, control, name, str(count), _millions(by_wall), _millions(rate), *floors, ratio
+                )
                 progress.advance(bar)
             if peer_runs and id == peer_imm.PEER_OF:
                 peer_runs.append(peer_imm.imm_steps_per_second(500))  # the peer meets the same disturbances

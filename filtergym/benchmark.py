@@ -37,7 +37,7 @@ def cells(full: bool, environments: Sequence[str] = ()) -> list[Cell]:
         names = (
             list(cls.scenarios)
             if full
-            else [s for s in ("paper", cls.default_scenario) if s in cls.scenarios]
+            else [s for s in cls.scenarios if s.startswith("paper") or s == cls.default_scenario]
         )
         for name in names:
             horizon = cls.Parameters(**cls.scenarios[name].parameters).horizon

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from filtergym.baselines.bootstrap import Bootstrap
+from filtergym.baselines.metrics import mean_of_present
 from scipy import stats
 
 
@@ -49,3 +50,19 @@ def test_without_finite_resamples_there_is_no_interval():
     estimate = Bootstrap(10).estimate(np.full(10, np.nan))
     assert np.isnan(estimate.low)
     assert np.isnan(estimate.high)
+
+
+def test_the_mean_of_what_is_present_pools_over_episodes():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(30, 20))
+    values[rng.random(values.shape) < 0.4] = np.nan
+    values[3] = np.nan
+    bootstrap = Bootstrap(30)
+    found = mean_of_present(values, bootstrap)
+    assert found.value == pytest.approx(np.nanmean(values), rel=1e-12)
+    assert found.low < found.value < found.high
+    full = rng.normal(size=(30, 20))
+    np.testing.assert_allclose(
+        mean_of_present(full, bootstrap), bootstrap.estimate(full.mean(axis=1)), rtol=1e-10
+    )
+    assert np.isnan(mean_of_present(np.full((30, 5), np.nan), bootstrap)).all()

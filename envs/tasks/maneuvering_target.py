@@ -129,16 +129,34 @@ class Maneuvers(NamedTuple):
     """Scan number, ``(manoeuvres, N)``."""
     last: Array
     """Scan number, included, ``(manoeuvres, N)``."""
-    velocity_along: Array
-    """Velocity added per velocity: cos(theta) - 1 of a turn by theta, ``(manoeuvres, N)``."""
-    velocity_across: Array
-    """Velocity added per velocity turned by +90 degrees: sin(theta)."""
-    position_along: Array
-    """Displacement added per velocity, s."""
-    position_across: Array
-    """Displacement added per turned velocity, s."""
-    acceleration: Array
-    """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+    effect: Array
+    """``(6, manoeuvres, N)``: the four of a turn and the two of thrust, as the properties below name them; one
+    array, because the truth picks from all of them in every scan."""
+
+    @property
+    def velocity_along(self) -> Array:
+        """Velocity added per velocity: cos(theta) - 1 of a turn by theta, ``(manoeuvres, N)``."""
+        return self.effect[0]
+
+    @property
+    def velocity_across(self) -> Array:
+        """Velocity added per velocity turned by +90 degrees: sin(theta)."""
+        return self.effect[1]
+
+    @property
+    def position_along(self) -> Array:
+        """Displacement added per velocity, s."""
+        return self.effect[2]
+
+    @property
+    def position_across(self) -> Array:
+        """Displacement added per turned velocity, s."""
+        return self.effect[3]
+
+    @property
+    def acceleration(self) -> Array:
+        """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+        return self.effect[4:]
 
 
 class AlphaBeta(NamedTuple):
@@ -453,10 +471,10 @@ class ManeuveringTarget(Task[State]):
         else:
             position = self.constant(p.initial_position)[:, None] * ones
             velocity = self.constant(p.initial_velocity)[:, None] * ones
-            none = 0.0 * ones[None]
+            once = ones[None]
             first, last = p.maneuver_steps
-            acceleration = self.constant(p.acceleration)[:, None, None] * ones
-            maneuvers = Maneuvers(first + none, last + none, none, none, none, none, acceleration)
+            effect = self.constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
+            maneuvers = Maneuvers(first * once, last * once, effect)
         sigma = xp.sqrt(polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma))
         start = position + sigma * normals[:2]
         start_velocity = velocity + (math.sqrt(2.0) / self.T) * sigma * normals[2:]
@@ -545,11 +563,16 @@ class ManeuveringTarget(Task[State]):
                 (
                     first,
                     first + duration[m] - 1.0,
-                    xp.cos(theta) - 1.0,
-                    xp.sin(theta),
-                    xp.where(turning, T * (xp.sin(theta) / divisor - 1.0), 0.0),
-                    xp.where(turning, T * (1.0 - xp.cos(theta)) / divisor, 0.0),
-                    vector,
+                    xp.stack(
+                        [
+                            xp.cos(theta) - 1.0,
+                            xp.sin(theta),
+                            xp.where(turning, T * (xp.sin(theta) / divisor - 1.0), 0.0),
+                            xp.where(turning, T * (1.0 - xp.cos(theta)) / divisor, 0.0),
+                            vector[0],
+                            vector[1],
+                        ]
+                    ),
                 )
             )
             total = theta * duration[m]
@@ -558,9 +581,9 @@ class ManeuveringTarget(Task[State]):
             now = turned + (T * duration[m]) * vector
         if not columns:
             empty = xp.reshape(uniforms[:0], (0, uniforms.shape[-1]))
-            return position, velocity, Maneuvers(*[empty] * 6, xp.stack([empty, empty]))  # type: ignore[call-arg]
-        parts = [xp.stack([column[i] for column in columns], axis=-2) for i in range(7)]
-        return position, velocity, Maneuvers(*parts)
+            return position, velocity, Maneuvers(empty, empty, xp.stack([empty] * 6))
+        first, last, effect = (xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))
+        return position, velocity, Maneuvers(first, last, effect)
 
     def _fly(self, state: State, scan: Array) -> tuple[Array, Array]:
         """True position and velocity at the next scan."""
@@ -573,21 +596,19 @@ class ManeuveringTarget(Task[State]):
         position, velocity = state.position + T * state.velocity, state.velocity
         if not self.slots:
             return position, velocity
-        x, y = state.velocity[0], state.velocity[1]
         active = xp.astype((scan >= m.first) & (scan <= m.last), state.position.dtype)
-        across = xp.stack([-y, x])
-        for slot in range(self.slots):
-            on = active[slot]
-            acceleration = on * m.acceleration[:, slot]
-            position = position + (0.5 * T**2) * acceleration
-            velocity = velocity + T * acceleration
-            if self.parameters.flight == "random":
-                position = position + (
-                    (on * m.position_along[slot]) * state.velocity + (on * m.position_across[slot]) * across
-                )
-                velocity = velocity + (
-                    (on * m.velocity_along[slot]) * state.velocity + (on * m.velocity_across[slot]) * across
-                )
+        # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
+        effects = active * m.effect
+        effect = effects[:, 0]
+        for slot in range(1, self.slots):
+            effect = effect + effects[:, slot]
+        acceleration = effect[4:]
+        position = position + (0.5 * T**2) * acceleration
+        velocity = velocity + T * acceleration
+        if self.parameters.flight == "random":
+            across = xp.stack([-state.velocity[1], state.velocity[0]])
+            position = position + (effect[2] * state.velocity + effect[3] * across)
+            velocity = velocity + (effect[0] * state.velocity + effect[1] * across)
         return position, velocity
 
     def measure(self, state: State, noise: Array) -> State:

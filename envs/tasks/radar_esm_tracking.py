@@ -765,7 +765,7 @@ class RadarEsmTracking(Task[State]):
         return state.estimate_covariance
 
     def records(self, state: State) -> dict[str, Array]:
-        """Class probabilities, the true class and its probability, reported variances, time and NIS.
+        """Class probabilities, true class and type, reported variances, time and NIS.
 
         The NIS of the bank is the mean over the classes by their probability given the radar; where these are
         calibrated its expectation is 2, that of the true class's filter.
@@ -782,6 +782,7 @@ class RadarEsmTracking(Task[State]):
             "mode_probability": bank.probabilities,
             "nis": nis,
             "true_class": xp.astype(state.truth.target_class, xp.float64),
+            "true_type": xp.astype(state.truth.emitter_type, xp.float64),
             "true_class_probability": true_probability,
             **{
                 f"variance_{component.name}": state.estimate_covariance[i, i]

@@ -1,0 +1,74 @@
+"""Scenarios of UavAutopilot: the paper's two inputs, the training distribution, and three held-out tests.
+
+Times and lengths are counted in measurements, so that one table serves both plants: the loops settle in 16
+(plant P) and 27 (plant U) of them. Levels multiply the nominal standard deviations. The window "steady" of
+``paper-noise`` stops before the end: in the last moments control costs and no longer pays, so that a policy
+that knows the time can be better there than the filter, which is optimal for a loop that goes on.
+"""
+
+from collections.abc import Mapping
+
+from ..task import Scenario
+
+_RANDOM = {
+    "command_amplitude": (0.25, 1.0),
+    "disturbance_levels": ((0.25, 4.0), (0.25, 4.0), (0.25, 4.0)),
+    "disturbance_times": ((100, 250), (350, 500)),
+    "sensor_levels": ((0.5, 2.0), (0.5, 5.0)),
+    "sensor_times": ((150, 450),),
+    "dropout_period": 300,
+}
+_NOMINAL_WITH_COMMANDS = {"command_amplitude": (0.25, 1.0)}
+
+SCENARIOS: Mapping[str, Scenario] = {
+    scenario.name: scenario
+    for scenario in (
+        Scenario(
+            "paper-noise",
+            "White noise only, nominal and known: the filter is optimal and the loop stationary.",
+            {},
+            {"steady": (200, 550), "all": (1, 600)},
+        ),
+        Scenario(
+            "paper-step",
+            "A unit step of the command added to the white noise.",
+            {"step_size": 1.0, "step_time": 200},
+            {"before": (100, 199), "transient": (200, 299), "steady": (300, 600), "all": (1, 600)},
+        ),
+        Scenario(
+            "random",
+            "Steps and doublets of the command; gust level and sensor noise drawn for each episode and "
+            "changing inside it; short dropouts of single sensors.",
+            _RANDOM,
+            {"steady": (50, 600), "all": (1, 600)},
+            training=True,
+        ),
+        Scenario(
+            "gust-front",
+            "Gusts go from light to severe (four times) at one measurement, unreported.",
+            {
+                **_NOMINAL_WITH_COMMANDS,
+                "disturbance_levels": ((1.0, 1.0), (4.0, 4.0)),
+                "disturbance_times": ((200, 200),),
+            },
+            {"before": (100, 199), "front": (200, 249), "after": (250, 600), "all": (1, 600)},
+        ),
+        Scenario(
+            "sensor-degradation",
+            "The noise of the rate sensor grows fivefold, unreported.",
+            {
+                **_NOMINAL_WITH_COMMANDS,
+                "sensor_levels": ((1.0, 1.0), (5.0, 5.0)),
+                "sensor_times": ((200, 200),),
+                "changing_sensors": ("rate",),
+            },
+            {"before": (100, 199), "after": (200, 600), "all": (1, 600)},
+        ),
+        Scenario(
+            "actuator-lag",
+            "The actuator is twice as slow as the filter and the autopilot believe (plant U).",
+            {**_NOMINAL_WITH_COMMANDS, "actuator_lag": 2.0},
+            {"steady": (100, 600), "all": (1, 600)},
+        ),
+    )
+}

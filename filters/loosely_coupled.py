@@ -1,0 +1,235 @@
+r"""Loosely coupled INS and GNSS on one axis: the INS error, the plain scheme, the augmented error state.
+
+    INS      dX/dt  = dXr/dt + beta + eta + xi,     beta constant,  d eta/dt = -eta / tau + w
+    GNSS     Z      = Xr + zeta
+    plain    dXh/dt = dX/dt + K (Z - Xh),           K = sqrt(Ge / N) when settled
+    error    d delta/dt = beta + eta + xi,          delta = X - Xr,  X - Z = delta - zeta
+
+``xi`` has the intensity G, ``zeta`` N, ``eta`` the stationary variance ``sigma^2``, ``beta`` the variance
+``sigma_b^2``. This is Fig. 3 of the paper by Benkafo and Lobaty; its (4) and (5) with A = 0 and the
+equivalent white intensity Ge give the plain scheme.
+
+Reading: the paper does not say how the INS enters (3). Its increment replaces ``A Xh + U``, which is the same
+as filtering ``X - Z`` with an error that walks at random.
+Reading: "the systematic errors are compensated" holds for the plain scheme as an attenuation, of a constant
+rate error to ``beta / K``; only the augmented scheme, which estimates (delta, beta, eta), removes it.
+
+The filters are written for the estimate ``Xh = X - delta_h`` of the position itself, with the innovation
+``nu = Z - Xh``. Everything is elementwise in the batch; axes of space are just more batch. One covariance
+serves all axes, for it depends on the noise levels and on the gaps in the data only.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy
+
+from .array_namespace import Array
+from .linear_systems import Matrix, van_loan
+
+
+def error_model(
+    drift: float, coloured: float, correlation_time: float, white_intensity: float
+) -> tuple[Matrix, Matrix, Matrix]:
+    """Continuous model of the INS error (delta, beta, eta).
+
+    Args:
+        drift: standard deviation of the constant rate error, m/s.
+        coloured: stationary standard deviation of the coloured rate error, m/s.
+        correlation_time: of the coloured rate error, s.
+        white_intensity: G, m^2/s.
+
+    Returns:
+        ``A``, ``B G B^T`` and the covariance at the start, where INS and reference agree, each ``(3, 3)``.
+    """
+    A = numpy.array([[0.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1.0 / correlation_time]])
+    BGBt = numpy.diag([white_intensity, 0.0, 2.0 * coloured**2 / correlation_time])
+    return A, BGBt, numpy.diag([0.0, drift**2, coloured**2])
+
+
+class Sampling(NamedTuple):
+    """Exact sampling of the INS error: ``delta += step beta + drive eta + dd``, ``eta = decay eta + de``."""
+
+    step: float
+    """Sampling interval, s."""
+    drive: float
+    """Displacement per unit of the coloured rate error at the start of the step, s."""
+    decay: float
+    """What is left of the coloured rate error after a step."""
+    coloured: float
+    """Standard deviation of ``de`` per unit of the stationary one."""
+    coupling: float
+    """Regression of ``dd`` on ``de``, s."""
+    residual: float
+    """Variance of ``dd`` that ``de`` does not explain, per unit of the stationary variance, s^2."""
+
+
+def sampling(correlation_time: float, step: float) -> Sampling:
+    """Sample the INS error exactly (Van Loan), for a coloured rate error of unit variance, no white one."""
+    A, BGBt, _ = error_model(0.0, 1.0, correlation_time, 0.0)
+    Phi, Qd = van_loan(A, BGBt, step)
+    coupling = Qd[0, 2] / Qd[2, 2]
+    return Sampling(
+        step,
+        float(Phi[0, 2]),
+        float(Phi[2, 2]),
+        math.sqrt(Qd[2, 2]),
+        float(coupling),
+        max(float(Qd[0, 0] - coupling * Qd[0, 2]), 0.0),
+    )
+
+
+def settled_gain(growth: Array, R: Array) -> Array:
+    """Gain at which the sampled plain scheme settles, ``P / (P + R)`` with the settled prediction P.
+
+    ``P = q / 2 + sqrt(q^2 / 4 + q R)``; the gain is ``sqrt(Ge / N) step`` at first order in the step.
+
+    Args:
+        growth: q, variance that the error gains in a step, ``Ge step``, m^2.
+        R: variance of a measurement, ``N / step``, m^2.
+    """
+    P = growth / 2 + (growth * growth / 4 + growth * R) ** 0.5
+    return P / (P + R)
+
+
+def update_variance(P: Array, R: Array, gain: Array) -> Array:
+    """Variance after an update with any gain, ``(1 - gain)^2 P + gain^2 R`` (Joseph form), m^2."""
+    rest = 1.0 - gain
+    return rest * rest * P + gain * gain * R
+
+
+def attenuated_mean_square(
+    K: float,
+    drift: float,
+    coloured: float,
+    correlation_time: float,
+    white_intensity: float,
+    receiver_intensity: float,
+) -> float:
+    """Settled mean square error of the continuous plain scheme with gain K, m^2.
+
+    From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta``:
+    ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``; the first term is what is left of
+    the constant.
+
+    Args:
+        K: gain, 1/s.
+        drift: standard deviation of the constant rate error, m/s.
+        coloured: stationary standard deviation of the coloured rate error, m/s.
+        correlation_time: of the coloured rate error, s.
+        white_intensity: G, m^2/s.
+        receiver_intensity: N, m^2 s.
+    """
+    return (
+        (drift / K) ** 2
+        + coloured**2 / (K * (K + 1.0 / correlation_time))
+        + (white_intensity + K * K * receiver_intensity) / (2.0 * K)
+    )
+
+
+def best_constant_gain(
+    drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
+) -> float:
+    """Gain K, 1/s, that minimises :func:`attenuated_mean_square`: a bound for any tuning of the plain scheme.
+
+    The mean square error is convex in K, so one root of its derivative is the minimum.
+
+    Raises:
+        ValueError: the INS has no error, so that the best gain is zero.
+    """
+    if not max(drift, coloured, white_intensity) > 0:
+        raise ValueError("the best gain of a perfect INS is zero; give it a rate error")
+    from scipy.optimize import brentq
+
+    rate = 1.0 / correlation_time
+
+    def slope(K: float) -> float:
+        return (
+            -2.0 * drift**2 / K**3
+            - coloured**2 * (2.0 * K + rate) / (K * (K + rate)) ** 2
+            + (receiver_intensity - white_intensity / K**2) / 2.0
+        )
+
+    low, high = 1.0, 1.0
+    while slope(low) > 0:
+        low /= 2.0
+    while slope(high) < 0:
+        high *= 2.0
+    return float(brentq(slope, low, high, xtol=1e-12, rtol=1e-12))
+
+
+class AugmentedCovariance(NamedTuple):
+    """Covariance of (delta, beta, eta): six arrays of one shape."""
+
+    position: Array
+    """m^2."""
+    position_drift: Array
+    """m^2/s."""
+    position_coloured: Array
+    """m^2/s."""
+    drift: Array
+    """m^2/s^2."""
+    drift_coloured: Array
+    """m^2/s^2."""
+    coloured: Array
+    """m^2/s^2."""
+
+
+def predict_augmented(
+    P: AugmentedCovariance, s: Sampling, coloured: Array, white: Array
+) -> AugmentedCovariance:
+    """Covariance after one step without a measurement, ``F P F^T + Qd``.
+
+    Args:
+        P: after the previous measurement.
+        s: sampling of the INS error.
+        coloured: variance that the coloured rate error gains in a step, m^2/s^2.
+        white: variance of the displacement in a step that this gain does not explain, m^2.
+    """
+    position = P.position + s.step * P.position_drift + s.drive * P.position_coloured
+    drift = P.position_drift + s.step * P.drift + s.drive * P.drift_coloured
+    cross = P.position_coloured + s.step * P.drift_coloured + s.drive * P.coloured
+    coupled = s.coupling * coloured
+    return AugmentedCovariance(
+        position + s.step * drift + s.drive * cross + (s.coupling * coupled + white),
+        drift,
+        s.decay * cross + coupled,
+        P.drift,
+        s.decay * P.drift_coloured,
+        s.decay**2 * P.coloured + coloured,
+    )
+
+
+class AugmentedGain(NamedTuple):
+    """Gains of (delta, beta, eta)."""
+
+    position: Array
+    drift: Array
+    """1/s."""
+    coloured: Array
+    """1/s."""
+
+
+def update_augmented(
+    P: AugmentedCovariance, R: Array, available: Array
+) -> tuple[AugmentedGain, AugmentedCovariance]:
+    """Gains and covariance of a measurement of delta.
+
+    ``K = P H^T / S``, ``P - K S K^T``; with this gain, which is Kalman's, and one measurement the position
+    variance is ``P R / S``, positive whatever the rounding.
+
+    Args:
+        P: of the prediction.
+        R: variance of the measurement, m^2.
+        available: one where there is a measurement, zero where there is none.
+    """
+    weight = available / (P.position + R)
+    gain = AugmentedGain(weight * P.position, weight * P.position_drift, weight * P.position_coloured)
+    return gain, AugmentedCovariance(
+        P.position - gain.position * P.position,
+        P.position_drift - gain.position * P.position_drift,
+        P.position_coloured - gain.position * P.position_coloured,
+        P.drift - gain.drift * P.position_drift,
+        P.drift_coloured - gain.drift * P.position_coloured,
+        P.coloured - gain.coloured * P.position_coloured,
+    )

@@ -1,0 +1,103 @@
+r"""Kalman covariances kept as the lower triangle, with sensors that each read one coordinate.
+
+A symmetric ``(n, n, N)`` is stored as ``(n (n + 1) / 2, N)``: the columns of its lower triangle one after
+the other, ``P00, P10, P20, ..., P11, P21, ...``. It is symmetric by construction, takes almost half the
+arithmetic, and its prediction is one matrix product over the whole batch: ``F P F^T`` is linear in P.
+
+Measurements of single coordinates with independent noise are taken in one after the other,
+
+    S = P_ii + R,   K = P_:i / S,   x = x + K (z - x_i),   P = P - K P_i:
+
+which needs no inverse and is the joint update (12) of the paper by Gridnev, Rusetski and Rak exactly. K is
+the Kalman gain of the P in use, so the short form is the Joseph form here.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy
+
+from .array_namespace import Array, namespace
+
+
+def position(n: int, i: int, j: int) -> int:
+    """Row of element (i, j) in the packed triangle of an ``n`` by ``n`` matrix."""
+    i, j = max(i, j), min(i, j)
+    return j * n - j * (j - 1) // 2 + i - j
+
+
+def column(n: int, j: int) -> list[int]:
+    """Rows of the packed triangle that hold column j of the matrix."""
+    return [position(n, i, j) for i in range(n)]
+
+
+def diagonal(n: int) -> list[int]:
+    """Rows of the packed triangle that hold the diagonal."""
+    return [position(n, i, i) for i in range(n)]
+
+
+def pack(P: Array) -> Array:
+    """Lower triangle of ``(n, n, ...)``, as ``(n (n + 1) / 2, ...)``."""
+    return namespace(P).concat([P[j:, j] for j in range(P.shape[0])], axis=0)
+
+
+def unpack(packed: Array, n: int) -> Array:
+    """Symmetric matrix ``(n, n, ...)`` of a packed triangle."""
+    return namespace(packed).stack([packed[column(n, j)] for j in range(n)], axis=0)
+
+
+def propagator(F: numpy.ndarray) -> numpy.ndarray:
+    """Matrix M with ``pack(F P F^T) = M pack(P)``, ``(n (n + 1) / 2,) * 2``."""
+    n = len(F)
+    M = numpy.zeros((n * (n + 1) // 2,) * 2)
+    for j in range(n):
+        for i in range(j, n):
+            for a in range(n):
+                for b in range(n):
+                    M[position(n, i, j), position(n, a, b)] += F[i, a] * F[j, b]
+    return M
+
+
+class Update(NamedTuple):
+    """Result of measurements of single coordinates."""
+
+    mean: Array
+    """``(n, N)``."""
+    covariance: Array
+    """Packed, ``(n (n + 1) / 2, N)``."""
+    log_likelihood: Array
+    """Log-density of the available measurements given the prediction, ``(N,)``."""
+    squared_distance: Array
+    """Normalised innovation squared, chi-square with as many degrees of freedom as measurements, ``(N,)``."""
+
+
+def update_coordinates(
+    mean: Array, covariance: Array, z: Array, coordinates: tuple[int, ...], R: Array, available: Array
+) -> Update:
+    """Take in measurements of single coordinates with independent noise.
+
+    Args:
+        mean: predicted, ``(n, N)``.
+        covariance: predicted, packed, ``(n (n + 1) / 2, N)``.
+        z: readings, ``(m, N)``; where not available any finite number.
+        coordinates: which coordinate each sensor reads, m of them.
+        R: variances of the readings, ``(m,)`` or ``(m, N)``.
+        available: 1 where there is a reading and 0 where there is none, ``(m, N)``.
+    """
+    xp = namespace(mean)
+    n = mean.shape[0]
+    squared_distance = determinant = None
+    for k, i in enumerate(coordinates):
+        p = covariance[column(n, i)]
+        S = p[i] + R[k]
+        innovation = z[k] - mean[i]
+        weight = available[k] / S
+        scaled = weight * innovation
+        mean = mean + p * scaled
+        gain = p * weight
+        covariance = covariance - xp.concat([gain[j:] * p[j] for j in range(n)], axis=0)
+        distance = scaled * innovation
+        volume = xp.where(available[k] > 0.0, 2.0 * math.pi * S, 1.0)
+        squared_distance = distance if squared_distance is None else squared_distance + distance
+        determinant = volume if determinant is None else determinant * volume
+    return Update(mean, covariance, -0.5 * (squared_distance + xp.log(determinant)), squared_distance)

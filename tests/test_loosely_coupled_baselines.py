@@ -1,0 +1,317 @@
+"""Policies, reference, bound and metrics of loosely coupled navigation, through the evaluation."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.baselines import evaluate, tidy_records
+from filtergym.baselines.evaluation import baselines_of, load_policy
+from filtergym.baselines.policies.loosely_coupled_navigation import recovery_times
+from filtergym.baselines.reproductions import kalman_bucy_ins_gnss as paper
+from filtergym.baselines.rollout import run_policy, run_reference
+from filtergym.baselines.tuning import stored_values
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.lanes import _replace_lanes
+from filtergym.filters import kalman_bucy, loosely_coupled
+from filtergym.filters.linear_systems import van_loan
+
+import filtergym  # noqa: F401  # registers the environments
+
+ID = "filtergym/LooselyCoupledNavigation-v0"
+KNOWN = baselines_of(ID)
+MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])
+START = np.diag([0.0, 0.36, 0.16])
+PRINTED = {
+    "ins-only": 2.508,
+    "gnss-only": 1.414,
+    "time-varying-white": 0.5019,
+    "time-varying": 0.2702,
+    "augmented": 0.2253,
+    "matched": 0.2253,
+}
+"""Root mean square errors from 2.5 to 5 s, m, of the reference table (its plain rows have the Riccati gain)."""
+
+
+@pytest.fixture(scope="module")
+def on_paper():
+    return evaluate(ID, list(KNOWN.names), "paper", episodes=800, seed=1)
+
+
+def steered(name, scenario, seeds, **keywords):
+    """States after every action of a policy or reference, one list."""
+    maker = load_policy(ID, name)
+    task = make_task(ID, getattr(maker, "control", None), scenario, **keywords)
+    states = []
+    run = run_policy if KNOWN.kind(name) == "policy" else run_reference
+    run(task, maker(task), seeds, states.append, lambda _: None)
+    return task, states
+
+
+# --- errors
+
+
+def test_reference_table(on_paper):
+    theory = paper.exact_root_mean_squares()
+    assert set(theory) == set(KNOWN.policies) - {"augmented-gain", "innovation-adaptive", "random"} | {
+        "matched"
+    }
+    for name, expected in theory.items():
+        if name in PRINTED:
+            # Half a unit of the last digit that the table prints, and a little.
+            assert expected == pytest.approx(PRINTED[name], abs=6e-4 if expected > 1 else 6e-5)
+        squares = (on_paper["error"].sel(policy=name).values[:, 249:, 0] ** 2).mean(axis=1)
+        assert abs(squares.mean() - expected**2) < 4 * squares.std() / math.sqrt(len(squares)), name
+
+
+def test_settled_gain_beats_the_riccati_gain_where_the_model_leaves_out_the_drift():
+    theory = paper.exact_root_mean_squares()
+    assert theory["plain-white"] == pytest.approx(0.4988, abs=6e-5)
+    assert theory["plain-white"] < theory["time-varying-white"]
+    assert theory["best-constant"] < theory["plain-reduced"]
+
+
+def test_nobody_beats_the_optimal_filter_where_it_is_optimal(on_paper):
+    """A policy that is significantly better than the optimum has found a leak."""
+    cost = on_paper["cost"].mean("time")
+    for name in KNOWN.policies:
+        difference = (cost.sel(policy=name) - cost.sel(policy="matched")).values
+        assert difference.mean() > -3 * difference.std() / math.sqrt(len(difference)) - 1e-12, name
+
+
+@pytest.mark.parametrize("scenario", ["random", "quiet", "jamming", "outage", "spoof-ramp"])
+def test_matched_is_consistent_with_its_bound(scenario):
+    names = ["matched", "matched-covariance", "augmented", "augmented-gain", "time-varying"]
+    dataset = evaluate(ID, names, scenario, episodes=400, seed=2)
+    matched = dataset.sel(policy="matched")
+    runs = math.sqrt(dataset.sizes["episode"])
+    bound = dataset["mean_square"].sel(policy="matched-covariance").values[..., 0]
+    excess = (matched["error"].values[..., 0] ** 2 - bound).mean(axis=1)
+    assert abs(excess.mean()) < 4 * excess.std() / runs
+    nees = matched["nees"].values.mean(axis=1)
+    assert abs(nees.mean() - 1.0) < 4 * nees.std() / runs
+    nis = np.nanmean(matched["nis"].values, axis=1)
+    assert abs(nis.mean() - 1.0) < 4 * nis.std() / runs
+    # A measurement that failed or is left out has no innovation.
+    missing = np.isnan(matched["nis"].values)
+    clean = scenario in ("quiet", "jamming")
+    assert missing.any() != clean
+    for name in names[2:]:
+        loss = (dataset["cost"].sel(policy=name) - matched["cost"]).values.mean(axis=1)
+        assert loss.mean() > -3 * loss.std() / runs
+
+
+# --- against naive filters
+
+
+def test_matched_equals_a_naive_filter_told_the_truth():
+    keywords = {
+        "axes": 2, "outage_probability": 1.0, "outage_start": (0.3, 0.5), "outage_duration": (0.2, 0.4),
+        "spoofing_probability": 1.0, "spoofing_start": (1.0, 1.0), "spoofing_duration": (0.3, 0.3),
+        "change_start": (0.1, 1.8), "horizon": 200,
+    }  # fmt: skip
+    seeds = [5, 6, 7]
+    task, states = steered("matched", "random", seeds, **keywords)
+    s = task.sampling
+    for lane in range(len(seeds)):
+        first = states[0]
+        sigma = first.coloured_step[lane] / s.coloured
+        white = (first.white_step[lane] ** 2 - s.residual * sigma**2) / 0.01
+        A, W, P = loosely_coupled.error_model(first.drift_deviation[lane], sigma, 1.0, white)
+        Phi, Qd = van_loan(A, W, 0.01)
+        error = np.zeros((3, 2))
+        for k, state in enumerate(states, 1):
+            error, P = Phi @ error, Phi @ P @ Phi.T + Qd
+            if state.available[lane] > 0 and not 100 <= k < 130:
+                K = P[:, 0] / (P[0, 0] + state.deviation[lane] ** 2)
+                error = error + np.outer(K, state.ins[:, lane] - state.measurement[:, lane] - error[0])
+                P = P - np.outer(K, P[0])
+            # Equal formulas, different rounding over 200 steps.
+            np.testing.assert_allclose(state.estimate[:, lane], state.ins[:, lane] - error[0], atol=1e-10)
+            np.testing.assert_allclose(
+                state.estimate_covariance[:, :, lane], P[0, 0] * np.eye(2), rtol=1e-8, atol=1e-14
+            )
+
+
+def test_matched_is_the_augmented_filter_on_paper(on_paper):
+    error = on_paper["error"]
+    np.testing.assert_allclose(error.sel(policy="matched"), error.sel(policy="augmented"), atol=1e-10)
+    exact = kalman_bucy.sampled_covariance(*MODEL, START, 0.01, 5.0).updated[:, 0, 0]
+    bound = on_paper["mean_square"].sel(policy="matched-covariance").values[0, :, 0]
+    np.testing.assert_allclose(bound, exact, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("name", "mode"), [("time-varying-white", 0), ("time-varying", 1)])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_riccati_gain_as_policy_is_the_plain_filter_of_the_bank(name, mode, axes):
+    class Believe:
+        control = "mode"
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.full(len(observation), mode), state
+
+    dataset = evaluate(
+        ID, {"policy": name, "filter": Believe()}, "random", episodes=10, axes=axes, outage_probability=1.0
+    )
+    # The policy sees logarithms and answers with one; a gain keeps 15 digits on the way.
+    np.testing.assert_allclose(
+        dataset["error"].sel(policy="policy"), dataset["error"].sel(policy="filter"), atol=1e-11
+    )
+
+
+def test_innovation_adaptive_equals_a_naive_filter():
+    seeds = [1, 2]
+    _, states = steered("innovation-adaptive", "jamming", seeds, outage_probability=1.0, outage_start=(0.5, 0.5),
+                        outage_duration=(0.3, 0.3), horizon=300)  # fmt: skip
+    rate = 1 - math.exp(-0.01 / 0.25)
+    for lane in range(len(seeds)):
+        x, v, squares = 0.0, 0.0, None
+        for state in states:
+            x, v = x + state.increment[0, lane], v + 0.0036
+            squares = v + 2.0 if squares is None else squares
+            if state.available[lane]:
+                nu = state.measurement[0, lane] - x
+                squares += rate * (nu**2 - squares)
+                gain = v / (v + max(squares - v, 0.1 * squares))
+                x, v = x + gain * nu, v * (1 - gain)
+            np.testing.assert_allclose(state.estimate[0, lane], x, atol=1e-10)
+    # Jammed measurements lose their weight without being announced.
+    gains = np.stack([state.gain[0, :2] for state in states])
+    assert (gains[250:299] < 0.2 * gains[150:199].mean()).mean() > 0.8
+
+
+def test_a_gain_can_follow_the_augmented_filter(on_paper):
+    cost = on_paper["cost"].mean(["time", "episode"])
+    assert abs(cost.sel(policy="augmented-gain") / cost.sel(policy="augmented") - 1) < 0.02
+    dataset = evaluate(ID, ["augmented-gain", "augmented"], "paper", episodes=20, axes=3)
+    apart = (dataset["error"].sel(policy="augmented-gain") - dataset["error"].sel(policy="augmented")).values
+    # Where the sign of the innovation never allows it the estimates differ for a few samples.
+    assert np.median(np.abs(apart)) < 1e-3
+
+
+def test_policies_forget_at_the_start_of_an_episode():
+    for name in ("time-varying", "innovation-adaptive", "augmented-gain"):
+        maker = load_policy(ID, name)
+        env = gym.make(ID, control="gain")
+        policy = maker(env.unwrapped.task)
+        shown = [env.reset(seed=4)[0], *(env.step(np.array([0.4]))[0] for _ in range(20))]
+        memory, fresh_memory, both = None, None, [np.stack([o, o]) for o in shown]
+        for observation in both:
+            _, memory = policy.predict(observation, memory, np.array([False, False]))
+        for k, observation in enumerate(both):
+            action, memory = policy.predict(observation, memory, np.array([k == 0, False]))
+            fresh, fresh_memory = policy.predict(observation[:1], fresh_memory, np.array([k == 0]))
+            np.testing.assert_array_equal(action[0], fresh[0])
+            assert k or name == "augmented-gain" or action[0] != action[1]
+
+
+# --- metrics
+
+
+def test_recovery_times_of_made_up_runs():
+    available = np.ones((6, 40))
+    available[:5, 10:15] = 0.0
+    error = np.full((6, 40), 0.1)
+    error[1, 12:20] = 1.0  # small again five samples after the outage
+    error[2, 12:] = 1.0  # never
+    error[3, 12:18], error[3, 19:22] = 1.0, 1.0  # one small sample does not count
+    available[4], error[4] = 1.0, 1.0
+    available[4, 30:35] = 0.0  # too late to be judged
+    found = recovery_times(error, available, 0.5, held=3, longest=20)
+    np.testing.assert_array_equal(found, [0, 5, 20, 7, np.nan, np.nan])
+
+
+def test_recovery_is_reported_for_outages_only(on_paper):
+    assert not {r.metric for r in tidy_records(on_paper)} & {"recovery_time", "not_recovered"}
+    records = tidy_records(
+        evaluate(ID, ["plain-white", "time-varying", "matched", "matched-covariance"], "outage", episodes=200)
+    )
+    found = {(r.policy, r.metric): r.value for r in records if r.window == "all"}
+    assert 0 < found["matched", "recovery_time"] < found["time-varying", "recovery_time"]
+    assert found["time-varying", "recovery_time"] < found["plain-white", "recovery_time"] <= 1.0
+    assert found["plain-white", "not_recovered"] > found["time-varying", "not_recovered"]
+    assert ("matched-covariance", "recovery_time") not in found
+    nis = {(r.policy, r.window): r.value for r in records if r.metric == "nis"}
+    assert nis["matched", "during"] is None
+    assert nis["matched", "after"] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("axes", [1, 2])
+def test_records_name_the_position(axes):
+    records = tidy_records(evaluate(ID, ["plain-reduced"], "paper", episodes=16, axes=axes))
+    rmse = {r.component for r in records if r.metric == "rmse"}
+    assert "position" in rmse
+    if axes == 2:
+        assert rmse == {"position", "position_x", "position_y"}
+        assert next(r.value for r in records if r.metric == "nis") == pytest.approx(2.0, abs=0.1)
+    assert {r.window for r in records if r.metric == "mean_error"} == {"all", "late"}
+
+
+def test_tuned_values_are_shipped_and_better_on_other_episodes():
+    for name in KNOWN.tunable:
+        assert set(stored_values(ID, name)[0]) == set(KNOWN.tunable[name].limits)
+    dataset = evaluate(ID, ["best-constant", "best-constant-tuned"], "random", episodes=500, seed=3)
+    cost = dataset["cost"].mean(["time", "episode"])
+    assert cost.sel(policy="best-constant-tuned") < cost.sel(policy="best-constant")
+
+
+# --- engine
+
+
+def test_fields_without_rows_survive_the_restart_of_some_lanes():
+    task = make_task(ID, "gain")
+    rng = np.random.default_rng(0)
+    old, new = (
+        task.begin(rng.random((task.noise.uniforms, 8)), rng.standard_normal((task.noise.initial_normals, 8)))
+        for _ in range(2)
+    )
+    assert old.rest.shape == (0, 8)
+    assert old.rate.shape == (0, 1, 8)
+    merged = _replace_lanes(old, new, np.array([2, 5]))
+    for a, b, c in zip(old, new, merged, strict=True):
+        assert c.shape == a.shape
+        np.testing.assert_array_equal(c[..., [2, 5]], b[..., :2])
+        np.testing.assert_array_equal(np.delete(c, [2, 5], axis=-1), np.delete(a, [2, 5], axis=-1))
+
+
+@pytest.mark.parametrize("control", ["gain", "mode"])
+def test_lanes_that_restart_alone_equal_single_environments(control):
+    env = gym.make_vec(ID, num_envs=3, control=control, autoreset_mode="Disabled", horizon=12)
+    env.reset(seed=[1, 2, 3])
+    action = np.full((3, 1), 0.4, np.float32) if control == "gain" else np.array([0, 1, 2])
+    for _ in range(5):
+        env.step(action)
+    env.reset(seed=[9, 9, 9], options={"reset_mask": np.array([False, True, False])})
+    alone = gym.make(ID, control=control, horizon=12)
+    alone.reset(seed=9)
+    for _ in range(7):
+        shown, paid, *_ = env.step(action)
+        one, other, *_ = alone.step(action[1])
+        np.testing.assert_array_equal(shown[1], one)
+        assert paid[1] == other
+
+
+# --- reproduction
+
+
+def test_reproduction_runs_and_judges():
+    done = []
+    result = paper.reproduce(lambda n=1: done.append(n), 60)
+    assert sum(done) == paper.STEPS
+    verdicts = {claim.key: claim.verdict for claim in result.claims}
+    assert [verdicts[key] for key in "134"] == ["reproduced", "reproduced in part", "reproduced"]
+    assert all(verdicts[key] == "paper is silent" for key in "5678")
+    assert set(result.figures) == set(result.captions) == {"figure_2", "figure_4", "figure_5", "drift"}
+
+
+def test_example_a_against_its_theory():
+    example = paper.first_order(3000)
+    for name, expected in example.theory.items():
+        values = example.squares[name]
+        assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(len(values)), name
+    agreement = paper.riccati_agreement()
+    assert agreement.hamiltonian < 1e-12
+    assert agreement.ode < 1e-8
+    assert agreement.matrix < 1e-9
+    assert agreement.order == pytest.approx(1.0, abs=0.05)
+    assert "no stabilising solution" in agreement.refusal

@@ -1,0 +1,554 @@
+"""The loosely coupled navigation task against naive filters, exact moments and the reference table."""
+
+import math
+from collections import deque
+
+import array_api_compat.torch as xp_torch
+import numpy as np
+import pytest
+import torch
+from filtergym.envs.tasks.loosely_coupled_navigation import TASK, LooselyCoupledNavigationParameters
+from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
+
+PAPER = LooselyCoupledNavigationParameters()
+MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])
+START = np.diag([0.0, 0.36, 0.16])
+
+
+def make(scenario, control="gain", xp=np, **keywords):
+    values = {**TASK.scenarios[scenario].parameters, **keywords}
+    return TASK(TASK.Parameters(**values), control, xp)
+
+
+def numbers(task, lanes, steps, seed):
+    """What an episode draws: uniforms, initial normals, and a list of rows."""
+    rng = np.random.default_rng(seed)
+    rows = task.noise.normals + task.noise.row_uniforms
+    return (
+        rng.random((task.noise.uniforms, lanes)),
+        rng.standard_normal((task.noise.initial_normals, lanes)),
+        [rng.standard_normal((rows, lanes)) for _ in range(steps)],
+    )
+
+
+def states(task, drawn, policy):
+    """Drive the task; yield the state after each measurement and the state after each action."""
+    uniforms, normals, rows = drawn
+    state = task.begin(uniforms, normals)
+    for k, row in enumerate(rows):
+        seen = task.measure(state, row)
+        state = task.act(seen, policy(k, seen))
+        yield seen, state
+
+
+def constant(task, action, lanes):
+    if task.control == "mode":
+        return lambda k, seen: np.full(lanes, action)
+    return lambda k, seen: np.full((task.action_space.shape[0], lanes), action)
+
+
+def random_actions(task, lanes, steps, seed):
+    rng = np.random.default_rng([seed, 1])
+    if task.control == "mode":
+        return rng.integers(0, 3, (steps, lanes))
+    low = -1.2 if task.control == "gain" else 0.0
+    return rng.uniform(low, 1.2, (steps, task.action_space.shape[0], lanes))
+
+
+# --- The reference table ---------------------------------------------------------------------------------
+
+
+def plain_riccati_root_mean_square(intensity):
+    """Exact root mean square error of the plain scheme with the Riccati gain over 2.5 to 5 s."""
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
+    variance, P, squares = 0.0, START, []
+    for _ in range(500):
+        variance += intensity * 0.01
+        gain = variance / (variance + 2.0)
+        variance *= 1 - gain
+        rest = np.eye(3) - gain * np.diag([1.0, 0, 0])
+        P = rest @ (Phi @ P @ Phi.T + Qd) @ rest.T + np.diag([2.0 * gain**2, 0, 0])
+        squares.append(P[0, 0])
+    return math.sqrt(np.mean(squares[249:]))
+
+
+def fixed_gain_root_mean_square(gain=None):
+    column = None if gain is None else [gain, 0, 0]
+    found = kalman_bucy.sampled_covariance(*MODEL, START, 0.01, 5.0, column).updated[249:, 0, 0]
+    return math.sqrt(found.mean())
+
+
+@pytest.mark.parametrize(
+    ("control", "action", "printed", "theory"),
+    [
+        ("gain", 0.0, 2.508, fixed_gain_root_mean_square(0.0)),
+        ("gain", 1.0, 1.414, math.sqrt(2)),
+        ("gain", 0.041535951739, 0.2702, fixed_gain_root_mean_square(0.041535951739)),
+        ("mode", 0, 0.5019, plain_riccati_root_mean_square(0.04)),
+        ("mode", 1, 0.2702, plain_riccati_root_mean_square(0.36)),
+        ("mode", 2, 0.2253, fixed_gain_root_mean_square()),
+    ],
+)
+def test_reference_table(control, action, printed, theory):
+    runs = 4000
+    task = make("paper", control)
+    if control == "gain":
+        action = task.action_of_gain(action)
+    squares, nees, nis = np.zeros(runs), np.zeros(runs), np.zeros(runs)
+    for k, (_, state) in enumerate(states(task, numbers(task, runs, 500, 3), constant(task, action, runs))):
+        if k >= 249:
+            squares += task.error(state)[0] ** 2
+            nis += task.records(state)["nis"]
+            if (control, action) == ("mode", 2):
+                nees += augmented_nees(state)
+    # Half a unit of the last digit that the table prints, and a little.
+    assert theory == pytest.approx(printed, abs=6e-5 if printed < 1 else 6e-4)
+    checks = [(squares / 251, theory**2)]
+    if (control, action) == ("mode", 2):
+        checks += [(nees / 251, 1.0), (nis / 251, 1.0)]
+    for found, expected in checks:
+        assert abs(found.mean() - expected) < 4 * found.std() / math.sqrt(runs)
+
+
+def augmented_nees(state):
+    """Normalised squared error of (delta, beta, eta) over its dimension."""
+    a, b, c, d, e = state.rest
+    P = np.array([[state.variance[2, 0], a, b], [a, c, d], [b, d, e]]).transpose(2, 0, 1)
+    error = np.stack(
+        [
+            state.reference[0] - state.position[2, 0],
+            state.rate[0, 0] - state.drift[0],
+            state.rate[1, 0] - state.coloured[0],
+        ],
+        axis=-1,
+    )
+    return np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]) / 3
+
+
+def test_best_constant_gain():
+    model = (0.6, 0.4, 1.0, 0.04, 0.02)
+    K = loosely_coupled.best_constant_gain(*model)
+    assert pytest.approx(4.73, abs=5e-3) == K
+    assert pytest.approx(0.447, abs=5e-4) == K * K * 0.02
+    cost = loosely_coupled.attenuated_mean_square
+    assert cost(K, *model) < min(cost(1.001 * K, *model), cost(0.999 * K, *model))
+    with pytest.raises(ValueError, match="perfect INS"):
+        loosely_coupled.best_constant_gain(0, 0, 1, 0, 0.02)
+
+
+@pytest.mark.parametrize("K", [1.41, 4.24, 9.0])
+def test_attenuation_follows_from_the_moments(K):
+    A, BGBt, P0 = loosely_coupled.error_model(0.6, 0.4, 0.7, 0.04)
+    A[0, 0], BGBt[0, 0] = -K, 0.04 + K * K * 0.02
+    found = kalman_bucy.moments(A, np.zeros(3), BGBt, np.zeros(3), P0, [30.0]).covariance[0, 0, 0]
+    assert loosely_coupled.attenuated_mean_square(K, 0.6, 0.4, 0.7, 0.04, 0.02) == pytest.approx(
+        found, rel=1e-9
+    )
+
+
+def test_the_plain_scheme_attenuates_a_constant_and_the_augmented_one_removes_it():
+    runs, means = 3000, []
+    for control, action in (("gain", 0.447), ("mode", 2)):
+        task = make("paper", control, fixed_drift=1.0, horizon=2000)
+        run = states(task, numbers(task, runs, 2000, 5), constant(task, action, runs))
+        _, state = deque(run, maxlen=1).pop()
+        means.append(task.error(state)[0])
+    K = loosely_coupled.settled_gain(0.0036, 2.0)
+    standard_error = [m.std() / math.sqrt(runs) for m in means]
+    # The sampled scheme settles at beta step (1 - gain) / gain, close to beta / K = 0.236.
+    assert abs(means[0].mean() - 0.01 * (1 - K) / K) < 4 * standard_error[0]
+    # 20 s: the prior of beta still holds back a little, computed from the covariance.
+    P = kalman_bucy.sampled_covariance(*MODEL, START, 0.01, 20.0).updated[-1]
+    assert P[1, 1] < 0.05
+    assert abs(means[1].mean()) < 0.1 * means[0].mean()
+
+
+# --- Filters against naive ones -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bank_equals_naive_filters(seed):
+    lanes, steps = 4, 300
+    task = make("random", "weights", axes=2, noise_changes=(2, 2), outage_probability=1.0)
+    drawn, actions = numbers(task, lanes, steps, seed), random_actions(task, lanes, steps, seed)
+    run = list(states(task, drawn, lambda k, seen: actions[k]))
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
+    for lane in range(lanes):
+        for axis in range(2):
+            x = np.full(2, run[0][0].ins[axis, lane] - run[0][0].increment[axis, lane])
+            v, error, P = np.zeros(2), np.zeros(3), START
+            for k, (seen, state) in enumerate(run):
+                R = seen.reported[lane] ** 2
+                x, v = x + seen.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
+                error, P = Phi @ error, Phi @ P @ Phi.T + Qd
+                if seen.available[lane]:
+                    g, z = v / (v + R), seen.measurement[axis, lane]
+                    x, v = x + g * (z - x), v * (1 - g)
+                    K = P[:, 0] / (P[0, 0] + R)
+                    error = error + K * (seen.ins[axis, lane] - z - error[0])
+                    P = P - np.outer(K, P[0])
+                expected = [*x, seen.ins[axis, lane] - error[0]]
+                weights = np.clip(actions[k, :, lane], 0, 1)
+                weights = weights / weights.sum()
+                # Rounding over 300 steps of different but equal formulas.
+                np.testing.assert_allclose(state.position[:, axis, lane], expected, atol=1e-11)
+                np.testing.assert_allclose(state.rate[:, axis, lane], error[1:], atol=1e-11)
+                variances = np.array([*v, P[0, 0]])
+                np.testing.assert_allclose(state.variance[:, 0, lane], variances, rtol=1e-10)
+                mean = weights @ expected
+                np.testing.assert_allclose(state.estimate[axis, lane], mean, atol=1e-11)
+                np.testing.assert_allclose(
+                    state.estimate_covariance[axis, axis, lane],
+                    weights @ (variances + (expected - mean) ** 2),
+                    rtol=1e-8,
+                )
+
+
+def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
+    lanes, steps = 5, 200
+    task = make("random", outage_probability=1.0)
+    actions = random_actions(task, lanes, steps, 1)
+    x = v = 0.0
+    for k, (seen, state) in enumerate(
+        states(task, numbers(task, lanes, steps, 1), lambda k, seen: actions[k])
+    ):
+        a = np.clip(actions[k, 0], -1, 1)
+        gain = seen.available * np.where(a == -1, 0.0, 10.0 ** (-2.5 * (1 - a)))
+        before = x + seen.increment[0]
+        x = np.where(seen.available > 0, (1 - gain) * before + gain * seen.measurement[0], before)
+        v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * seen.reported**2
+        np.testing.assert_allclose(state.estimate[0], x, atol=1e-12)
+        np.testing.assert_allclose(state.estimate_covariance[0, 0], v, rtol=1e-12)
+    drawn = numbers(task, lanes, steps, 2)
+    for _, state in states(task, drawn, constant(task, -1.0, lanes)):
+        np.testing.assert_array_equal(state.estimate, state.ins)
+    for _, state in states(make("paper"), drawn, constant(task, 1.0, lanes)):
+        np.testing.assert_array_equal(state.gain, 1.0)
+        np.testing.assert_allclose(state.estimate, state.measurement, atol=1e-15)
+
+
+def test_actions_and_gains_are_inverse():
+    task = make("paper")
+    for gain in (0.0, 2e-5, 0.0032, 0.0415, 0.5, 1.0):
+        assert float(task.gain_of_action(np.array(task.action_of_gain(gain)))) == pytest.approx(
+            gain, rel=1e-12
+        )
+    assert task.gain_of_action(np.array(1.0)) == 1.0
+    # The least action above -1 sets about the smallest gain.
+    assert task.gain_of_action(np.array(-1 + 1e-12)) == pytest.approx(1e-5)
+    with pytest.raises(ValueError, match=r"gain must lie in \[0, 1\]"):
+        task.action_of_gain(1.5)
+    assert task.paper_policy.action == pytest.approx(TASK.paper_policy.action, abs=5e-4)
+
+
+def test_averages_are_those_of_the_definition():
+    task = make("outage")
+    weight = 1 - math.exp(-0.01 / 0.25)
+    mean, square, product, last = 0.0, 1.0, 0.0, 0.0
+    for seen, _ in states(task, numbers(task, 1, 400, 4), constant(task, 0.4, 1)):
+        if seen.available[0]:
+            n = seen.innovation[0, 0, 0] / math.sqrt(seen.variance[0, 0, 0] + seen.reported[0] ** 2)
+            mean += weight * (n - mean)
+            square += weight * (n * n - square)
+            product += weight * (n * last - product)
+            last = n
+        shown = task.observe(seen)[:, 0]
+        np.testing.assert_allclose(shown[2:5], [mean, math.log1p(square), product], rtol=1e-10, atol=1e-13)
+        assert shown[0] == (last if seen.available[0] else 0.0)
+
+
+# --- Scenarios ---------------------------------------------------------------------------------------------
+
+
+def test_disturbances_stand_in_their_windows():
+    lanes = 3
+    for name in ("outage", "jamming", "spoof-ramp"):
+        task = make(name)
+        first, last = TASK.scenarios[name].windows["during"]
+        uniforms, normals, rows = numbers(task, lanes, 500, 6)
+        rows = [0.0 * row for row in rows]
+        for k, (seen, _) in enumerate(states(task, (uniforms, normals, rows), constant(task, 0.0, lanes)), 1):
+            inside = first <= k <= last
+            assert (seen.available == (0.0 if name == "outage" and inside else 1.0)).all()
+            jammed = 10.0 if name == "jamming" and inside else 1.0
+            np.testing.assert_allclose(seen.deviation, math.sqrt(2) * jammed, rtol=1e-14)
+            np.testing.assert_allclose(seen.reported, math.sqrt(2), rtol=1e-14)
+            pull = 0.02 * (k - first + 1) if name == "spoof-ramp" and inside else 0.0
+            truth = 2 * math.sin(0.008 * k) + pull
+            np.testing.assert_allclose(
+                seen.measurement, 0.0 if inside and name == "outage" else truth, atol=1e-12
+            )
+
+
+def test_random_draws_a_decade_and_reports_half_of_the_changes():
+    task, lanes = make("random"), 20000
+    state = task.begin(*numbers(task, lanes, 0, 8)[:2])
+    low, high = 10**-0.5, 10**0.5
+    intensities = state.receiver_levels**2 / 2.0
+    for drawn in (state.drift_deviation / 0.6, *intensities):
+        assert low <= drawn.min() * (1 + 1e-12)
+        assert drawn.max() <= high * (1 + 1e-12)
+        assert abs(np.log(drawn).mean()) < 4 * math.log(10) / math.sqrt(12 * lanes)
+    one = state.change[1] > 1e6
+    assert abs(one.mean() - 0.5) < 2 / math.sqrt(lanes)
+    assert (state.change[0] < state.change[1] + 1).all()
+    silent = state.reported_levels[1] == state.reported_levels[0]
+    assert abs(silent.mean() - 0.5) < 2 / math.sqrt(lanes)
+    assert abs((state.outage[0] < 1e6).mean() - 0.5) < 2 / math.sqrt(lanes)
+
+
+def test_ins_noise_has_the_drawn_intensities():
+    task = make("random")
+    state = task.begin(*numbers(task, 6, 0, 9)[:2])
+    s = task.sampling
+    for i in range(6):
+        variance = (state.coloured_step[i] / s.coloured) ** 2
+        q33 = state.coloured_step[i] ** 2
+        q11 = state.white_step[i] ** 2 + s.coupling**2 * q33
+        white = (
+            q11
+            - linear_systems.van_loan(*loosely_coupled.error_model(0, math.sqrt(variance), 1, 0)[:2], 0.01)[
+                1
+            ][0, 0]
+        ) / 0.01
+        assert 0.04 * 10**-0.5 * (1 - 1e-6) < white < 0.04 * 10**0.5 * (1 + 1e-6)
+        Qd = linear_systems.van_loan(
+            *loosely_coupled.error_model(0, math.sqrt(variance), 1, white)[:2], 0.01
+        )[1]
+        np.testing.assert_allclose([q11, s.coupling * q33, q33], [Qd[0, 0], Qd[0, 2], Qd[2, 2]], rtol=1e-9)
+
+
+def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
+    task = make("paper")
+    # One lane for each source: beta, eta, the two noises; the step is linear in them.
+    normals = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0]])
+    noise = np.array([[0.0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
+    after = task.sense(task.begin(np.full((20, 5), 0.5), normals), noise)
+    error = np.stack([(after.ins - after.reference)[0], after.drift[0], after.coloured[0]])
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
+    # The last lane has no source and stays free of error.
+    np.testing.assert_array_equal(error[:, 4], 0.0)
+    np.testing.assert_allclose(error[:, :2], Phi @ np.sqrt(START)[:, [1, 2]], rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(error[:, 2:4] @ error[:, 2:4].T, Qd, rtol=1e-9, atol=1e-16)
+
+
+# --- Contract ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("control", TASK.controls)
+@pytest.mark.parametrize("axes", [1, 2, 3])
+@pytest.mark.parametrize("scenario", TASK.scenarios)
+def test_shapes_and_sizes(control, axes, scenario):
+    lanes, steps = 8, 60
+    task = make(scenario, control, axes=axes)
+    actions = random_actions(task, lanes, steps, 0)
+    uniforms, normals, rows = numbers(task, lanes, steps, 0)
+    shapes = [x.shape for x in task.begin(uniforms, normals)]
+    for seen, state in states(task, (uniforms, normals, rows), lambda k, seen: actions[k]):
+        observation = task.observe(seen)
+        assert observation.shape == (len(task.fields), lanes)
+        assert np.isfinite(observation).all()
+        assert np.abs(observation).max() < 50
+        assert [x.shape for x in state] == shapes
+        assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in state)
+        assert task.error(state).shape == (axes, lanes) == (len(task.components), lanes)
+        assert task.covariance(state).shape == (axes, axes, lanes)
+        np.testing.assert_allclose(task.cost(state), (task.error(state) ** 2).sum(0) / 2.0, rtol=1e-12)
+        for name, record in task.records(state).items():
+            assert record.shape == ((3, lanes) if name == "mode_probability" else (lanes,))
+    assert len({f.name for f in task.fields}) == len(task.fields)
+
+
+@pytest.mark.parametrize("control", TASK.controls)
+def test_the_truth_follows_the_noise_and_not_the_control(control):
+    lanes, steps = 4, 80
+    reference = make("random", "gain", axes=2)
+    task = make("random", control, axes=2)
+    drawn = numbers(task, lanes, steps, 2)
+    actions = random_actions(task, lanes, steps, 5)
+    for (seen, _), (other, _) in zip(
+        states(reference, drawn, constant(reference, 0.3, lanes)),
+        states(task, drawn, lambda k, s: actions[k]),
+        strict=True,
+    ):
+        for name in ("reference", "ins", "measurement", "available", "reported", "deviation"):
+            np.testing.assert_array_equal(getattr(seen, name), getattr(other, name))
+
+
+@pytest.mark.parametrize("control", TASK.controls)
+def test_no_truth_at_any_distance(control):
+    """The same instrument readings with another truth give the same observations and estimates."""
+    lanes, steps = 4, 150
+    task = make("random", control, axes=2, outage_probability=1.0, spoofing_probability=0.5)
+    drawn, actions = numbers(task, lanes, steps, 3), random_actions(task, lanes, steps, 3)
+    truth = [
+        "reference",
+        "drift",
+        "coloured",
+        "drift_deviation",
+        "coloured_step",
+        "white_step",
+        "receiver_levels",
+        "reported_levels",
+        "change",
+        "outage",
+        "jamming",
+        "spoofing",
+        "deviation",
+    ]
+    instruments = ["clock", "ins", "increment", "measurement", "available", "reported"]
+    rng = np.random.default_rng(4)
+    other = task.begin(*drawn[:2])
+    assert set(truth + instruments) <= set(other._fields)
+    for k, (seen, state) in enumerate(states(task, drawn, lambda k, s: actions[k])):
+        false = {name: rng.normal(size=getattr(seen, name).shape) for name in truth}
+        read = {name: getattr(seen, name) for name in instruments}
+        other = task.predict(other._replace(**false, **read))
+        np.testing.assert_array_equal(task.observe(other), task.observe(seen))
+        other = task.act(other, actions[k])
+        np.testing.assert_array_equal(other.estimate, state.estimate)
+        np.testing.assert_array_equal(other.estimate_covariance, state.estimate_covariance)
+        assert (task.error(other) != task.error(state)).any()
+
+
+@pytest.mark.parametrize("control", TASK.controls)
+def test_lanes_at_different_times_do_not_disturb_each_other(control):
+    lanes, late = 8, 37
+    task = make("random", control)
+    drawn, actions = numbers(task, lanes, 120, 7), random_actions(task, lanes, 120, 7)
+    alone = [state for _, state in states(task, drawn, lambda k, s: actions[k])]
+    restarted = np.arange(lanes) % 2 == 1
+    state = task.begin(*drawn[:2])
+    for k in range(120):
+        if k == late:
+            fresh = task.begin(*drawn[:2])
+            state = type(state)(
+                *(np.where(restarted, new, old) for new, old in zip(fresh, state, strict=True))
+            )
+        row = np.where(restarted & (k >= late), drawn[2][k - late], drawn[2][k])
+        state = task.act(
+            task.measure(state, row), np.where(restarted & (k >= late), actions[k - late], actions[k])
+        )
+    for found, old, new in zip(state, alone[119], alone[119 - late], strict=True):
+        np.testing.assert_array_equal(found, np.where(restarted, new, old))
+
+
+@pytest.mark.parametrize("control", TASK.controls)
+def test_torch_equals_numpy(control):
+    lanes, steps = 8, 60
+    keywords = {"axes": 2, "outage_probability": 1.0, "outage_start": (0.1, 0.3), "jamming_probability": 1.0}
+    keywords |= {"spoofing_probability": 1.0, "change_start": (0.1, 0.4)}
+    task, twin = make("random", control, **keywords), make("random", control, xp_torch, **keywords)
+    drawn, actions = numbers(task, lanes, steps, 1), random_actions(task, lanes, steps, 1)
+    copies = (*(torch.from_numpy(x) for x in drawn[:2]), [torch.from_numpy(x) for x in drawn[2]])
+    run = states(task, drawn, lambda k, s: actions[k])
+    other = states(twin, copies, lambda k, s: torch.from_numpy(actions[k]))
+    for (seen, state), (seen_too, state_too) in zip(run, other, strict=True):
+        assert all(x.dtype == torch.float64 for x in state_too)
+        # The two libraries round exp, log and sin differently in the last place.
+        np.testing.assert_allclose(twin.observe(seen_too).numpy(), task.observe(seen), rtol=1e-10, atol=1e-12)
+        for a, b in zip(state, state_too, strict=True):
+            np.testing.assert_allclose(b.numpy(), a, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(twin.cost(state_too).numpy(), task.cost(state), rtol=1e-9, atol=1e-12)
+        for name, record in task.records(state).items():
+            np.testing.assert_allclose(twin.records(state_too)[name].numpy(), record, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("control", ["gain", "weights"])
+def test_the_cost_is_differentiable_in_the_actions(control):
+    lanes, steps = 2, 12
+    task, twin = make("random", control), make("random", control, xp_torch)
+    drawn = numbers(task, lanes, steps, 1)
+    actions = np.random.default_rng(0).uniform(0.1, 0.9, (steps, task.action_space.shape[0], lanes))
+
+    def total(values):
+        return sum(task.cost(s).sum() for _, s in states(task, drawn, lambda k, seen: values[k]))
+
+    copies = (*(torch.from_numpy(x) for x in drawn[:2]), [torch.from_numpy(x) for x in drawn[2]])
+    leaf = torch.from_numpy(actions.copy()).requires_grad_()
+    sum(twin.cost(s).sum() for _, s in states(twin, copies, lambda k, seen: leaf[k])).backward()
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        direction = rng.normal(size=actions.shape)
+        slope = (total(actions + 1e-5 * direction) - total(actions - 1e-5 * direction)) / 2e-5
+        # Central difference: its error is of the order of 1e-10 relative to the curvature.
+        assert slope == pytest.approx(float((leaf.grad.numpy() * direction).sum()), rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"white_intensity": -0.1}, "white_intensity must be a finite number at least 0"),
+        ({"receiver_intensity": 0.0}, "receiver_intensity must be a finite number above 0"),
+        ({"step": 2.0, "duration": 1.0}, r"step must be at most the duration of 1\.0 s, got 2\.0"),
+        ({"step": -0.01}, "step must be a finite number above 0"),
+        ({"axes": 4}, "axes must be 1, 2 or 3"),
+        ({"horizon": 0}, "horizon must be an integer"),
+        ({"coloured": 0.0, "white_intensity": 0.0}, "must not both be 0"),
+        ({"receiver_factor": (2.0, 1.0)}, "ascending order"),
+        ({"noise_changes": (1, 3)}, "at most 2"),
+        ({"unreported": 1.5}, "unreported must be"),
+        ({"outage_duration": 1.5}, "outage_duration must be 2 numbers"),
+        ({"fixed_drift": math.nan}, "fixed_drift must be a finite number"),
+    ],
+)
+def test_bad_parameters_are_refused_with_the_reason(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        LooselyCoupledNavigationParameters(**keywords)
+
+
+def test_parameters_from_json_and_duration():
+    assert LooselyCoupledNavigationParameters(drift_factor=[0.5, 2.0]).drift_factor == (0.5, 2.0)
+    assert LooselyCoupledNavigationParameters(duration=2.0, step=0.02).horizon == 100
+    with pytest.raises(ValueError, match="control must be one of"):
+        TASK(PAPER, "evidence")
+
+
+# --- The batched filter functions --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_augmented_covariance_against_matrices(library, seed):
+    rng = np.random.default_rng(seed)
+    s = loosely_coupled.sampling(0.7, 0.05)
+    Phi, Qd = linear_systems.van_loan(*loosely_coupled.error_model(0, 1.3, 0.7, 0.2)[:2], 0.05)
+    root = rng.normal(size=(3, 3))
+    P = root @ root.T
+    entries = [P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]]
+    lift = (
+        (lambda x: np.full(2, x))
+        if library == "numpy"
+        else (lambda x: torch.full((2,), x, dtype=torch.float64))
+    )
+    packed = loosely_coupled.AugmentedCovariance(*map(lift, entries))
+    coloured, white = (1.3 * s.coloured) ** 2, 0.2 * 0.05 + 1.3**2 * s.residual
+    predicted = loosely_coupled.predict_augmented(packed, s, coloured, white)
+    available = (
+        lift(1.0) * np.array([1.0, 0.0])
+        if library == "numpy"
+        else torch.tensor([1.0, 0.0], dtype=torch.float64)
+    )
+    gain, updated = loosely_coupled.update_augmented(predicted, lift(0.8), available)
+    naive = Phi @ P @ Phi.T + Qd
+    K = naive[:, 0] / (naive[0, 0] + 0.8)
+    rest = np.eye(3) - np.outer(K, [1, 0, 0])
+    joseph = rest @ naive @ rest.T + 0.8 * np.outer(K, K)
+    upper = np.triu_indices(3)
+    np.testing.assert_allclose([float(x[0]) for x in predicted], naive[upper], rtol=1e-11)
+    np.testing.assert_allclose([float(x[0]) for x in updated], joseph[upper], rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose([float(x[1]) for x in updated], naive[upper], rtol=1e-11)
+    np.testing.assert_allclose([float(x[0]) for x in gain], K, rtol=1e-11)
+    np.testing.assert_array_equal([float(x[1]) for x in gain], 0.0)
+
+
+def test_settled_gain_is_the_limit_of_the_recursion():
+    P = 0.0
+    for _ in range(2000):
+        P = P + 0.0036
+        gain = P / (P + 2.0)
+        P = loosely_coupled.update_variance(P, 2.0, gain)
+    assert loosely_coupled.settled_gain(0.0036, 2.0) == pytest.approx(gain, rel=1e-12)
+    # At first order in the step it is K step with K = sqrt(Ge / N).
+    fine = [loosely_coupled.settled_gain(0.36 * h, 0.02 / h) / h for h in (1e-3, 1e-4)]
+    np.testing.assert_allclose(fine, math.sqrt(18), rtol=3e-3)

@@ -1,0 +1,531 @@
+"""Policies, ideal filter, bound, metrics and reproduction of RadarEsmTracking."""
+
+import math
+
+import gymnasium
+import numpy
+import pytest
+from filtergym.baselines import evaluate, tidy_records
+from filtergym.baselines.bootstrap import Bootstrap
+from filtergym.baselines.evaluation import baselines_of
+from filtergym.baselines.policies import radar_esm_tracking as baselines
+from filtergym.baselines.reproductions import radar_esm_class_fusion as reproduction
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.lanes import Lanes
+
+import filtergym  # noqa: F401  # registers the environments
+
+ID = "filtergym/RadarEsmTracking-v0"
+WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}
+NEVER_REFUSED = {"association_error": 1e-12}
+
+
+# --- the paper's experiment at 20000 episodes
+
+
+@pytest.fixture(scope="module")
+def paper():
+    """The paper's algorithm on 20000 targets of any class."""
+    return evaluate(ID, ["quasi-optimal"], "paper", 20000, seed=2008).isel(policy=0)
+
+
+def root(mean_squares):
+    """Root of the mean, and its standard error."""
+    value = math.sqrt(mean_squares.mean())
+    return value, mean_squares.std() / math.sqrt(len(mean_squares)) / (2.0 * value)
+
+
+def test_errors_by_class(paper):
+    """Published RMSE (M = 20000) and its standard error, windows 0.5-10, 10-30 and 30-60 s."""
+    table = {
+        (0, 1): ((9.04, 0.02), (7.06, 0.02), (6.85, 0.01)),
+        (0, 2): ((2.83, 0.01), (1.33, 0.005), (1.29, 0.005)),
+        (1, 1): ((11.22, 0.02), (9.91, 0.02), (9.84, 0.01)),
+        (1, 2): ((6.06, 0.02), (4.17, 0.01), (4.12, 0.01)),
+        (2, 1): ((13.80, 0.02), (13.19, 0.02), (13.13, 0.01)),
+        (2, 2): ((13.46, 0.03), (11.75, 0.01), (11.72, 0.01)),
+    }
+    true_class = paper["true_class"].values[:, 0]
+    squares = paper["error"].values ** 2
+    for (s, component), row in table.items():
+        for (first, last), (expected, published) in zip(WINDOWS.values(), row, strict=True):
+            value, error = root(squares[true_class == s, first - 1 : last, component].mean(axis=1))
+            assert abs(value - expected) < 4.0 * math.hypot(error, published), (s, component, first, value)
+    for (first, last), expected in zip(WINDOWS.values(), (1091.0, 492.3, 325.3), strict=True):
+        value, error = root(squares[:, first - 1 : last, 0].mean(axis=1))
+        assert abs(value - expected) < 4.0 * error
+
+
+def test_recognition_by_class(paper):
+    table = (
+        (0.747, 0.862, 0.963, 0.996, 0.999),
+        (0.628, 0.738, 0.897, 0.980, 0.996),
+        (0.668, 0.785, 0.917, 0.985, 0.997),
+    )
+    true_class = paper["true_class"].values[:, 0]
+    for s, row in enumerate(table):
+        P = paper["true_class_probability"].values[true_class == s]
+        for second, expected in zip((2, 5, 10, 20, 30), row, strict=True):
+            at = P[:, 2 * second - 1]
+            # Published with M = 20000 and rounded to 0.001.
+            error = math.hypot(at.std() / math.sqrt(len(at)), at.std() / math.sqrt(20000)) + 0.0005
+            assert abs(at.mean() - expected) < 4.0 * error, (s, second, at.mean())
+        first = 0.5 * ((P >= 0.9).argmax(axis=1) + 1)
+        # On a grid of 0.5 s: the published quantile lies between neighbours of the measured one.
+        assert abs(numpy.median(first) - (4.0, 5.5, 4.0)[s]) <= 0.5
+        assert abs(numpy.quantile(first, 0.9) - (8.0, 12.5, 11.0)[s]) <= 0.5
+
+
+def test_calibration(paper):
+    """Classes and types drawn as assumed: mean square error over mean reported variance is 1."""
+    for i, component in enumerate(("range", "range_rate", "acceleration")):
+        for first, last in WINDOWS.values():
+            squares = paper["error"].values[:, first - 1 : last, i] ** 2
+            ratio = squares.mean() / paper[f"variance_{component}"].values[:, first - 1 : last].mean()
+            assert ratio == pytest.approx(1.0, abs=0.03)
+
+
+def test_one_sensor_alone():
+    """Published medians of the first P >= 0.9 by radar and by ESM alone, and mean P(true) by radar."""
+    dataset = evaluate(ID, ["radar-only", "esm-only"], "paper", 4000, seed=1)
+    for s, (radar, esm, at_10, at_60) in enumerate(
+        (((23.5), (4, 4), 0.641, 0.965), ((23.5), (6, 6), 0.492, 0.956), ((9.5), (6, 8), 0.706, 0.993))
+    ):
+        of = dataset["true_class"].values[0, :, 0] == s
+        P = dataset["true_class_probability"].sel(policy="radar-only").values[of]
+        first = numpy.where((P >= 0.9).any(axis=1), 0.5 * ((P >= 0.9).argmax(axis=1) + 1), math.inf)
+        # A quantile's standard error by the spread of order statistics.
+        low, high = numpy.quantile(
+            first, [0.5 - 2.0 / math.sqrt(len(first)), 0.5 + 2.0 / math.sqrt(len(first))]
+        )
+        assert low - 0.5 <= radar <= high + 0.5
+        for second, expected in ((10, at_10), (60, at_60)):
+            at = P[:, 2 * second - 1]
+            error = at.std() * math.sqrt(1.0 / len(at) + 1.0 / 20000) + 0.0005
+            assert abs(at.mean() - expected) < 4.0 * error
+        P = dataset["true_class_probability"].sel(policy="esm-only").values[of]
+        first = 0.5 * ((P >= 0.9).argmax(axis=1) + 1)
+        assert esm[0] <= numpy.median(first) <= esm[1]
+
+
+def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_its_repair():
+    dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 4000)
+    records = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
+    assert records["quasi-optimal", "sure_and_wrong", ""].low > 0.1
+    assert records["joint-type", "sure_and_wrong", ""].high < 0.02
+    cheaper = records["joint-type", "relative_cost_difference", ""]
+    assert cheaper.high < 0.0
+
+
+# --- exact errors
+
+
+@pytest.mark.parametrize("target", range(3))
+def test_non_adaptive_and_ideal_have_their_exact_errors(target):
+    dataset = evaluate(
+        ID, ["non-adaptive", "ideal", "known-class-bound"], "paper", 3000, true_class=f"S{target}"
+    )
+    p = make_task(ID, scenario="paper").parameters
+    for name, channel in (("non-adaptive", 2), ("ideal", target)):
+        exact = reproduction.exact_mean_squares(p, target, channel)
+        squares = dataset["error"].sel(policy=name).values ** 2
+        for i in range(3):
+            for first, last in WINDOWS.values():
+                value, error = root(squares[:, first - 1 : last, i].mean(axis=1))
+                assert abs(value - reproduction.rms(exact[i], (first, last))) < 4.0 * error
+    bound = dataset["mean_square"].sel(policy="known-class-bound").values[0].T
+    assert bound == pytest.approx(reproduction.exact_mean_squares(p, target, target), rel=1e-9)
+
+
+def test_exact_errors_after_a_minute():
+    """Published to 0.01 (range to 0.01 m), the columns being the filters of S0, S1, S2 on an S0 target."""
+    p = make_task(ID, scenario="paper").parameters
+    last = numpy.array([numpy.sqrt(reproduction.exact_mean_squares(p, 0, c)[:, -1]) for c in range(3)])
+    expected = [(279.77, 6.85, 1.29), (279.78, 8.71, 2.17), (279.79, 11.74, 5.86)]
+    assert last == pytest.approx(numpy.array(expected), abs=0.0055)
+
+
+# --- the ideal filter
+
+
+def played(task, estimator, seeds, decisions):
+    """States after the estimator's update, with the task's own before it."""
+    lanes = Lanes(task, len(seeds))
+    for lane, seed in enumerate(seeds):
+        lanes.seed(lane, numpy.random.default_rng(seed))
+    lanes.restart()
+    memory = estimator.start(lanes.state)
+    states = []
+
+    def update(state):
+        nonlocal memory
+        after, memory = estimator.update(state, memory)
+        states.append((state, after))
+        return after
+
+    for _ in range(decisions):
+        lanes.step(update)
+    return states
+
+
+def test_ideal_is_the_channel_of_the_true_class():
+    task = make_task(ID, scenario="random")
+    for before, after in played(task, baselines.Ideal(task), range(24), 120):
+        lane, true = numpy.arange(24), before.truth.target_class
+        # The channel's gains were computed in advance; 120 scans of rounding.
+        assert after.estimate == pytest.approx(before.bank.mean[:, true, lane], rel=1e-9, abs=1e-7)
+        reported = numpy.moveaxis(before.bank.covariance[:, :, true, lane], -1, 0)
+        assert numpy.moveaxis(after.estimate_covariance, -1, 0) == pytest.approx(reported, rel=1e-9)
+        squared = (before.bank.innovation[:, true, lane] ** 2).sum(axis=0)
+        assert task.records(after)["nis"] == pytest.approx(squared, rel=1e-7, abs=1e-9)
+
+
+def test_ideal_switches_its_model_at_the_change():
+    """Against a Kalman filter written out for each lane, which keeps state and covariance at the change."""
+    task = make_task(ID, scenario="class-change")
+    models, start = task.design_models(task.parameters)
+    H, R = models.H, models.R
+    states = played(task, baselines.Ideal(task), range(8), 120)
+    first = task.parameters.class_change[0]
+    for lane in range(8):
+        changes = 0
+        mean = covariance = None
+        governed = int(states[0][0].truth.target_class[lane])
+        for before, after in states:
+            z = before.measurement[:, lane]
+            if mean is None:
+                # Scan 0 taken back from the innovation of the channel of S2, to differ from the code under test.
+                Theta = (
+                    H @ (models.Phi[..., 2] @ start[..., 2] @ models.Phi[..., 2].T + models.Q[..., 2]) @ H.T
+                    + R
+                )
+                z0 = z - numpy.linalg.cholesky(Theta) @ before.bank.innovation[:, 2, lane]
+                mean, covariance = numpy.array([z0[0] - 0.5 * z0[1], z0[1], 0.0]), start[..., governed]
+            Phi = models.Phi[..., governed]
+            mean, P = Phi @ mean, Phi @ covariance @ Phi.T + models.Q[..., governed]
+            K = P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R)
+            mean, covariance = mean + K @ (z - H @ mean), P - K @ H @ P
+            assert after.estimate[:, lane] == pytest.approx(mean, rel=1e-8, abs=1e-6)
+            assert after.estimate_covariance[:, :, lane] == pytest.approx(covariance, rel=1e-6, abs=1e-6)
+            now = int(before.truth.target_class[lane])
+            if now != governed:
+                changes += 1
+                assert 0.5 * before.scan[lane] >= first
+            governed = now
+        assert changes == 1
+
+
+def test_ideal_does_not_depend_on_what_the_bank_does():
+    one = evaluate(ID, ["ideal"], "class-change", 20)
+    mixing = evaluate(ID, ["ideal"], "class-change", 20, class_transition=reproduction.leaking(0.05))
+    # Scan 0 is taken back from innovations that two formulas compute.
+    assert mixing["error"].values == pytest.approx(one["error"].values, rel=1e-7, abs=1e-6)
+
+
+def test_ideal_keeps_its_bound_where_the_class_changes():
+    dataset = evaluate(ID, ["ideal", "known-class-bound"], "class-change", 3000)
+    squares = dataset["error"].sel(policy="ideal").values ** 2
+    bound = dataset["mean_square"].sel(policy="known-class-bound").values
+    for i in range(3):
+        difference = (squares[..., i] - bound[..., i]).mean(axis=1)
+        assert abs(difference.mean()) < 4.0 * difference.std() / math.sqrt(3000)
+
+
+# --- policies
+
+
+def decided(task, policy, seeds, decisions):
+    """States after measurement and after the policy's action."""
+    lanes = Lanes(task, len(seeds))
+    for lane, seed in enumerate(seeds):
+        lanes.seed(lane, numpy.random.default_rng(seed))
+    lanes.restart()
+    for _ in range(decisions):
+        before = lanes.state
+        action, _ = policy.predict(lanes.observe())
+        after = []
+        lanes.step(
+            lambda state, a=action: task.act(state, a.T), lambda state, _, kept=after: kept.append(state)
+        )
+        yield before, after[0]
+
+
+@pytest.mark.parametrize(
+    ("cls", "arguments"),
+    [
+        (baselines.RadarOnly, {}), (baselines.EsmOnly, {}), (baselines.Ungated, {}), (baselines.JointType, {}),
+        (baselines.JointType, {"refused": 0.7, "esm": 0.4}), (baselines.Leaky, {}),
+        (baselines.Leaky, {"leak": 0.2, "esm": 0.3}),
+    ],
+)  # fmt: skip
+def test_weights_against_bayes_written_out(cls, arguments):
+    """Every lane's weights from the states, with products in place of sums of logarithms."""
+    task = make_task(ID, "weights", "crowded")
+    p = task.parameters
+    recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
+    pi = composition @ recognition
+    policy = cls(task, **arguments)
+    leak, esm = arguments.get("leak", 0.01), arguments.get("esm", 1.0)
+    q = numpy.array([[1.0 - leak if i == j else leak / 2.0 for j in range(3)] for i in range(3)])
+    radar, previous = numpy.ones((3, 16)), None
+    for before, after in decided(task, policy, range(16), 60):
+        likelihood = numpy.exp(before.bank.log_likelihood - before.bank.log_likelihood.max(axis=0))
+        radar = radar * likelihood
+        for n in range(16):
+            used, refused = before.used_counts[:, n], before.refused_counts[:, n]
+            if cls is baselines.RadarOnly:
+                P = radar[:, n]
+            elif cls is baselines.EsmOnly:
+                P = numpy.prod(pi**used, axis=1)
+            elif cls is baselines.Ungated:
+                P = radar[:, n] * numpy.prod(pi ** (used + refused), axis=1)
+            elif cls is baselines.JointType:
+                counts = esm * (used + arguments.get("refused", 0.0) * refused)
+                P = radar[:, n] * (composition @ numpy.prod(recognition**counts, axis=1))
+            else:
+                decision = int(before.intercept.decision[n])
+                factor = pi[:, decision] ** esm if before.intercept.used[n] else 1.0
+                last = before.bank.probabilities[:, n] if previous is None else previous[:, n]
+                P = ((last * likelihood[:, n]) @ q) * factor
+            # The observation compresses the logarithms; the last digits are lost.
+            assert after.bank.probabilities[:, n] == pytest.approx(P / P.sum(), rel=1e-9, abs=1e-13)
+        previous = after.bank.probabilities
+
+
+def test_the_printed_rule_by_weights_is_zero_evidence():
+    """Where nothing is refused, all decisions are those that (8) uses."""
+    dataset = evaluate(ID, ["quasi-optimal", "ungated"], "paper", 200, **NEVER_REFUSED)
+    assert dataset["error"][0].values == pytest.approx(dataset["error"][1].values, rel=1e-7, abs=1e-8)
+
+
+def test_most_probable_names_the_largest():
+    dataset = evaluate(ID, ["quasi-optimal", "most-probable"], "random", 50)
+    largest = dataset["mode_probability"].sel(policy="quasi-optimal").values.argmax(axis=-1)
+    named = dataset["mode_probability"].sel(policy="most-probable").values
+    assert (named.argmax(axis=-1) == largest).all()
+    assert (named.max(axis=-1) == 1.0).all()
+
+
+def test_policies_fit_other_numbers_of_classes_and_types():
+    two = {
+        "manoeuvrability": (0.03, 0.1), "acceleration_sigma": (3.0, 20.0), "prior": (0.3, 0.7),
+        "recognition": ((0.9, 0.1), (0.0, 1.0)), "composition": ((0.8, 0.2), (0.1, 0.9)),
+        "class_transition": ((1.0, 0.0), (0.0, 1.0)),
+    }  # fmt: skip
+    dataset = evaluate(ID, list(baselines_of(ID).names), "random", 4, horizon=20, **two)
+    assert numpy.isfinite(dataset["cost"].values[:-1]).all()
+
+
+# --- no leak: what is optimal is not beaten
+
+
+def significance(dataset, name, optimum):
+    """Mean cost above the optimum's on the same episodes, in standard errors."""
+    cost = dataset["cost"].mean("time")
+    difference = (cost.sel(policy=name) - cost.sel(policy=optimum)).values
+    return difference.mean() / (difference.std() / math.sqrt(len(difference)) + 1e-300)
+
+
+def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
+    """Types redrawn, nothing refused: posterior weights minimise the mean square error."""
+    names = [name for name in baselines_of(ID).policies if name != "ungated"]
+    dataset = evaluate(ID, names, "paper", 1500, **NEVER_REFUSED)
+    for name in names:
+        assert significance(dataset, name, "quasi-optimal") > -3.0, name
+
+
+def test_refused_decisions_are_all_that_can_be_won_on_paper():
+    """The agent is shown them; with one emitter they are as good as any, and nothing beats using them."""
+    names = ["ungated", "quasi-optimal", "joint-type", "leaky", "radar-only"]
+    dataset = evaluate(ID, names, "paper", 4000)
+    for name in names[1:]:
+        assert significance(dataset, name, "ungated") > 3.0, name
+
+
+def test_nothing_beats_the_joint_posterior_for_one_type():
+    names = [name for name in baselines_of(ID).policies if name != "ungated"]
+    dataset = evaluate(ID, names, "fixed-type", 1500, **NEVER_REFUSED)
+    for name in names:
+        assert significance(dataset, name, "joint-type") > -3.0, name
+
+
+def test_nothing_beats_the_ideal_filter():
+    names = [*baselines_of(ID).policies, "ideal"]
+    for scenario in ("paper", "class-change"):
+        dataset = evaluate(ID, names, scenario, 600)
+        for name in names:
+            assert significance(dataset, name, "ideal") > -3.0, name
+
+
+# --- metrics
+
+
+@pytest.fixture(scope="module")
+def records():
+    dataset = evaluate(ID, ["quasi-optimal", "ideal", "known-class-bound"], "class-change", 300, seed=4)
+    found = {(r.policy, r.metric, r.component, r.window): r for r in tidy_records(dataset)}
+    return dataset.sel(policy="quasi-optimal"), found
+
+
+def test_metrics_follow_from_the_dataset(records):
+    run, found = records
+    true, P = run["true_class"].values.astype(int), run["true_class_probability"].values
+    assert (run["mode_probability"].values[..., 0][true == 0] == P[true == 0]).all()
+
+    def value(metric, component, window):
+        return found["quasi-optimal", metric, component, window].value
+
+    squares = run["error"].values ** 2
+    late = numpy.zeros(true.shape, dtype=bool)
+    late[:, 59:120] = True
+    for s in range(3):
+        expected = math.sqrt(squares[..., 1][late & (true == s)].mean())
+        assert value("rmse_by_class", f"range_rate S{s}", "late") == pytest.approx(expected, rel=1e-9)
+        expected = P[true[:, 19] == s, 19].mean()
+        assert value("mean_true_class_probability", f"S{s}", "10 s") == pytest.approx(expected, rel=1e-9)
+    assert value("mean_true_class_probability", "", "60 s") == pytest.approx(P[:, 119].mean(), rel=1e-9)
+    ratio = squares[:, :20, 2].mean() / run["variance_acceleration"].values[:, :20].mean()
+    assert value("calibration_ratio", "acceleration", "early") == pytest.approx(ratio, rel=1e-9)
+    probability = run["mode_probability"].values
+    excess = (probability.max(-1) - (probability.argmax(-1) == true)).mean()
+    assert value("confidence_excess", "", "all") == pytest.approx(excess, rel=1e-9)
+    wrong = [
+        max(row[s] for s in range(3) if s != t) >= 0.9
+        for row, t in zip(probability[:, -1], true[:, -1], strict=True)
+    ]
+    assert value("sure_and_wrong", "", "60 s") == pytest.approx(numpy.mean(wrong), rel=1e-9)
+
+    first, after_change = [], []
+    for lane in range(len(true)):
+        change = next(k for k in range(120) if true[lane, k] != true[lane, 0])
+        first.append(next((0.5 * (k + 1) for k in range(change) if P[lane, k] >= 0.9), math.inf))
+        after_change.append(
+            next((0.5 * (k - change) for k in range(change, 120) if P[lane, k] >= 0.9), math.inf)
+        )
+    for name, times in (("time_to_recognise", first), ("time_to_recognise_change", after_change)):
+        for suffix, rank in (("median", 149), ("90_quantile", 269)):
+            quantile = sorted(times)[rank]
+            # None where the quantile lies among the runs that never got there.
+            expected = quantile if math.isfinite(quantile) else None
+            assert value(f"{name}_{suffix}", "", "all") == expected
+        assert value(f"{name}_censored", "", "all") == pytest.approx(numpy.isinf(times).mean(), rel=1e-9)
+
+
+def test_metrics_of_the_ideal_filter_and_of_a_bound(records):
+    _, found = records
+    assert found["ideal", "mean_true_class_probability", "", "60 s"].value == 1.0
+    assert found["ideal", "sure_and_wrong", "", "60 s"].value == 0.0
+    nis = found["ideal", "nis", "measurement", "all"]
+    assert nis.low < 2.0 < nis.high
+    assert not [key for key in found if key[0] == "known-class-bound" and key[1] == "calibration_ratio"]
+
+
+def test_time_quantile_is_the_order_statistic_and_knows_the_censored():
+    rng = numpy.random.default_rng(0)
+    first = rng.integers(0, 13, 101)  # 12 is "never"
+    chosen = rng.random(101) < 0.7
+    seconds = 0.5 * numpy.arange(1, 13)
+    times = numpy.sort(numpy.append(seconds, math.inf)[first[chosen]])
+    for share in (0.1, 0.5, 0.9):
+        estimate = baselines.time_quantile(Bootstrap(101), first, chosen, seconds, share)
+        assert estimate.value == times[math.ceil(share * len(times)) - 1]
+    assert baselines.time_quantile(Bootstrap(101), first, chosen, seconds, 0.999).value == math.inf
+
+
+def test_short_runs_report_what_they_reach():
+    dataset = evaluate(ID, ["quasi-optimal"], "paper", 20, horizon=12, true_class="S1")
+    windows = {r.window for r in tidy_records(dataset) if r.metric == "mean_true_class_probability"}
+    assert windows == {"2 s", "5 s"}
+    components = {r.component for r in tidy_records(dataset) if r.metric == "sure_and_wrong"}
+    assert components == {"", "S1"}
+
+
+# --- bad input
+
+
+@pytest.mark.parametrize(
+    ("keywords", "reason"),
+    [
+        ({"composition": [[0.5, 0.5, 0.5, 0.0]] * 3}, r"composition\[0\] must sum to 1"),
+        ({"association_error": 1.2}, "association_error must be .* below 1.0, got 1.2"),
+        ({"true_class": "S7"}, "true_class must be one of 'random', 'S0', 'S1', 'S2', got 'S7'"),
+        ({"class_change": (0.5, 20.0)}, r"class_change\[0\] must be .* above 0.5, got 0.5"),
+        ({"scenario": "fixed_type"}, "did you mean 'fixed-type'"),
+        ({"control": "gain"}, "unknown control 'gain'"),
+        ({"range_scale": 0.0}, "range_scale must be .* above 0"),
+    ],
+)
+def test_environment_refuses_bad_input_with_the_reason(keywords, reason):
+    with pytest.raises(ValueError, match=reason):
+        gymnasium.make(ID, **keywords)
+
+
+# --- the reproduction
+
+
+@pytest.fixture(scope="module")
+def reproduced():
+    done = []
+    return reproduction.reproduce(done.append, 400), done
+
+
+def test_reproduction_reports_its_progress(reproduced):
+    assert sum(reproduced[1]) == pytest.approx(reproduction.STEPS)
+
+
+def test_reproduction_has_a_verdict_for_every_claim_and_four_figures(reproduced):
+    result = reproduced[0]
+    verdicts = {claim.key: claim.verdict for claim in result.claims}
+    assert {key: verdicts[key] for key in ("D1, one type for each target", "D3", "D4")} == {
+        "D1, one type for each target": "not reproduced",
+        "D3": "reproduced",
+        "D4": "reproduced in part",
+    }
+    assert {f"figure_{i}" for i in range(1, 5)} <= {name[:8] for name in result.figures}
+    assert set(result.captions) == set(result.figures)
+    for table in result.tables:
+        assert {len(row) for row in table.rows} == {len(table.header)}
+
+
+def test_recognition_verdict():
+    measured = reproduction.Measured
+    good, bad = measured(0.999, 0.001), measured(0.9, 0.001)
+    assert reproduction.recognition_verdict([good, good, good]) == "reproduced"
+    assert reproduction.recognition_verdict([good, bad, good]) == "reproduced in part"
+    assert reproduction.recognition_verdict([bad, bad, bad]) == "not reproduced"
+    # Not certain enough.
+    assert reproduction.recognition_verdict([measured(0.991, 0.001)] * 3) == "not reproduced"
+
+
+def test_reproduction_refuses_too_few_episodes():
+    with pytest.raises(ValueError, match="at least 100"):
+        reproduction.reproduce(lambda _: None, 5)
+
+
+# --- the picture
+
+
+def test_picture_shows_accelerations_decisions_and_the_change():
+    from filtergym.envs.environment import TaskEnv
+
+    world = TaskEnv(ID, "weights", "class-change", render_mode="rgb_array")
+    world.reset(seed=2)
+    for _ in range(100):
+        world.step(numpy.ones(3))
+    drawn = world.picture
+    frame = world.render()
+    history = {name: numpy.array(values) for name, values in drawn.history.items()}
+    panels = drawn.picture
+    numpy.testing.assert_array_equal(panels.true.get_ydata(), history["true"])
+    numpy.testing.assert_allclose(
+        panels.estimate.get_ydata() - history["true"], history["error.acceleration"]
+    )
+    used, refused = (numpy.isfinite(history[name]) for name in ("used", "refused"))
+    assert not (used & refused).any()
+    assert (numpy.flatnonzero(used | refused) % 4 == 3).all()
+    assert (used | refused).any()
+    change = int(numpy.flatnonzero(numpy.diff(history["true_class"]))[0]) + 2
+    assert panels.shaded() == [(change - 0.5, 120.5)]
+    world.reset(seed=3)
+    assert (world.render() != frame).any()
+    world.close()

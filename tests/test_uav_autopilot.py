@@ -1,0 +1,541 @@
+import math
+from typing import Any
+
+import array_api_compat.torch
+import numpy
+import pytest
+import torch
+from filtergym.envs.task import Scenario
+from filtergym.envs.tasks.uav_autopilot import COORDINATES, State, UavAutopilot, UavAutopilotParameters
+from filtergym.filters import gaussian, linear_systems
+
+BOTH = pytest.mark.parametrize("plant", ["P", "U"])
+
+
+def make(
+    plant: str = "U", scenario: str = "random", control: str = "gain", xp: Any = numpy, **kw: Any
+) -> UavAutopilot:
+    chosen: Scenario = UavAutopilot.scenarios[scenario]
+    return UavAutopilot(UavAutopilotParameters(**{**chosen.parameters, "plant": plant, **kw}), control, xp)
+
+
+class Noise:
+    """What the engine will hand to the task."""
+
+    def __init__(self, task: UavAutopilot, N: int, seed: int, steps: int) -> None:
+        rng = numpy.random.default_rng(seed)
+        self.uniforms = rng.random((task.noise.uniforms, N))
+        self.initial = rng.standard_normal((task.noise.initial_normals, N))
+        self.rows = rng.standard_normal((steps, task.noise.normals, N))
+
+
+def begin(task: UavAutopilot, noise: Noise) -> State:
+    return task.measure(task.begin(noise.uniforms, noise.initial), noise.rows[0])
+
+
+def actions(task: UavAutopilot, seed: int, steps: int, N: int) -> numpy.ndarray:
+    rng = numpy.random.default_rng(seed)
+    if task.control == "gain":
+        return rng.uniform(-1.2, 1.2, (steps, 1, N))
+    return rng.integers(0, 3, (steps, N))
+
+
+# ---------------------------------------------------------------- design: the numbers of the reference tables
+
+
+def theory(plant: str, feedback: str, **kw: Any) -> tuple[float, float, float]:
+    d = make(plant, "paper-noise", **kw).design
+    F, B, L, H, R = d.model.F, d.model.B, d.feedback, d.H, d.R
+    Q, n = d.model.scaled_noise + d.model.other_noise, len(d.model.F)
+    output = [c.name for c in COORDINATES[plant]].index({"P": "position", "U": "pitch"}[plant])
+    if feedback == "true":
+        X = linear_systems.stationary_covariance(F - B @ L, Q)
+        u = (L @ X @ L.T)[0, 0]
+    elif feedback == "filter":
+        both = linear_systems.stationary_covariance(
+            *linear_systems.estimate_feedback_loop(F, B, H, L, d.steady.gain, Q, R)
+        )
+        X, estimate = both[:n, :n], numpy.hstack([L, -L])
+        u = (estimate @ both @ estimate.T)[0, 0]
+    else:
+        X = linear_systems.stationary_covariance(*linear_systems.measurement_feedback_loop(F, B, H, L, Q, R))
+        raw = L @ H.T
+        u = (raw @ (H @ X @ H.T + R) @ raw.T)[0, 0]
+    return X[output, output], u, numpy.trace(d.weight @ X) + d.control_weight * u
+
+
+TABLE = [
+    ("P", "true", {}, 0.00442, 0.01279, 0.0216),
+    ("P", "filter", {}, 0.26674, 0.06275, 0.3850),
+    ("P", "raw", {}, 0.32622, 3.8538, 4.504),
+    ("P", "filter", {"sensors": ("position",)}, 0.31021, 0.07145, 0.4461),
+    ("U", "true", {}, 0.01349, 0.18205, 0.0788),
+    ("U", "filter", {}, 0.05410, 0.24467, 0.1599),
+    ("U", "raw", {}, 0.06275, 1.1424, 0.4447),
+]
+
+
+@pytest.mark.parametrize(("plant", "feedback", "kw", "output", "control", "cost"), TABLE)
+def test_theory_of_the_reference_table(
+    plant: str, feedback: str, kw: dict[str, Any], output: float, control: float, cost: float
+) -> None:
+    found = theory(plant, feedback, **kw)
+    for value, expected in zip(found, (output, control, cost), strict=True):
+        digits = len(f"{expected}".split(".")[1])
+        # The table is printed; half a unit of its last digit, or 1e-4 relative where that is more.
+        assert value == pytest.approx(expected, rel=1e-4, abs=0.55 * 10.0**-digits)
+
+
+def test_raw_position_alone_cannot_fly() -> None:
+    d = make("P", "paper-noise", sensors=("position",)).design
+    Q = d.model.scaled_noise
+    loop = linear_systems.measurement_feedback_loop(d.model.F, d.model.B, d.H, d.feedback, Q, d.R)
+    assert linear_systems.spectral_radius(loop.transition) == pytest.approx(1.0125, abs=5e-5)
+
+
+def test_design_of_plant_p() -> None:
+    d = make("P").design
+    numpy.testing.assert_allclose(d.feedback, [[0.80578, 1.50361]], atol=5e-6)
+    numpy.testing.assert_allclose(d.steady.gain, [[0.12827, 0.03835], [0.03835, 0.02641]], atol=5e-6)
+    numpy.testing.assert_allclose(numpy.sqrt(numpy.diag(d.steady.posterior)), [0.35815, 0.16252], atol=5e-6)
+    control = numpy.linalg.eigvals(d.model.F - d.model.B @ d.feedback)
+    numpy.testing.assert_allclose([control[0].real, abs(control[0].imag)], [0.7995, 0.1007], atol=5e-5)
+    filter_pole = d.steady.poles[0]
+    numpy.testing.assert_allclose([filter_pole.real, abs(filter_pole.imag)], [0.9179, 0.0690], atol=5e-5)
+    one = make("P", sensors=("position",)).design.steady
+    numpy.testing.assert_allclose(one.gain[:, 0], [0.14621, 0.04620], atol=5e-6)
+    numpy.testing.assert_allclose(numpy.sqrt(numpy.diag(one.posterior)), [0.38238, 0.17435], atol=5e-6)
+
+
+def test_design_of_plant_u() -> None:
+    d = make("U").design
+    numpy.testing.assert_allclose(d.feedback, [[0.88253, -0.34716, -1.63714, 0.51561, 0.83282]], atol=6e-6)
+    assert d.feedforward == pytest.approx(-1.63714, abs=5e-6)
+    poles = numpy.sort_complex(numpy.log(numpy.linalg.eigvals(d.model.F)) / 0.02)
+    # The logarithm of the integrator's pole: rounding of one over T.
+    numpy.testing.assert_allclose(poles, [-20, -1.909 - 5.070j, -1.909 + 5.070j, -0.7, 0], atol=6e-4)
+
+
+@BOTH
+def test_poles_of_the_loop_are_those_of_control_and_filter(plant: str) -> None:
+    d = make(plant).design
+    assert linear_systems.separation_defect(d.model.F, d.model.B, d.H, d.feedback, d.steady.gain) < 1e-12
+
+
+@BOTH
+def test_discrete_model_agrees_with_finite_differences_of_the_equations_of_motion(plant: str) -> None:
+    if plant == "P":
+        A, b, T = numpy.array([[0.0, 1.0], [0.0, 0.0]]), numpy.array([0.0, 1.0]), 0.25
+    else:
+        A = numpy.diag([-3.1194, -0.6984, 0.0, -20.0, -0.7])
+        A[0, [1, 3, 4]] = 1.0, 0.3255, -3.1194
+        A[1, [0, 3, 4]] = -27.168, -35.748, -27.168
+        A[2, 1] = 1.0
+        b, T = numpy.array([0.0, 0.0, 0.0, 20.0, 0.0]), 0.02
+    model = make(plant).design.model
+    x, u, steps = numpy.ones(len(A)), 2.0, 4000
+    expected = model.F @ x + model.B[:, 0] * u
+    for _ in range(steps):  # midpoint rule: error of order (T / 4000)^2
+        middle = x + T / steps / 2 * (A @ x + b * u)
+        x = x + T / steps * (A @ middle + b * u)
+    # Coefficients in the table have five digits.
+    numpy.testing.assert_allclose(x, expected, rtol=0, atol=1e-4)
+
+
+# ---------------------------------------------------------------- the task against a plain loop
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("control", ["gain", "mode"])
+@BOTH
+def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, seed: int) -> None:
+    steps, N = 60, 8
+    task = make(
+        plant,
+        "random",
+        control,
+        dropout_period=50,
+        disturbance_times=((10, 20), (30, 40)),
+        sensor_times=((10, 50),),
+    )
+    noise, a = Noise(task, N, seed, steps + 1), actions(task, seed, steps, N)
+    d = task.design
+    F, B, H, R, L = d.model.F, d.model.B[:, 0], d.H, d.R, d.feedback[0]
+    Q = d.model.scaled_noise + d.model.other_noise
+    state = begin(task, noise)
+    lane = seed
+    x, P, scale, raw = (
+        numpy.zeros(len(F)),
+        numpy.diag(numpy.square(task.parameters.value("initial_sigmas"))),
+        1.0,
+        None,
+    )
+    held, dropped, u = numpy.zeros(len(H)), 0, 0.0
+    for k in range(steps):
+        x, P = F @ x + B * u, F @ P @ F.T
+        rows = state.available[:, lane] > 0
+        dropped += int((~rows).sum())
+        held[rows] = state.measurement[rows, lane]
+        shown = numpy.zeros(len(H))
+        S = H @ (P + scale * Q) @ H.T + R
+        shown[rows] = ((held - H @ x) / numpy.sqrt(numpy.diag(S)))[rows]
+        # A covariance of five states, packed against full, over 60 steps.
+        numpy.testing.assert_allclose(state.innovation[:, lane], shown, rtol=0, atol=1e-9)
+        if rows.any():
+            nu = (held - H @ x)[rows]
+            nis = nu @ numpy.linalg.solve(S[numpy.ix_(rows, rows)], nu) / rows.sum()
+            assert state.nis[lane] == pytest.approx(nis, rel=1e-9)
+        choice = a[k][..., lane]
+        scale = 100.0 ** numpy.clip(choice[0], -1, 1) if control == "gain" else 100.0 if choice == 1 else 1.0
+        P = P + scale * Q
+        K = P @ H[rows].T @ numpy.linalg.inv(H[rows] @ P @ H[rows].T + R[numpy.ix_(rows, rows)])
+        x = x + K @ (held - H @ x)[rows]
+        rest = numpy.eye(len(F)) - K @ H[rows]
+        P = rest @ P @ rest.T + K @ R[numpy.ix_(rows, rows)] @ K.T
+        raw = control == "mode" and choice == 2
+        state = task.act(state, a[k])
+        estimate = H.T @ held if raw else x
+        numpy.testing.assert_allclose(state.estimate[:, lane], estimate, rtol=0, atol=1e-9)
+        if not raw:
+            numpy.testing.assert_allclose(task.covariance(state)[..., lane], P, rtol=1e-9, atol=1e-9)
+        u = d.feedforward * state.command[lane] - L @ estimate
+        truth = state.truth[:, lane].copy()
+        truth[task.output] -= state.command[lane]
+        cost = (truth @ d.weight @ truth + d.control_weight * u**2) / task.cost_unit
+        assert task.cost(state)[lane] == pytest.approx(cost, rel=1e-9)
+        numpy.testing.assert_allclose(
+            task.error(state)[:, lane], estimate - state.truth[:, lane], rtol=0, atol=1e-9
+        )
+        state = task.measure(state, noise.rows[k + 1])
+        assert state.control[lane] == pytest.approx(u, abs=1e-9)
+    assert dropped > 0
+
+
+@BOTH
+def test_truth_follows_from_the_control_and_noise_covariances_are_those_stated(plant: str) -> None:
+    task = make(plant, "gust-front", disturbance_times=((2, 2),), command_amplitude=(0.0, 0.0))
+    noise = Noise(task, 80_000, 1, 2)
+    before = task.begin(noise.uniforms, noise.initial)
+    d = task.design
+    for level in (1.0, 4.0):
+        after = task.measure(before, noise.rows[int(level > 1)])
+        w = after.truth - d.true_model.F @ before.truth - d.true_model.B * after.control
+        Q = level**2 * d.true_model.scaled_noise + d.true_model.other_noise
+        sigma = numpy.sqrt(numpy.diag(Q))
+        # Five standard errors of a sample covariance of 80 000.
+        numpy.testing.assert_allclose(
+            w @ w.T / 80_000 / numpy.outer(sigma, sigma), Q / numpy.outer(sigma, sigma), rtol=0, atol=0.025
+        )
+        v = (after.measurement - d.H @ after.truth) / numpy.sqrt(numpy.diag(d.R))[:, None]
+        numpy.testing.assert_allclose(v @ v.T / 80_000, numpy.eye(len(d.R)), rtol=0, atol=0.025)
+        before = task.act(after, numpy.zeros((1, 80_000)))
+
+
+# ---------------------------------------------------------------- Monte Carlo of the reference table
+
+
+@pytest.mark.parametrize(("plant", "feedback", "kw", "output", "control", "cost"), TABLE)
+def test_monte_carlo_of_the_reference_table(
+    plant: str, feedback: str, kw: dict[str, Any], output: float, control: float, cost: float
+) -> None:
+    N, burn, steps = 200, 200, 300
+    task = make(plant, "paper-noise", "mode", horizon=burn + steps, **kw)
+    noise = Noise(task, N, 7, burn + steps + 1)
+    state, action = begin(task, noise), numpy.full(N, 2 if feedback == "raw" else 0)
+    sums = numpy.zeros((5, N))
+    n, m = task.covariance(state).shape[0], len(task.sensors)
+    for k in range(burn + steps):
+        shown = state.nis
+        state = task.act(state, action)
+        if feedback == "true":
+            state = state._replace(estimate=state.truth)
+        if k >= burn:
+            _, nees = gaussian.log_density(task.error(state), task.covariance(state))
+            record = task.records(state)
+            sums += numpy.stack(
+                [
+                    record["output"] ** 2,
+                    record["control_signal"] ** 2,
+                    task.cost(state) * task.cost_unit,
+                    nees / n,
+                    shown,
+                ]
+            )
+        state = task.measure(state, noise.rows[k + 1])
+    runs = sums / steps
+    expected = [output, control, cost] + ([1.0, 1.0] if feedback == "filter" else [])
+    for values, value in zip(runs, expected, strict=False):
+        assert abs(values.mean() - value) < 4 * values.std(ddof=1) / math.sqrt(N)
+    assert m == len(task.design.R)
+
+
+@pytest.mark.parametrize(
+    ("plant", "overshoot", "rise", "settling"), [("P", 0.0045, 3.5, 4.0), ("U", 0.0, 0.46, 0.54)]
+)
+def test_step_of_the_command(plant: str, overshoot: float, rise: float, settling: float) -> None:
+    task = make(plant, "paper-step", step_time=1, horizon=100)
+    noise = Noise(task, 8, 0, 101)
+    noise.rows[:] = 0.0
+    noise.initial[:] = 0.0
+    state, outputs = begin(task, noise), []
+    for k in range(100):
+        outputs.append(task.records(state)["output"][0])
+        state = task.measure(task.act(state, numpy.zeros((1, 8))), noise.rows[k + 1])
+    y, T = numpy.array(outputs), task.parameters.value("sampling_interval")
+    assert max(y.max() - 1.0, 0.0) == pytest.approx(overshoot, abs=5e-5)
+    assert numpy.argmax(y >= 0.9) * T == pytest.approx(rise)
+    assert (numpy.flatnonzero(abs(y - 1.0) > 0.05)[-1] + 1) * T == pytest.approx(settling)
+    assert y[-1] == pytest.approx(1.0, abs=1e-3)
+
+
+@BOTH
+def test_mean_output_after_a_unit_step_in_noise_is_one(plant: str) -> None:
+    N = 200
+    task = make(plant, "paper-step", step_time=1, horizon=400)
+    noise = Noise(task, N, 3, 401)
+    state, total = begin(task, noise), numpy.zeros(N)
+    for k in range(400):
+        state = task.act(state, numpy.zeros((1, N)))
+        total += task.records(state)["output"] * (k >= 150)
+        state = task.measure(state, noise.rows[k + 1])
+    mean = total / 250
+    assert abs(mean.mean() - 1.0) < 4 * mean.std(ddof=1) / math.sqrt(N)
+
+
+# ---------------------------------------------------------------- the contract
+
+
+@pytest.mark.parametrize("control", ["gain", "mode"])
+@BOTH
+def test_shapes_names_and_finiteness_in_every_scenario(plant: str, control: str) -> None:
+    for name in UavAutopilot.scenarios:
+        if plant == "P" and name == "actuator-lag":
+            continue
+        task = make(plant, name, control)
+        noise = Noise(task, 8, 0, 41)
+        state, a = begin(task, noise), actions(task, 1, 40, 8)
+        for k in range(40):
+            observation = task.observe(state)
+            assert observation.shape == (len(task.fields), 8)
+            assert observation.dtype == numpy.float64
+            assert numpy.isfinite(observation).all()
+            state = task.act(state, a[k])
+            n = len(task.components)
+            assert task.error(state).shape == (n, 8)
+            assert task.covariance(state).shape == (n, n, 8)
+            assert (numpy.linalg.eigvalsh(numpy.moveaxis(task.covariance(state), -1, 0)) > 0).all()
+            assert (task.cost(state) >= 0).all()
+            state = task.measure(state, noise.rows[k + 1])
+        assert all(array.shape[-1] == 8 for array in state)
+        assert len({f.name for f in task.fields}) == len(task.fields)
+
+
+@pytest.mark.parametrize("control", ["gain", "mode"])
+@BOTH
+def test_observation_is_recomputed_from_the_measurements_alone(plant: str, control: str) -> None:
+    """Two different truths, sensor noise chosen so that the readings agree: the agent sees the same."""
+    N, steps = 8, 80
+    task = make(plant, "random", control, dropout_period=75)
+    noise, other, a = Noise(task, N, 0, steps + 1), Noise(task, N, 1, steps + 1), actions(task, 0, steps, N)
+    drives = task.noise.normals - len(task.sensors)
+    one = task.begin(noise.uniforms, noise.initial)
+    two = one._replace(truth=5.0 * other.initial, level=3.0 * one.level, levels=3.0 * one.levels)
+    sigmas = numpy.array(task.parameters.value("sensor_sigmas"))[:, None]
+    for k in range(steps):
+        one = task.measure(one, noise.rows[k])
+        drive = other.rows[k].copy()
+        drive[drives:] = 0.0
+        trial = task.measure(two, drive)
+        wanted = task.design.H @ one.truth + sigmas * one.sensor_level * noise.rows[k][drives:]
+        drive[drives:] = (wanted - task.design.H @ trial.truth) / (sigmas * trial.sensor_level)
+        two = task.measure(two, drive)
+        assert numpy.abs(one.truth - two.truth).max() > 0.1
+        # The readings agree to rounding, amplified by the filter for 80 steps.
+        numpy.testing.assert_allclose(task.observe(one), task.observe(two), rtol=0, atol=1e-9)
+        one, two = task.act(one, a[k]), task.act(two, a[k])
+        numpy.testing.assert_allclose(one.estimate, two.estimate, rtol=0, atol=1e-9)
+
+
+@BOTH
+def test_noise_does_not_depend_on_the_actions_but_the_truth_does(plant: str) -> None:
+    task = make(plant)
+    noise = Noise(task, 8, 0, 31)
+    low, high = begin(task, noise), begin(task, noise)
+    B, F = task.design.true_model.B, task.design.true_model.F
+    for k in range(30):
+        low, high = task.act(low, numpy.full((1, 8), -1.0)), task.act(high, numpy.full((1, 8), 1.0))
+        previous = low.truth, high.truth
+        low, high = task.measure(low, noise.rows[k + 1]), task.measure(high, noise.rows[k + 1])
+        w = [s.truth - F @ x - B * s.control for s, x in zip((low, high), previous, strict=True)]
+        numpy.testing.assert_allclose(w[0], w[1], rtol=0, atol=1e-11)
+        numpy.testing.assert_array_equal(low.available, high.available)
+        numpy.testing.assert_array_equal(low.command, high.command)
+    controlled = slice(0, 4 if plant == "U" else 2)  # nothing moves the gust
+    assert numpy.abs(low.truth - high.truth)[controlled].min() > 1e-6
+
+
+def test_lanes_at_different_times_and_batch_widths() -> None:
+    task = make("U")
+    noise = Noise(task, 16, 0, 61)
+    wide = begin(task, noise)
+    narrow = Noise(task, 16, 0, 61)
+    narrow.uniforms, narrow.initial, narrow.rows = (
+        a[..., :8] for a in (noise.uniforms, noise.initial, noise.rows)
+    )
+    small, a = begin(task, narrow), actions(task, 0, 60, 16)
+    for k in range(60):
+        if k == 30:  # lanes 8 to 15 start again
+            fresh = begin(task, noise)
+            lane = numpy.arange(16) >= 8
+            wide = State(*(numpy.where(lane, f, w) for f, w in zip(fresh, wide, strict=True)))
+        wide = task.measure(task.act(wide, a[k]), noise.rows[k + 1])
+        small = task.measure(task.act(small, a[k][:, :8]), narrow.rows[k + 1])
+    for w, s in zip(wide, small, strict=True):
+        numpy.testing.assert_array_equal(w[..., :8], s)
+
+
+def test_mode_nominal_is_gain_zero_and_wide_band_is_gain_one_bit_for_bit_or_nearly() -> None:
+    for mode, gain, tolerance in ((0, 0.0, 0.0), (1, 1.0, 1e-10)):
+        by_mode, by_gain = make("U", control="mode"), make("U", control="gain")
+        noise = Noise(by_mode, 8, 0, 51)
+        a, b = begin(by_mode, noise), begin(by_gain, noise)
+        for k in range(50):
+            a, b = (
+                by_mode.act(a, numpy.full(8, mode)),
+                by_gain.act(b, numpy.full((1, 8), gain, numpy.float32)),
+            )
+            numpy.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=tolerance)
+            a, b = by_mode.measure(a, noise.rows[k + 1]), by_gain.measure(b, noise.rows[k + 1])
+
+
+def test_action_beyond_the_box_is_the_action_at_its_edge() -> None:
+    task = make("U")
+    state = begin(task, Noise(task, 8, 0, 1))
+    for array, limit in zip(
+        task.act(state, numpy.full((1, 8), 9.0)), task.act(state, numpy.ones((1, 8))), strict=True
+    ):
+        numpy.testing.assert_array_equal(array, limit)
+
+
+@pytest.mark.parametrize("control", ["gain", "mode"])
+@BOTH
+def test_torch_gives_the_same_roll_out(plant: str, control: str) -> None:
+    steps, N = 40, 8
+    plain, tensor = make(plant, control=control), make(plant, control=control, xp=array_api_compat.torch)
+    noise, a = Noise(plain, N, 2, steps + 1), actions(plain, 2, steps, N)
+    one = begin(plain, noise)
+    two = tensor.measure(
+        tensor.begin(*map(torch.asarray, (noise.uniforms, noise.initial))), torch.asarray(noise.rows[0])
+    )
+    for k in range(steps):
+        one, two = plain.act(one, a[k]), tensor.act(two, torch.asarray(a[k]))
+        pairs = [
+            (plain.observe(one), tensor.observe(two)),
+            (plain.cost(one), tensor.cost(two)),
+            (plain.covariance(one), tensor.covariance(two)),
+            *zip(one, two, strict=True),
+        ]
+        for x, y in pairs:
+            assert y.dtype == torch.float64
+            # Another library's exp and matrix product, 40 steps of a stable loop.
+            numpy.testing.assert_allclose(x, y.numpy(), rtol=1e-9, atol=1e-9)
+        one, two = (
+            plain.measure(one, noise.rows[k + 1]),
+            tensor.measure(two, torch.asarray(noise.rows[k + 1])),
+        )
+
+
+def test_gradient_of_the_cost_through_the_closed_loop() -> None:
+    task = make("U", xp=array_api_compat.torch)
+    noise = Noise(task, 8, 4, 7)
+    rows = torch.asarray(noise.rows)
+
+    def total(action: torch.Tensor) -> torch.Tensor:
+        state = task.measure(task.begin(torch.asarray(noise.uniforms), torch.asarray(noise.initial)), rows[0])
+        value = torch.zeros((), dtype=torch.float64)
+        for k in range(5):
+            state = task.act(state, action[k])
+            value = value + task.cost(state).sum()
+            state = task.measure(state, rows[k + 1])
+        return value
+
+    a = (
+        torch.asarray(0.5 * numpy.random.default_rng(0).standard_normal((5, 1, 8)))
+        .clip(-0.9, 0.9)
+        .requires_grad_()
+    )
+    assert torch.autograd.gradcheck(total, (a,), rtol=1e-5, atol=1e-6)
+    (gradient,) = torch.autograd.grad(total(a), a)
+    assert (gradient[0] != 0).all()
+
+
+# ---------------------------------------------------------------- what an episode of "random" is like
+
+
+def test_random_episodes_hold_what_they_promise() -> None:
+    task = make("U")
+    N, p = 400, task.parameters
+    noise = Noise(task, N, 0, 1)
+    state = task.begin(noise.uniforms, noise.initial)
+    times = state.command_times
+    assert (numpy.diff(times, axis=0) > 0).all()
+    assert (times.max(axis=0) <= p.horizon).all()
+    assert numpy.abs(state.levels).min() >= 0.25
+    assert numpy.abs(state.levels).max() <= 4.0
+    assert abs(numpy.log(state.levels).mean()) < 0.12  # log-uniform about one: four standard errors
+    command = [
+        task._in_force(numpy.full(N, k), numpy.zeros(N), times, state.commands) for k in range(p.horizon)
+    ]
+    changes = (numpy.diff(numpy.array(command), axis=0) != 0).sum(axis=0)
+    assert changes.min() >= 4
+    assert changes.max() <= 12
+    assert set(numpy.unique(changes)) > {6, 8, 10}  # steps are one change, doublets three
+    length = state.dropout_stops - state.dropout_starts
+    assert (length >= 1).all()
+    assert (length <= 15).all()
+    assert (state.dropout_stops <= p.horizon + 1).all()
+
+
+def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:
+    for plant in "PU":
+        task = make(plant, "sensor-degradation")
+        noise = Noise(task, 8, 0, 1)
+        state = task.begin(noise.uniforms, noise.initial)
+        after = state.sensor_levels[1, :, 0]
+        assert dict(zip(task.sensors, after, strict=True))["rate"] == pytest.approx(5.0)
+        assert sorted(after)[:-1] == [1.0] * (len(after) - 1)
+    lag = make("U", "actuator-lag").design
+    assert lag.true_model.F[3, 3] == pytest.approx(math.exp(-0.02 / 0.1))
+    assert lag.model.F[3, 3] == pytest.approx(math.exp(-0.02 / 0.05))
+
+
+@pytest.mark.parametrize(
+    ("kw", "message"),
+    [
+        ({"plant": "X"}, "plant must be one of"),
+        ({"feedback": (0.0, 0.0, 0.0, 0.0, 0.0)}, "feedback must stabilise the plant.*spectral radius"),
+        ({"feedback": (1.0, 2.0)}, "feedback must be 5 numbers"),
+        ({"sensor_sigmas": (0.5, 0.0, 0.5)}, r"sensor_sigmas\[1\].*above 0.0.*got 0.0"),
+        ({"gust_sigma": -1.0}, "gust_sigma must be a finite number above 0.0, got -1.0"),
+        ({"moment_disturbance": 0.0}, "moment_disturbance"),
+        ({"sensors": ("rate", "elevator")}, "sensors cannot detect.*add a sensor"),
+        ({"sensors": ("speed",)}, "each of sensors must be one of"),
+        ({"sensors": ("incidence",)}, "sensor_sigmas must be given"),
+        ({"plant": "P", "actuator_lag": 2.0}, "has no actuator"),
+        ({"step_size": 1.0, "command_amplitude": (0.5, 1.0)}, "exclude each other"),
+        ({"disturbance_times": ((100, 200),)}, "one range more"),
+        ({"disturbance_levels": ((1, 1), (0, 1)), "disturbance_times": ((5, 9),)}, "above 0.0"),
+        ({"dropout_period": 15}, "longer than the longest dropout, 15, got 15"),
+        ({"command_period": 40}, "longer than a doublet"),
+        ({"horizon": 0}, "horizon must be an integer of at least 1"),
+    ],
+)
+def test_bad_input_is_refused_with_the_reason(kw: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        UavAutopilot(UavAutopilotParameters(**kw), "gain")
+
+
+def test_parameters_from_json_equal_those_from_python() -> None:
+    assert UavAutopilotParameters(command_amplitude=[0.5, 1.0]) == UavAutopilotParameters(
+        command_amplitude=(0.5, 1.0)
+    )
