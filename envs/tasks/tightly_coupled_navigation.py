@@ -980,7 +980,7 @@ class TightlyCoupledNavigation(Task[State]):
             "mode_probability": state.probabilities,
             "nis": self.total([state.probabilities[i] * nis[i] for i in range(len(HYPOTHESES))]),
             "nis_degrees": self.total([state.available[j] for j in range(self.observations)]),
-            "seconds": p.T * state.clock,
+            "seconds": p.T * xp.astype(state.clock, state.truth.dtype),
             "true_mode": state.mode,
             "rate_outside_aperture": xp.astype(outside, state.truth.dtype),
         }

@@ -1,0 +1,343 @@
+"""Policies, reference, bound, metrics and reproduction of tightly coupled navigation."""
+
+import math
+
+import numpy
+import pytest
+from filtergym.baselines import evaluate, tidy_records
+from filtergym.baselines.bootstrap import Bootstrap, Estimate
+from filtergym.baselines.evaluation import baselines_of
+from filtergym.baselines.policies import tightly_coupled_navigation as policies
+from filtergym.baselines.reproduction import save_reproduction
+from filtergym.baselines.reproductions import multi_hypothesis_ins_gnss as paper
+from filtergym.baselines.rollout import run_bound, run_policy
+from filtergym.baselines.seeds import episode_seeds
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.tasks.tightly_coupled_navigation import HYPOTHESES, LINE, REST, SINGER
+from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.results import write_text
+
+ID = "filtergym/TightlyCoupledNavigation-v0"
+KNOWN = baselines_of(ID)
+
+
+# --- reference and bound
+
+
+@pytest.fixture(scope="module")
+def matched():
+    """All policies where Singer's filter is optimal."""
+    names = [*KNOWN.policies, "known-mode", "known-mode-bound"]
+    return evaluate(ID, names, "matched", episodes=16, horizon=150, decision_interval=1)
+
+
+def test_known_mode_is_the_singer_filter_where_all_is_singer(matched):
+    one, other = (matched["error"].sel(policy=name).values for name in ("known-mode", "singer"))
+    # Both form the same numbers; the bank adds mixing with weights of zero, in another order.
+    numpy.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7)
+
+
+def test_nobody_beats_the_optimal_filter_where_it_is_optimal(matched):
+    """A policy that is significantly better than the optimum has found a leak."""
+    cost = matched["cost"].mean("time")
+    for name in KNOWN.policies:
+        difference = (cost.sel(policy=name) - cost.sel(policy="known-mode")).values
+        assert difference.mean() > -3 * difference.std() / math.sqrt(len(difference)) - 1e-9, name
+
+
+def test_bound_is_what_the_optimal_filter_reaches(matched):
+    squares = (matched["error"].sel(policy="known-mode") ** 2).values[:, 50:]
+    mean_square = matched["mean_square"].sel(policy="known-mode-bound").values[:, 50:]
+    ratio = (squares / mean_square).mean(axis=1)
+    error = ratio.std(axis=0) / math.sqrt(len(ratio))
+    # 17 components, 16 runs: five standard errors, and room for their own scatter.
+    assert (abs(ratio.mean(axis=0) - 1.0) < 5 * error + 0.15).all()
+
+
+def test_bound_is_the_dense_recursion():
+    """Random legs and faults with dense matrices and the information form, one lane at a time."""
+    keywords = {
+        "leg_duration": (0.05, 0.1), "rate_fault_probability": 1.0, "rate_fault_duration": (0.1, 0.15),
+        "stick_probability": 1.0, "stick_duration": (0.1, 0.15), "satellites_outage": 0.1,
+        "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
+    }  # fmt: skip
+    task = make_task(ID, **keywords)
+    seen, bounds = [], []
+
+    class Watched(policies.KnownModeBound):
+        def update(self, state, memory):
+            seen.append(state)
+            return super().update(state, memory)
+
+    run_bound(task, Watched(task), episode_seeds("test", 3, 8), bounds.append, lambda _: None)
+    assert (numpy.stack([s.jump for s in seen]).sum(axis=0) > 1).all()
+    assert numpy.stack([s.stuck for s in seen]).any(axis=0).all()
+    p, S = task.parameters, task.satellites
+    identity = numpy.eye(17)[:, :, None, None]
+    F = [
+        gnss_ins.advance(identity, task.axis[:, :, i : i + 1], p.T, task.common.decay)[..., 0, 0]
+        for i in range(3)
+    ]
+    user = [0, 1, 2, 4, 5, 6, 8, 9, 10]
+    Q = [task.process_noise[:, :, i, 0].copy() for i in range(3)]
+    Q[REST][numpy.ix_(user, user)] = 0.0
+    for i in (8, 9, 10):
+        Q[LINE][i, i] = 0.0  # the acceleration of straight flight is zero, not nearly
+    for lane in range(8):
+        P = numpy.diag(task.initial_sigma[:, 0] ** 2)
+        mode = int(seen[0].mode[lane])
+        for state, mean_square in zip(seen, bounds, strict=True):
+            jumped = state.jump[lane] > 0.0
+            i = mode if jumped else int(state.mode[lane])
+            P = F[i] @ P @ F[i].T + Q[i]
+            if jumped:
+                P[8:11] = P[:, 8:11] = 0.0
+            position, velocity = task.satellites_now(state)
+            _, rows = gnss_ins.observe(state.truth, position, velocity, state.ins_angles, p.gravity)
+            H = extended_kalman.dense(rows, state.truth)[..., lane]
+            R = numpy.array(task.sensor_variance) * state.noise_factor[:, lane] ** 2
+            there = state.available[:, lane] > 0.0
+            there[2 * S : 2 * S + 3] &= state.stuck[lane] == 0.0
+            H, R = H[there], numpy.diag(R[there])
+            P = P - P @ H.T @ numpy.linalg.solve(H @ P @ H.T + R, H @ P)
+            # Subtraction of the dense form: 100 m^2 and 1e-6 (rad/s)^2 stand in one matrix.
+            numpy.testing.assert_allclose(mean_square[:, lane], numpy.diag(P), rtol=1e-6, atol=1e-12)
+            mode = int(state.mode[lane])
+
+
+@pytest.fixture(scope="module")
+def on_random():
+    names = ["multi-hypothesis", "sticky", "singer", "known-mode", "known-mode-bound"]
+    return evaluate(ID, names, episodes=32, horizon=400)
+
+
+def test_known_mode_is_no_worse_than_singer_on_any_leg(on_random):
+    records = {
+        (r.policy, r.component): r.value for r in tidy_records(on_random) if r.metric == "rmse_by_hypothesis"
+    }
+    for hypothesis in HYPOTHESES:
+        for component in ("position", "velocity"):
+            name = f"{component} {hypothesis}"
+            assert records["known-mode", name] <= 1.02 * records["singer", name], name
+
+
+def test_known_mode_reports_an_honest_covariance(on_random):
+    nees = on_random["nees"].sel(policy="known-mode").values.mean(axis=1) / 17
+    # At rest velocity and acceleration are known exactly; the filter keeps a little noise: below one.
+    assert 0.5 < nees.mean() < 1.0 + 4 * nees.std() / math.sqrt(len(nees))
+
+
+def test_bound_is_below_the_reference(on_random):
+    bound = on_random["mean_square"].sel(policy="known-mode-bound").values.mean(axis=1)
+    squares = (on_random["error"].sel(policy="known-mode").values ** 2).mean(axis=1)
+    difference = squares - bound
+    assert (difference.mean(axis=0) > -4 * difference.std(axis=0) / math.sqrt(len(squares))).all()
+
+
+# --- policies
+
+
+def test_sticky_changes_the_chain_of_the_bank(on_random):
+    assert make_task(ID, **policies.Sticky.task_keywords).parameters.transition == policies.chain(0.9999)
+    assert policies.chain(0.998) == pytest.approx(numpy.array(make_task(ID).parameters.transition), abs=1e-15)
+    error = on_random["error"]
+    assert (error.sel(policy="sticky") != error.sel(policy="multi-hypothesis")).any()
+
+
+def observed(task, **values):
+    """Two quiet observations with some fields replaced."""
+    observation = numpy.zeros((2, len(task.fields)))
+    for name, value in values.items():
+        columns = [i for i, f in enumerate(task.fields) if f.name.startswith(name)]
+        assert columns, name
+        observation[0, columns] = value
+    return observation
+
+
+def test_nis_adaptive_divides_the_excess():
+    task = make_task(ID, "gain")
+    policy = policies.NisAdaptive(task, threshold=2.0, rates=0.5, accelerometers=3.0, base=0.1)
+    action, _ = policy.predict(observed(task, average_nis_rates=math.log1p(2.0 * 9.0)))
+    excess = math.log(9.0) / (2 * math.log(300.0))
+    assert action[0] == pytest.approx([0.0, 0.5 * excess, 0.1 + 3.0 * excess, 0.0], rel=1e-12)
+    assert action[1] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
+    # One hypothesis that is content is enough.
+    quiet = observed(task, average_nis_rates=5.0, average_nis_rates_rest=0.0)
+    assert policy.predict(quiet)[0][0] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
+
+
+def test_stuck_check_switches_stuck_accelerometers_off():
+    task = make_task(ID, "gain", rate_fault_probability=0.0, stick_probability=1.0, horizon=200)
+    states, actions = [], []
+
+    class Watched(policies.StuckCheck):
+        def act(self, observation, state, start):
+            action, state = super().act(observation, state, start)
+            actions.append(action[:, 2])
+            return action, state
+
+    run_policy(task, Watched(task), episode_seeds("test", 5, 8), states.append, lambda _: None)
+    stuck = numpy.stack([s.stuck for s in states])[:: task.decision_interval] > 0.0
+    off = numpy.stack(actions) == 1.0
+    assert stuck.any(axis=0).all()
+    # Two decisions in a row see it stuck: the second one knows.
+    both = stuck[1:] & stuck[:-1]
+    assert off[1:][both].all()
+    assert not off[~stuck].any()
+
+
+# --- metrics
+
+
+def test_lasting_and_switches_are_what_a_loop_finds():
+    rng = numpy.random.default_rng(0)
+    condition = rng.random((5, 60)) < 0.7
+    for steps in (1, 3, 10):
+        naive = [
+            [row[k : k + steps].all() and k + steps <= len(row) for k in range(len(row))] for row in condition
+        ]
+        assert (policies.lasting(condition, steps) == naive).all()
+    mode = numpy.array([[0] * 20 + [2] * 30 + [1] * 5, [1] * 55])
+    probability = numpy.zeros((2, 55, 3))
+    probability[0, 23:26, 2] = 0.9  # too short
+    probability[0, 30:50, 2] = 0.9
+    probability[0, 52:, 1] = 0.6  # until the end, five steps after the switch
+    found = policies.switches(mode, probability)
+    assert [(s.episode, s.before, s.after) for s in found] == [(0, 0, 2), (0, 2, 1)]
+    assert found[0].wait == 11.0
+    assert found[1].wait == math.inf  # five steps are asked for, three are there
+
+
+def test_quantiles_are_those_of_the_episodes():
+    values = numpy.random.default_rng(1).random(101)
+    bootstrap = Bootstrap(101)
+    assert policies.quantile(bootstrap, values, 0.5).value == numpy.median(values)
+    chosen = values > 0.5
+    found = policies.quantile(bootstrap, values, 0.5, chosen)
+    assert found.value == numpy.sort(values[chosen])[math.ceil(0.5 * chosen.sum()) - 1]
+    assert found.low < found.value < found.high
+    assert math.isnan(policies.quantile(bootstrap, values, 0.5, values > 2.0).value)
+
+
+def test_metrics_follow_from_the_dataset(on_random):
+    records = {(r.policy, r.metric, r.component): r for r in tidy_records(on_random) if r.window == "all"}
+    run = on_random.sel(policy="singer")
+    mode, squares = run["true_mode"].values, (run["error"].values[:, :, 4:7] ** 2).sum(axis=2)
+    value = records["singer", "rmse_by_hypothesis", "velocity singer"].value
+    assert value == pytest.approx(math.sqrt(squares[mode == SINGER].mean()), rel=1e-12)
+    cost = numpy.sort(run["cost"].values.mean(axis=1))
+    assert records["singer", "cost_median", ""].value == cost[15]
+    # A filter that believes one hypothesis for ever follows every change to it at once, and no other.
+    assert records["singer", "adaptation_time", "rest to singer"].value == pytest.approx(0.01, rel=1e-12)
+    assert records["singer", "adaptation_censored", "singer to constant-velocity"].value == 1.0
+    assert ("singer", "adaptation_time", "singer to constant-velocity") not in records
+    assert records["known-mode", "track_loss_rate", ""].value == 0.0
+    assert not [r for r in records if r[0] == "known-mode-bound" and r[1] == "cost_median"]
+
+
+def test_loss_of_track_is_found_and_timed():
+    dataset = evaluate(
+        ID, ["singer", "constant-velocity"], "paper", episodes=12, leg_steps=(150, 1000), horizon=280
+    )
+    records = {(r.policy, r.metric): r for r in tidy_records(dataset)}
+    assert records["singer", "track_loss_rate"].value == 1.0
+    assert 0.67 <= records["singer", "track_loss_time"].value <= 0.77
+    assert records["constant-velocity", "track_loss_rate"].value == 0.0
+    assert ("constant-velocity", "track_loss_time") not in records
+
+
+# --- reproduction
+
+
+def test_filters_side_by_side_are_the_filters_alone():
+    runs = paper.simulate("paper", {"adaptive": 4, "Singer": 3}, horizon=40, leg_steps=(10, 25))
+    known = paper.simulate("paper", {"known mode": 3}, horizon=40, leg_steps=(10, 25))["known mode"]
+    dataset = evaluate(
+        ID, ["multi-hypothesis", "singer", "known-mode"], "paper", episodes=4, horizon=40, leg_steps=(10, 25)
+    )
+    pairs = ((runs["adaptive"], "multi-hypothesis"), (runs["Singer"], "singer"), (known, "known-mode"))
+    for run, name in pairs:
+        error = dataset["error"].sel(policy=name).values[: len(run.nis)]
+        for c, part in enumerate(paper.PARTS):
+            expected = (error[:, :, part] ** 2).sum(axis=2)
+            # The weights pass through the observation's logarithms; the bank amplifies their rounding.
+            numpy.testing.assert_allclose(run.squares[c], expected, rtol=1e-5, atol=1e-9)
+        nis = dataset["nis"].sel(policy=name).values / dataset["nis_degrees"].sel(policy=name).values
+        numpy.testing.assert_allclose(run.nis, nis[: len(run.nis)], rtol=1e-5)
+
+
+def test_slower_adaptation_without_rates():
+    keywords = {"horizon": 300, "leg_steps": (200, 1000)}
+    quick, slow = (
+        paper.waits_of(paper.simulate("paper", {"adaptive": 16}, **keywords, **more)["adaptive"], REST, LINE)
+        for more in ({}, {"rate_sigma": paper.NOTHING})
+    )
+    assert 0.01 <= quick.mean <= 0.03
+    assert slow.never == 0
+    # 0.48 s after a leg 1 of 1000 steps; the position is less well known after 200.
+    assert 0.3 < slow.mean < 0.6
+
+
+def fake_run(episodes, steps, motion, lost):
+    rng = numpy.random.default_rng(episodes)
+    mode = numpy.zeros((episodes, steps), dtype=int)
+    mode[:, motion - 1 :] = LINE
+    mode[:, 2 * motion - 2 :] = SINGER
+    probability = 0.98 * (mode[:, :, None] == numpy.arange(3)) + 0.01
+    outside = numpy.zeros((episodes, steps), dtype=bool)
+    if lost:
+        outside[:, motion + 60 :] = True
+    return paper.Run(
+        rng.random((6, episodes, steps)) + 0.1, rng.random((episodes, steps)), probability, mode, outside,
+        rng.random((episodes, steps)),
+    )  # fmt: skip
+
+
+def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
+    def simulate(scenario, filters, **keywords):
+        motion = keywords.get("leg_steps", (1000,))[0] + 1
+        steps = keywords.get("horizon", 3000)
+        return {
+            name: fake_run(count, steps, motion, name == "Singer" and scenario == "paper")
+            for name, count in filters.items()
+        }
+
+    monkeypatch.setattr(paper, "simulate", simulate)
+    done = []
+    result = paper.reproduce(done.append, 5)
+    assert sum(done) == paper.STEPS
+    verdicts = {c.key: c.verdict for c in result.claims}
+    assert verdicts["C3"] == "reproduced in part"  # lost in increment, not in kinematic
+    assert verdicts["C5"] == "reproduced"
+    for table in result.tables:
+        assert {len(row) for row in table.rows} == {len(table.header)}
+    save_reproduction(result, tmp_path, write_text)
+    assert {p.name for p in tmp_path.iterdir()} == {"report.md", *(f"{name}.png" for name in result.figures)}
+    with pytest.raises(ValueError, match="at least 2"):
+        paper.reproduce(done.append, 1)
+
+
+def near(value):
+    return Estimate(value, value - 0.01, value + 0.01)
+
+
+def test_verdicts_follow_the_data():
+    assert paper.matched_verdict([near(1.03)], [near(1.0)]) == "reproduced"
+    assert paper.matched_verdict([near(1.03)], [near(1.6)]) == "reproduced in part"
+    assert paper.matched_verdict([near(1.2)], [near(1.0)]) == "not reproduced"
+    exact = Estimate(1.0, 1.0, 1.0)
+    assert paper.weight_verdict([0.0, 0.06, 0.3], [exact, near(1.03), near(1.3)]) == "reproduced"
+    assert paper.weight_verdict([0.0, 0.3, 0.06], [exact, near(1.03), near(1.3)]) == "reproduced in part"
+    assert paper.weight_verdict([0.0, 0.06], [near(1.05), near(1.06)]) == "reproduced in part"
+    assert paper.weight_verdict([0.0, 0.06], [exact, near(1.0)]) == "not reproduced"
+    lost, late, kept = (paper.Loss(1.0, t, t, t) for t in (0.7, 1.4, 0.7))
+    kept = kept._replace(rate=0.0)
+    assert paper.loss_verdict(lost, lost) == "reproduced"
+    assert paper.loss_verdict(lost, kept) == "reproduced in part"
+    assert paper.loss_verdict(late, kept) == "not reproduced"
+    quick, middle, slow = (paper.Wait(t, 0.01, t, 0, numpy.array([t])) for t in (0.02, 0.4, 0.49))
+    assert paper.adaptation_verdict([quick, middle], slow) == "reproduced"
+    assert paper.adaptation_verdict([quick], slow) == "reproduced in part"
+    assert paper.adaptation_verdict([quick], quick) == "not reproduced"
+    assert paper.stability_verdict([kept]) == "reproduced"
+    assert paper.stability_verdict([kept, lost]) == "not reproduced"
