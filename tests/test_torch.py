@@ -19,6 +19,8 @@ LANES = 5
 # one unit in the last place, and the recursions amplify that. Observations are of order one (4e-13 seen over
 # whole episodes of ManeuveringTarget), rewards go to 1e4 and are compared relative to their size.
 TOLERANCE = 1e-10
+# A pseudorange of 2.5e7 m is known to 4e-9 m in float64, and the filter is linearised around one: 5e-9 seen.
+WIDER = {"filtergym/TightlyCoupledNavigation-v0": 5e-8}
 
 CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
 CONTINUOUS = [
@@ -50,9 +52,10 @@ def sampled(env):
     return action.astype(float) if action.dtype.kind == "f" else action
 
 
-def assert_close(tensor, array):
+def assert_close(tensor, array, id=None):
     assert isinstance(tensor, torch.Tensor)
-    numpy.testing.assert_allclose(tensor.detach().cpu().numpy(), array, rtol=TOLERANCE, atol=TOLERANCE)
+    tolerance = WIDER.get(id, TOLERANCE)
+    numpy.testing.assert_allclose(tensor.detach().cpu().numpy(), array, rtol=tolerance, atol=tolerance)
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -64,13 +67,13 @@ def test_torch_equals_numpy(id, control, scenario, device):
     observation, _ = env.reset(seed=11)
     assert observation.dtype == torch.float64
     assert observation.device.type == device
-    assert_close(observation, expected)
+    assert_close(observation, expected, id)
     for _ in range(DECISIONS):
         action = sampled(reference)
         observation, reward, terminated, truncated, info = env.step(torch.tensor(action, device=device))
         expected = reference.step(action)
-        assert_close(observation, expected[0])
-        assert_close(reward, expected[1])
+        assert_close(observation, expected[0], id)
+        assert_close(reward, expected[1], id)
         assert reward.shape == (LANES,)
         for mask, values in ((terminated, expected[2]), (truncated, expected[3])):
             assert mask.dtype == torch.bool
@@ -79,7 +82,7 @@ def test_torch_equals_numpy(id, control, scenario, device):
         # Errors are in metres and the like, hence only relative to the largest of their kind.
         for name, values in expected[4].items():
             numpy.testing.assert_allclose(
-                info[name].cpu().numpy(), values, rtol=0.0, atol=TOLERANCE * max(1.0, numpy.abs(values).max())
+                info[name].cpu().numpy(), values, rtol=0.0, atol=WIDER.get(id, TOLERANCE) * max(1.0, numpy.abs(values).max())
             )
 
 
@@ -92,7 +95,7 @@ def test_other_rewards_equal_numpy(id, reward):
     env.reset(seed=5)
     for _ in range(DECISIONS):
         action = sampled(reference)
-        assert_close(env.step(action)[1], reference.step(action)[1])
+        assert_close(env.step(action)[1], reference.step(action)[1], id)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -109,15 +112,15 @@ def test_autoreset_equals_numpy(id, mode):
         action = sampled(reference)
         expected = reference.step(action)
         observation, reward, _, truncated, info = env.step(torch.tensor(action))
-        assert_close(observation, expected[0])
-        assert_close(reward, expected[1])
+        assert_close(observation, expected[0], id)
+        assert_close(reward, expected[1], id)
         assert (truncated.numpy() == expected[3]).all()
         ends += int(truncated.sum())
         if mode == "SameStep" and truncated.any():
             finished = info["_final_obs"].numpy()
             assert (finished == expected[4]["_final_obs"]).all()
             assert_close(
-                info["final_obs"][info["_final_obs"]], numpy.stack(expected[4]["final_obs"][finished])
+                info["final_obs"][info["_final_obs"]], numpy.stack(expected[4]["final_obs"][finished]), id
             )
             assert set(info["final_info"]) == set(expected[4]["final_info"])
         if mode == "Disabled" and truncated.any():
@@ -127,7 +130,7 @@ def test_autoreset_equals_numpy(id, mode):
             for part in (restarted, ~restarted):
                 values, _ = reference.reset(options={"reset_mask": part.copy()})
                 shown, _ = env.reset(options={"reset_mask": torch.tensor(part)})
-                assert_close(shown, values)
+                assert_close(shown, values, id)
     assert ends >= 2 * LANES
 
 
