@@ -184,8 +184,11 @@ class Parameters:
     evidence_scale: float = 10.0
     """Nats that an evidence of one adds to the log-posterior. Ours."""
     noise_scale: float = 300.0
-    """Largest factor of a sensor's standard deviation under control "gain"; its reciprocal is the smallest.
-    Ours: 300 switches a sensor off for practical purposes."""
+    """Largest factor of a sensor's standard deviation under control "gain". Ours: 300 switches a sensor off
+    for practical purposes."""
+    noise_reduction: float = 3.0
+    """Largest divisor of it. Ours: a filter that trusts its sensors far too much is never right, and
+    amplifies rounding from one backend to another."""
     average: float = 0.1
     """Weight of the newest value in the short averages. Ours: ten measurements."""
     position_unit: float = 7.4
@@ -214,7 +217,8 @@ class Parameters:
         for name in ("height", "heading", "epoch"):
             check.number(name, getattr(self, name))
         check.number("average", self.average, above=0.0, at_most=1.0)
-        check.number("noise_scale", self.noise_scale, above=1.0)
+        for name in ("noise_scale", "noise_reduction"):
+            check.number(name, getattr(self, name), above=1.0)
         check.stochastic_matrix("transition", self.transition, len(HYPOTHESES))
         check.stochastic_matrix("initial_probabilities", (self.initial_probabilities,), 1, len(HYPOTHESES))
         if len(self.leg_steps) != 2 or not 0 < self.leg_steps[0] < self.leg_steps[1]:
@@ -360,9 +364,10 @@ class TightlyCoupledNavigation(Task[State]):
     * `mode`: `Discrete(3)`, the one hypothesis believed. The bank mixes on its weights, so this collapses it
       to one filter that switches its model.
     * `weights`: `Box(0, 1, (3,))`, normalised; all zero is uniform.
-    * `gain`: `Box(-1, 1, (4,))`, the logarithm to base 300 of the factor of the noise's standard deviation,
-      one for each sensor group (pseudoranges, rates, accelerometers, attitude), under the paper's
-      probabilities; for faults that no weight can cure. Zero is the paper's algorithm.
+    * `gain`: `Box(-1, 1, (4,))`, what the standard deviation of the noise is taken to be, over the nominal one,
+      for each sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a positive
+      action, 3 to that of a negative one; under the paper's probabilities, for faults that no weight can
+      cure. Zero is the paper's algorithm.
 
     The weights are used for the combination and as the prior of the next mixing.
 
@@ -921,7 +926,9 @@ class TightlyCoupledNavigation(Task[State]):
         xp, p = self.xp, self.parameters
         if self.control == "gain":
             action = xp.clip(action, -1.0, 1.0)
-            factor = xp.exp((2.0 * math.log(p.noise_scale)) * xp.astype(action, state.truth.dtype))
+            exponent = xp.astype(action, state.truth.dtype)
+            up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
+            factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
             variance = [
                 self.sensor_variance[j] * factor[i]
                 for i, g in enumerate(self.sensor_groups)
