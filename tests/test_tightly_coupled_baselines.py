@@ -15,6 +15,7 @@ from filtergym.baselines.seeds import episode_seeds
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.tasks.tightly_coupled_navigation import HYPOTHESES, LINE, REST, SINGER
 from filtergym.filters import extended_kalman, gnss_ins
+
 from filtergym.results import write_text
 
 ID = "filtergym/TightlyCoupledNavigation-v0"

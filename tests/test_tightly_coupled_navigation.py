@@ -166,11 +166,11 @@ class AnotherTruth(TightlyCoupledNavigation):
 
     tape = ()
 
-    def _move(self, state, k, normals):
-        truth, mode, jump = super()._move(state, k, normals)
+    def move(self, state, k, normals):
+        truth, mode, jump = super().move(state, k, normals)
         return 1.3 * truth + 17.0, (mode + 1) % 3, 1.0 - jump
 
-    def _sense(self, state, noise):
+    def sense(self, state, noise):
         step = self.tape[int(state.clock[0]) - 1]
         names = ("measurement", "ins_angles", "available", "cn0")
         return state._replace(noise_factor=7.0 * state.noise_factor, **dict(zip(names, step, strict=True)))

@@ -774,7 +774,8 @@ def reproduce(progress: Callable[[float], None], episodes: int | None = None) ->
         "figure_1_errors": f"Figure 1: spherical errors over {count} runs (non-adaptive: {min(FEW, count)}), 95 % "
         "bands; dotted lines: the motion begins, and changes.",
         "figure_2_probabilities": f"Figure 2: mean probabilities over {count} runs, 95 % bands.",
-        "loss_times": "When Singer's filter loses track in the increment variant, one setting changed at a time, within 1.6 s; "
+        "loss_times": "When Singer's filter loses track in the increment variant, one setting changed at a time, "
+        "within 1.6 s; "
         "grey: the paper's 0.5 to 1 s.",
         "matched": "What the parallel channels cost where Singer's model is right, over the weight that they "
         "have: sensors and stay probability differ from point to point.",

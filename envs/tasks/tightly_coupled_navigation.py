@@ -691,9 +691,9 @@ class TightlyCoupledNavigation(Task[State]):
         """Move the truth, predict the bank, sense, and form residuals and likelihoods."""
         xp, p, S = self.xp, self.parameters, self.satellites
         clock = state.clock + 1
-        truth, mode, jump = self._move(state, xp.astype(clock, noise.dtype), noise[:17])
+        truth, mode, jump = self.move(state, xp.astype(clock, noise.dtype), noise[:17])
         state = state._replace(clock=clock, truth=truth, mode=mode, jump=jump)
-        state = self._sense(state, noise[17:])
+        state = self.sense(state, noise[17:])
 
         chain = imm.predict_mode_probabilities(self.transition, state.probabilities)
         mixed = imm.mix(state.bank_mean, state.bank_covariance, chain.mixing)
@@ -770,7 +770,7 @@ class TightlyCoupledNavigation(Task[State]):
             state.available,
         )
 
-    def _move(self, state: State, k: Array, normals: Array) -> tuple[Array, Array, Array]:
+    def move(self, state: State, k: Array, normals: Array) -> tuple[Array, Array, Array]:
         """Truth at step k, the hypothesis it follows, and whether its acceleration has jumped."""
         xp, p, T = self.xp, self.parameters, self.parameters.T
         kind, push = state.leg_kind[0], state.leg_acceleration[:, 0]
@@ -815,7 +815,7 @@ class TightlyCoupledNavigation(Task[State]):
         truth = xp.concat([x, bias[None], v, drift[None], a, attitude, rate], axis=0)
         return truth, xp.astype(mode, xp.int64), xp.astype(jumped, normals.dtype)
 
-    def _sense(self, state: State, noise: Array) -> State:
+    def sense(self, state: State, noise: Array) -> State:
         """Measurement of the truth with noise, faults, outages and multipath."""
         xp, p, S, m = self.xp, self.parameters, self.satellites, self.observations
         k = xp.astype(state.clock, noise.dtype)
