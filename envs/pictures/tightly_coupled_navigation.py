@@ -68,6 +68,9 @@ class TightlyCoupledNavigationPicture(Picture):
         truth, estimate = state.truth[:, lane], state.estimate[:, lane]
         innovation = state.range_innovation[:, lane] / self.task.sensor_sigma[: 2 * S, 0]
         innovation = numpy.where(state.available[: 2 * S, lane] > 0.0, innovation, 0.0)
+        if state.clock[lane] <= 1:
+            # The receiver clock is not known yet: hundreds of sigma that would hide all that follow.
+            innovation = numpy.full_like(innovation, numpy.nan)
         values = {
             "true_east": truth[0],
             "true_north": truth[1],
