@@ -11,7 +11,7 @@ _HOMES = {
     "to_sb3": "adapter",
     "LearnedPolicy": "learned_policy",
 }
-__all__ = ["LearnedPolicy", "to_sb3"]  # noqa: F822 (found by __getattr__)
+__all__ = ["LearnedPolicy", "to_sb3"]
 
 
 def __getattr__(name: str) -> Any:

@@ -87,6 +87,10 @@ class TaskVecEnv(VecEnv):
         self._reset_options()
         return observation
 
+    def seed_episodes(self, seeds: Sequence[int]) -> None:
+        """Give every environment a seed of its own for the next reset."""
+        self._seeds = list(seeds)
+
     def step_async(self, actions: numpy.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
         self._actions = actions
@@ -145,21 +149,21 @@ class TaskVecEnv(VecEnv):
 
     # --- the rest of Stable-Baselines3's interface
 
-    def _indices(self, indices: None | int | Iterable[int]) -> Sequence[int]:
+    def _indices(self, indices: int | Iterable[int] | None) -> Sequence[int]:
         return list(self._get_indices(indices))
 
-    def get_attr(self, attr_name: str, indices: None | int | Iterable[int] = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
         """Return an attribute of the vector environment, once for each environment asked for."""
         return [getattr(self.env, attr_name) for _ in self._indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices: None | int | Iterable[int] = None) -> None:
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
         """Refuse: the environments are one object and its parameters are fixed."""
         raise NotImplementedError(
             f"cannot set {attr_name!r}: a task is fixed when it is made; make a new vector environment"
         )
 
     def env_method(
-        self, method_name: str, *args: Any, indices: None | int | Iterable[int] = None, **keywords: Any
+        self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **keywords: Any
     ) -> list[Any]:
         """Refuse: there are no separate environments to call."""
         raise NotImplementedError(
@@ -167,7 +171,7 @@ class TaskVecEnv(VecEnv):
         )
 
     def env_is_wrapped(
-        self, wrapper_class: type[gymnasium.Wrapper], indices: None | int | Iterable[int] = None
+        self, wrapper_class: type[gymnasium.Wrapper], indices: int | Iterable[int] | None = None
     ) -> list[bool]:
         """Say yes to ``Monitor``, whose statistics the adapter reports, and to nothing else."""
         return [wrapper_class is Monitor for _ in self._indices(indices)]
