@@ -159,6 +159,7 @@ def save_checkpoint(
         "numpy": numpy.random.get_state(),  # noqa: NPY002 (what Stable-Baselines3 draws from)
         "python": random.getstate(),
         "action_space": model.action_space.np_random,
+        "lstm": getattr(model, "_last_lstm_states", None),
     }
     (folder / "rest.pkl").write_bytes(pickle.dumps(rest))
 
@@ -189,6 +190,8 @@ def load_checkpoint(run: TrainingRun, folder: Path) -> tuple[BaseAlgorithm, Task
     numpy.random.set_state(rest["numpy"])  # noqa: NPY002
     random.setstate(rest["python"])
     model.action_space._np_random = rest["action_space"]
+    if isinstance(model, RecurrentPPO):
+        model._last_lstm_states = rest["lstm"]  # loading has set them to zero
     return model, adapted, normalisation
 
 
