@@ -10,8 +10,10 @@ from typing import Any
 _HOMES = {
     "to_sb3": "adapter",
     "LearnedPolicy": "learned_policy",
+    "ResidualActions": "residual",
+    "ResidualPolicy": "residual",
 }
-__all__ = ["LearnedPolicy", "to_sb3"]
+__all__ = ["LearnedPolicy", "ResidualActions", "ResidualPolicy", "to_sb3"]
 
 
 def __getattr__(name: str) -> Any:

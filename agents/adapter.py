@@ -18,12 +18,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from ..envs.environment import TaskVectorEnv
 from ..envs.lanes import Lanes
+from .residual import check_residual
 
 _OF_THE_TASK = ("task", "paper")
 """What of the lanes is made anew from names and keywords instead of being kept in a snapshot."""
 
 
-def to_sb3(vector_env: Any, staggered: bool = False) -> "TaskVecEnv":
+def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) -> "TaskVecEnv":
     """Return a native vector environment as a Stable-Baselines3 ``VecEnv``.
 
     It gives what ``DummyVecEnv`` gives over as many single environments, each in a ``Monitor``, to the last
@@ -35,6 +36,7 @@ def to_sb3(vector_env: Any, staggered: bool = False) -> "TaskVecEnv":
         staggered: cut the episodes that a reset starts to lengths spread evenly over the horizon, so that
             environments finish one after another instead of all in one step; later episodes are whole. For
             training only: a score over the shortened ones is not a score of whole episodes.
+        residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
 
     Raises:
         ValueError: for a vector environment that cannot be adapted, with the reason.
@@ -57,14 +59,20 @@ def to_sb3(vector_env: Any, staggered: bool = False) -> "TaskVecEnv":
         raise ValueError(
             "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
         )
-    return TaskVecEnv(vector_env, staggered)
+    if residual_to is not None:
+        check_residual(vector_env.task, residual_to)
+    return TaskVecEnv(vector_env, staggered, residual_to)
 
 
 class TaskVecEnv(VecEnv):
     """See :func:`to_sb3`."""
 
-    def __init__(self, env: TaskVectorEnv, staggered: bool) -> None:
+    def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any) -> None:
         self.env = env
+        self.residual_to = residual_to
+        self._policy_memory: Any = None
+        self._shown: Any = None
+        self._start = numpy.ones(env.num_envs, dtype=bool)
         self.staggered = staggered
         self.started = time.time()
         self.returns = numpy.zeros(env.num_envs)
@@ -85,6 +93,7 @@ class TaskVecEnv(VecEnv):
         self.lengths[:] = 0
         self._reset_seeds()
         self._reset_options()
+        self._shown, self._start = observation, numpy.ones(count, dtype=bool)
         return observation
 
     def seed_episodes(self, seeds: Sequence[int]) -> None:
@@ -93,6 +102,11 @@ class TaskVecEnv(VecEnv):
 
     def step_async(self, actions: numpy.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
+        if self.residual_to is not None:
+            own, self._policy_memory = self.residual_to.predict(
+                self._shown, self._policy_memory, self._start, deterministic=True
+            )
+            actions = own + actions
         self._actions = actions
 
     def step_wait(self) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
@@ -100,6 +114,7 @@ class TaskVecEnv(VecEnv):
         observation, reward, _, finished, info = self.env.step(self._actions)
         self.returns += reward
         self.lengths += 1
+        self._shown, self._start = observation, finished
         # One new dictionary for all that go on: whoever writes into it harms this step's only.
         running: dict[str, Any] = {"TimeLimit.truncated": False}
         infos = [running] * self.num_envs
@@ -131,7 +146,8 @@ class TaskVecEnv(VecEnv):
         Arrays are shared with the environment, so pickle it before the next step.
         """
         lanes = {k: v for k, v in vars(self.env.lanes).items() if k not in _OF_THE_TASK}
-        return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths}
+        policy = self._policy_memory, self._shown, self._start
+        return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Continue from a snapshot of an environment made with the same arguments.
@@ -146,6 +162,7 @@ class TaskVecEnv(VecEnv):
         lanes: Lanes = self.env.lanes
         vars(lanes).update(snapshot["lanes"])
         self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
+        self._policy_memory, self._shown, self._start = snapshot["policy"]
 
     # --- the rest of Stable-Baselines3's interface
 

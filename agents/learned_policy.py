@@ -91,7 +91,7 @@ def write_arrays(
     path: Path, arrays: Mapping[str, numpy.ndarray], run: Any, output: str, activation: str = "tanh"
 ) -> None:
     """Write a learned policy and the record of the run that it comes from."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     fields = [field.name for field in make_task(run.environment, run.control).fields]
     header = {
@@ -104,7 +104,7 @@ def write_arrays(
     }
     contiguous = {name: numpy.ascontiguousarray(a, dtype=numpy.float32) for name, a in arrays.items()}
     partial = path.with_name(path.name + ".partial")
-    save_file(contiguous, partial, header)
+    partial.write_bytes(save(contiguous, header))
     partial.replace(path)
 
 

@@ -251,3 +251,39 @@ def test_recurrent_agent_cannot_be_exported(tmp_path):
     with pytest.raises(ValueError, match="cannot export algorithm 'recurrent-ppo'"):
         export_run(tmp_path, tmp_path / "agent.safetensors")
     assert not (tmp_path / "agent.safetensors").exists()
+
+
+class TestCommandLine:
+    def run(self, monkeypatch, capsys, *words):
+        from filtergym.__main__ import main
+
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr()
+
+    def test_train_resume_export_evaluate(self, monkeypatch, capsys, tmp_path):
+        train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run")
+        assert self.run(monkeypatch, capsys, *train, "--steps", 400)[0] == 0
+        code, printed = self.run(monkeypatch, capsys, *train, "--steps", 400)
+        assert code == 2
+        assert "add --resume" in printed.err
+        assert self.run(monkeypatch, capsys, *train, "--steps", 800, "--resume")[0] == 0
+        run = load_run(tmp_path / "run")
+        assert run.steps_done == 800
+        assert run.command.startswith("filtergym train " + ID)
+        assert run.versions["torch"] == torch.__version__
+        assert run.seconds > 0.0
+        assert self.run(monkeypatch, capsys, "export", tmp_path / "run")[0] == 0
+        file = tmp_path / "run" / "agent.safetensors"
+        words = ("evaluate", ID, "--policy", file, "--policy", "imm", "--episodes", 4)
+        assert self.run(monkeypatch, capsys, *words)[0] == 0
+
+    def test_wrong_input_writes_nothing(self, monkeypatch, capsys, tmp_path):
+        code, printed = self.run(
+            monkeypatch, capsys, "train", ID, "--scenario", "paper", "--out", tmp_path / "x"
+        )
+        assert code == 2
+        assert printed.err.startswith("Error: scenario 'paper' is held out")
+        assert self.run(monkeypatch, capsys, "export", tmp_path / "x")[0] == 2
+        assert not (tmp_path / "x").exists()
