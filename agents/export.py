@@ -47,8 +47,8 @@ def network_arrays(agent: Sb3Policy, algorithm: str) -> tuple[dict[str, numpy.nd
         output = "argmax"
     else:
         raise ValueError(f"cannot export algorithm {algorithm!r}: choose from ppo, sac, dqn, bptt")
-    shape = agent.observation_space.shape
-    mean, scale = numpy.zeros(shape), numpy.ones(shape)
+    fields = arrays["weight_0"].shape[1]
+    mean, scale = numpy.zeros(fields), numpy.ones(fields)
     if agent.normalisation is not None:
         statistics: Any = agent.normalisation.obs_rms
         mean, scale = statistics.mean, numpy.sqrt(statistics.var + agent.normalisation.epsilon)

@@ -41,6 +41,13 @@ SPACES: dict[str, tuple[type[gymnasium.Space], ...]] = {
 }
 
 
+# What unpickling a corrupt file stumbles over.
+UNREADABLE = (
+    OSError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError,
+    AttributeError, ImportError, RuntimeError,
+)  # fmt: skip
+
+
 class Sb3Policy:
     """A trained model with the normalisation of its observations, as a policy for an evaluation."""
 
@@ -59,7 +66,8 @@ class Sb3Policy:
     ) -> tuple[numpy.ndarray, Any]:
         """Choose actions, as Stable-Baselines3 does."""
         if self.normalisation is not None:
-            observation = self.normalisation.normalize_obs(observation)
+            normalised: Any = self.normalisation.normalize_obs(observation)
+            observation = normalised
         return self.model.predict(observation, state, episode_start, deterministic)
 
 
@@ -96,14 +104,7 @@ def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | Non
         raise ValueError(
             f"{path} is a model of an algorithm that is not one of {', '.join(ALGORITHMS)}"
         ) from error
-    except (
-        zipfile.BadZipFile,
-        pickle.UnpicklingError,
-        ValueError,
-        KeyError,
-        RuntimeError,
-        EOFError,
-    ) as error:
+    except UNREADABLE as error:
         raise ValueError(f"cannot read the model {path}: {error}") from error
     return Sb3Policy(model, normalisation, control)
 
@@ -181,7 +182,7 @@ def load_checkpoint(run: TrainingRun, folder: Path) -> tuple[BaseAlgorithm, Task
             model.load_replay_buffer(folder / "replay_buffer.pkl")
         rest = pickle.loads((folder / "rest.pkl").read_bytes())
         adapted.restore(rest["environment"])
-    except (OSError, zipfile.BadZipFile, pickle.UnpicklingError, ValueError, KeyError, EOFError) as error:
+    except UNREADABLE as error:
         raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
     if normalisation is not None:
         normalisation.returns = rest["returns"]

@@ -1,6 +1,8 @@
 """Shipped agents score what their records say; residual agents with zero correction are the policy itself."""
 
 import json
+import subprocess
+import sys
 
 import gymnasium
 import numpy as np
@@ -138,3 +140,13 @@ def test_residuals_that_cannot_be():
         ResidualActions(gymnasium.make(ID, control="mode"), policy)
     with pytest.raises(ValueError, match="takes an environment of filtergym"):
         ResidualActions(gymnasium.make("CartPole-v1"), policy)
+
+
+def test_shipped_agents_need_no_torch():
+    code = (
+        "import sys, filtergym\n"
+        "from filtergym.baselines import evaluate\n"
+        f"evaluate({ID!r}, ['ppo', 'bptt'], episodes=2)\n"
+        "assert not {'torch', 'stable_baselines3', 'yaml'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -9,9 +9,10 @@ from filtergym.baselines.evaluation import evaluate, load_policy
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 
-torch = pytest.importorskip("torch")
+pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
+import torch
 from filtergym.agents import training_run
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
@@ -230,7 +231,7 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
         resumed_run(tmp_path, small_run(algorithm, 400, seed=3))
     for file in (tmp_path / "checkpoint").iterdir():
         file.write_bytes(b"\x80garbage" * 20)
-    with pytest.raises(ValueError, match="cannot read the checkpoint in"):
+    with pytest.raises(ValueError, match=r"cannot read the checkpoint in"):
         train(resumed_run(tmp_path, small_run(algorithm, 800)), tmp_path, resume=True)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"cannot read .*run\.json"):
@@ -239,7 +240,7 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
 
 def test_files_that_are_no_policies(tmp_path):
     for name in ("a.zip", "a.safetensors"):
-        with pytest.raises(ValueError, match="no (model|learned policy) at"):
+        with pytest.raises(ValueError, match=r"no (model|learned policy) at"):
             load_policy(ID, str(tmp_path / name))
         (tmp_path / name).write_bytes(b"garbage" * 30)
         with pytest.raises(ValueError, match=r"cannot read the model|is not a learned policy"):
