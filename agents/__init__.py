@@ -1,1 +1,22 @@
-"""Reinforcement learning on top of the environments."""
+"""Reinforcement learning on top of the environments.
+
+Names are imported on first use: a learned policy is evaluated without torch, and only training needs
+Stable-Baselines3.
+"""
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "to_sb3": "adapter",
+    "LearnedPolicy": "learned_policy",
+    "ResidualActions": "residual",
+    "ResidualPolicy": "residual",
+}
+__all__ = ["LearnedPolicy", "ResidualActions", "ResidualPolicy", "to_sb3"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

@@ -17,7 +17,7 @@ from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from . import policies
-from .policy import Baselines
+from .policy import LOADERS, Baselines
 from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
 from .tuning import tuned_policy
@@ -59,7 +59,7 @@ def load_policy(id: str, name: str) -> Any:
 
     Args:
         id: environment id.
-        name: one of the environment's own, or ``module:Class`` of a user's.
+        name: one of the environment's own, ``module:Class`` of a user's, or what one of ``LOADERS`` knows.
 
     Raises:
         ValueError: if there is no such name.
@@ -76,6 +76,10 @@ def load_policy(id: str, name: str) -> Any:
             return getattr(importlib.import_module(module_name), attribute)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"cannot load policy {name!r}: {error}") from error
+    for loader in LOADERS:
+        maker = loader(task_class(id).id, name)
+        if maker is not None:
+            return maker
     raise nearest("policy", name, known.names)
 
 

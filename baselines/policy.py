@@ -13,6 +13,12 @@ import numpy
 
 from ..envs.task import Array, Task
 
+PolicyLoader = Callable[[str, str], Any]
+"""From an environment's id and a name to what makes a policy for a task, or None for a name not its own."""
+
+LOADERS: list[PolicyLoader] = []
+"""Asked, in order, for a policy that is not among an environment's own; whoever has policies adds to it."""
+
 
 class Policy:
     """Base of the classical policies: made for a task, deterministic unless it says otherwise.

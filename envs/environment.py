@@ -288,8 +288,23 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Start new episodes everywhere, or where ``options["reset_mask"]`` is true."""
+        """Start new episodes everywhere, or where ``options["reset_mask"]`` is true.
+
+        ``options["shortened_by"]``: integers ``(num_envs,)``, by how many decisions each of these episodes ends
+        early (later ones are whole again), so that episodes of one horizon need not all end together.
+        """
         mask = (options or {}).get("reset_mask")
+        shortened = numpy.asarray((options or {}).get("shortened_by", numpy.zeros(self.num_envs, dtype=int)))
+        if (
+            shortened.shape != (self.num_envs,)
+            or shortened.dtype.kind not in "iu"
+            or (shortened < 0).any()
+            or (shortened >= self.last_decision).any()
+        ):
+            raise ValueError(
+                f"options['shortened_by'] must hold {self.num_envs} integers from 0 to "
+                f"{self.last_decision - 1}, got {shortened!r}"
+            )
         if mask is None:
             chosen: Sequence[int] = range(self.num_envs)
         else:
@@ -309,6 +324,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             chosen = numpy.flatnonzero(mask).tolist()
         self._seed(seed, chosen)
         self.lanes.restart(chosen)
+        self.lanes.decisions[list(chosen)] = shortened[list(chosen)]
         self._finished = self._finished.copy()
         self._finished[list(chosen)] = False
         return self.lanes.observe(), {}

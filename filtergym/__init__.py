@@ -4,6 +4,9 @@
 Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
+from typing import Any
+
+from .baselines.policy import LOADERS
 from .envs.catalogue import register
 from .envs.trajectory import Trajectory
 
@@ -11,3 +14,13 @@ __version__ = "0.1.0"
 __all__ = ["Trajectory", "register"]
 
 register()
+
+
+def _learned_policy(id: str, name: str) -> Any:
+    # Imported when asked for: baselines know nothing of agents.
+    from .agents.named_policies import learned_policy
+
+    return learned_policy(id, name)
+
+
+LOADERS.append(_learned_policy)

@@ -256,6 +256,90 @@ def reproduce(
         console.print(f"report and figures in {out}")
 
 
+@app.command("train")
+def train(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
+    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    control: Annotated[
+        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+    ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="A training scenario; held-out ones are refused.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
+    envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the training episodes and the network.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    validate_every: Annotated[
+        int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
+    ] = None,
+) -> None:
+    """Train an agent; Ctrl-C stops it with a checkpoint that --resume goes on from.
+
+    A checkpoint is loaded with pickle, which can execute code: resume only what you trust.
+
+    Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
+    """
+    try:
+        import torch
+
+        from .agents import training_run
+
+        trainer: Any
+        if algo == "bptt":
+            from .agents.bptt import train_bptt as trainer
+        else:
+            from .agents.sb3_training import train_sb3 as trainer
+    except ImportError as error:
+        raise ValueError(
+            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
+        ) from error
+    torch.set_num_threads(1)  # networks this small run slower on more
+    run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario)
+    if resume:
+        run = training_run.resumed_run(out, run)
+    elif (out / "run.json").exists():
+        raise ValueError(
+            f"{out} holds a training run: add --resume to go on with it, or choose another folder"
+        )
+    writable_folder(out)
+    run.command = (
+        f"filtergym train {run.environment} --algo {algo} --control {run.control} --scenario {run.scenario} "
+        f"--steps {run.steps} --envs {run.envs} --seed {seed}"
+    )
+    run.versions = training_run.installed_versions()
+    with progress_bar() as bar:
+        line = bar.add_task(f"training {algo}", total=run.steps)
+        trainer(
+            run,
+            out,
+            resume,
+            validate_every,
+            progress=lambda done: bar.update(line, completed=done),
+            report=lambda text: console.print(text, highlight=False),
+        )
+    console.print(f"{run.steps_done:,} steps done; best agent in {out / 'best'}, checkpoint beside it")
+
+
+@app.command("export")
+def export(
+    folder: Annotated[Path, typer.Argument(help="Folder of a training run.")],
+    out: Annotated[Path | None, typer.Option(help="File; default: agent.safetensors in the folder.")] = None,
+) -> None:
+    """Write a run's best agent as plain arrays, which evaluate without torch and cannot execute anything.
+
+    Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
+    """
+    try:
+        from .agents.export import export_run
+    except ImportError as error:
+        raise ValueError(f"export needs more packages: pip install 'filtergym[agents]' ({error})") from error
+    path = out or folder / "agent.safetensors"
+    run = export_run(folder, path)
+    console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
+
+
 def main() -> None:
     """Run the command line; a user's mistake ends in one sentence and exit code 2."""
     try:

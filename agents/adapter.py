@@ -1,0 +1,194 @@
+"""A native vector environment as Stable-Baselines3 sees environments.
+
+Stable-Baselines3 has its own ``VecEnv``, older than Gymnasium's vector environments: it resets finished
+environments in the same step and passes their last observation in ``info["terminal_observation"]``. The
+adapter works on whole arrays; only environments that finish in a step cost Python work, and all others share
+one info.
+"""
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy
+from gymnasium.vector import AutoresetMode
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import VecEnv
+
+from ..envs.environment import TaskVectorEnv
+from ..envs.lanes import Lanes
+from .residual import check_residual
+
+_OF_THE_TASK = ("task", "paper")
+"""What of the lanes is made anew from names and keywords instead of being kept in a snapshot."""
+
+
+def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) -> "TaskVecEnv":
+    """Return a native vector environment as a Stable-Baselines3 ``VecEnv``.
+
+    It gives what ``DummyVecEnv`` gives over as many single environments, each in a ``Monitor``, to the last
+    bit: observations, rewards (rounded to float32), dones, and infos with ``TimeLimit.truncated``,
+    ``terminal_observation`` and ``episode`` (return, length, seconds since this object was made).
+
+    Args:
+        vector_env: from ``gymnasium.make_vec(id, num_envs, autoreset_mode="SameStep")``.
+        staggered: cut the episodes that a reset starts to lengths spread evenly over the horizon, so that
+            environments finish one after another instead of all in one step; later episodes are whole. For
+            training only: a score over the shortened ones is not a score of whole episodes.
+        residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
+
+    Raises:
+        ValueError: for a vector environment that cannot be adapted, with the reason.
+    """
+    if not isinstance(vector_env, TaskVectorEnv):
+        raise ValueError(
+            "to_sb3 takes a native vector environment of filtergym, made by gymnasium.make_vec, "
+            f"got {type(vector_env).__name__}"
+        )
+    if vector_env.autoreset_mode is not AutoresetMode.SAME_STEP:
+        raise ValueError(
+            "Stable-Baselines3 resets a finished environment in the same step: make the vector environment "
+            f'with autoreset_mode="SameStep", got {vector_env.autoreset_mode.value!r}'
+        )
+    if vector_env.backend != "numpy":
+        raise ValueError(
+            f"Stable-Baselines3 takes NumPy arrays: use backend='numpy', got {vector_env.backend!r}"
+        )
+    if vector_env.detailed_info:
+        raise ValueError(
+            "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
+        )
+    if residual_to is not None:
+        check_residual(vector_env.task, residual_to)
+    return TaskVecEnv(vector_env, staggered, residual_to)
+
+
+class TaskVecEnv(VecEnv):
+    """See :func:`to_sb3`."""
+
+    def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any) -> None:
+        self.env = env
+        self.residual_to = residual_to
+        self._policy_memory: Any = None
+        self._shown: Any = None
+        self._start = numpy.ones(env.num_envs, dtype=bool)
+        self.staggered = staggered
+        self.started = time.time()
+        self.returns = numpy.zeros(env.num_envs)
+        """Sum of rewards of the running episodes."""
+        self.lengths = numpy.zeros(env.num_envs, dtype=int)
+        """Decisions taken in them."""
+        self._actions: Any = None
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self.metadata = env.metadata
+
+    def reset(self) -> numpy.ndarray:
+        """Start new episodes with the seeds given to :meth:`seed`; options do nothing, as in the environment."""
+        count = self.num_envs
+        cut = numpy.arange(count) * self.env.last_decision // count
+        options = {"shortened_by": cut} if self.staggered else None
+        observation, _ = self.env.reset(seed=self._seeds, options=options)
+        self.returns[:] = 0.0
+        self.lengths[:] = 0
+        self._reset_seeds()
+        self._reset_options()
+        self._shown, self._start = observation, numpy.ones(count, dtype=bool)
+        return observation
+
+    def seed_episodes(self, seeds: Sequence[int]) -> None:
+        """Give every environment a seed of its own for the next reset."""
+        self._seeds = list(seeds)
+
+    def step_async(self, actions: numpy.ndarray) -> None:
+        """Keep the actions for :meth:`step_wait`."""
+        if self.residual_to is not None:
+            own, self._policy_memory = self.residual_to.predict(
+                self._shown, self._policy_memory, self._start, deterministic=True
+            )
+            actions = own + actions
+        self._actions = actions
+
+    def step_wait(self) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
+        """Step every environment."""
+        observation, reward, _, finished, info = self.env.step(self._actions)
+        self.returns += reward
+        self.lengths += 1
+        self._shown, self._start = observation, finished
+        # One new dictionary for all that go on: whoever writes into it harms this step's only.
+        running: dict[str, Any] = {"TimeLimit.truncated": False}
+        infos = [running] * self.num_envs
+        if finished.any():
+            seconds = round(time.time() - self.started, 6)
+            for lane in numpy.flatnonzero(finished).tolist():
+                infos[lane] = {
+                    "TimeLimit.truncated": True,
+                    "terminal_observation": info["final_obs"][lane],
+                    "episode": {
+                        "r": round(float(self.returns[lane]), 6),
+                        "l": int(self.lengths[lane]),
+                        "t": seconds,
+                    },
+                }
+            self.returns[finished] = 0.0
+            self.lengths[finished] = 0
+        return observation, reward.astype(numpy.float32), finished, infos
+
+    def close(self) -> None:
+        """Close the vector environment."""
+        self.env.close()
+
+    # --- whole state, for checkpoints
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return everything that later steps depend on: states, noise, generators, running returns.
+
+        Arrays are shared with the environment, so pickle it before the next step.
+        """
+        lanes = {k: v for k, v in vars(self.env.lanes).items() if k not in _OF_THE_TASK}
+        policy = self._policy_memory, self._shown, self._start
+        return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Continue from a snapshot of an environment made with the same arguments.
+
+        Raises:
+            ValueError: if the number of environments differs.
+        """
+        if snapshot["lanes"]["count"] != self.num_envs:
+            raise ValueError(
+                f"the snapshot holds {snapshot['lanes']['count']} environments, not {self.num_envs}"
+            )
+        lanes: Lanes = self.env.lanes
+        vars(lanes).update(snapshot["lanes"])
+        self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
+        self._policy_memory, self._shown, self._start = snapshot["policy"]
+
+    # --- the rest of Stable-Baselines3's interface
+
+    def _indices(self, indices: int | Iterable[int] | None) -> Sequence[int]:
+        return list(self._get_indices(indices))
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """Return an attribute of the vector environment, once for each environment asked for."""
+        return [getattr(self.env, attr_name) for _ in self._indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Refuse: the environments are one object and its parameters are fixed."""
+        raise NotImplementedError(
+            f"cannot set {attr_name!r}: a task is fixed when it is made; make a new vector environment"
+        )
+
+    def env_method(
+        self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **keywords: Any
+    ) -> list[Any]:
+        """Refuse: there are no separate environments to call."""
+        raise NotImplementedError(
+            f"cannot call {method_name!r} on one environment: they are one native object"
+        )
+
+    def env_is_wrapped(
+        self, wrapper_class: type[gymnasium.Wrapper], indices: int | Iterable[int] | None = None
+    ) -> list[bool]:
+        """Say yes to ``Monitor``, whose statistics the adapter reports, and to nothing else."""
+        return [wrapper_class is Monitor for _ in self._indices(indices)]

@@ -1,0 +1,227 @@
+"""Learning through the filter: a small recurrent policy trained on the gradient of the episode's cost.
+
+The task on torch tensors is differentiable from the action to the reward of every later measurement. So no
+value function and no exploration are needed: the mean cost of a batch of episodes is differentiated through
+filter and policy (back-propagation through time) and descended by Adam. Where an episode is long, the
+gradient is cut every ``truncation`` measurements (truncated back-propagation): values go on, gradients stop.
+"""
+
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy
+import torch
+from stable_baselines3.common.logger import Logger, make_output_format
+
+from ..baselines.seeds import episode_seeds
+from ..envs.catalogue import make_task
+from ..envs.environment import TaskVectorEnv
+from ..envs.lanes import Lanes
+from .learned_policy import LearnedPolicy, write_arrays
+from .training_run import Bookkeeping, TrainingRun, interruption
+
+
+class RecurrentPolicy(torch.nn.Module):
+    """Observation, normalised -> GRU -> tanh -> box of the actions."""
+
+    low: torch.Tensor
+    high: torch.Tensor
+    mean: torch.Tensor
+    scale: torch.Tensor
+
+    def __init__(self, observations: int, space: gymnasium.spaces.Box, hidden_size: int) -> None:
+        super().__init__()
+        self.gru = torch.nn.GRUCell(observations, hidden_size)
+        self.head = torch.nn.Linear(hidden_size, space.shape[0])
+        with torch.no_grad():
+            # Begin near the middle of the box, with a gradient.
+            self.head.weight.mul_(0.1)
+            self.head.bias.zero_()
+        self.register_buffer("low", torch.as_tensor(space.low))
+        self.register_buffer("high", torch.as_tensor(space.high))
+        self.register_buffer("mean", torch.zeros(observations))
+        self.register_buffer("scale", torch.ones(observations))
+
+    def forward(self, observation: torch.Tensor, hidden: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Answer observations ``(N, fields)`` and memory ``(N, hidden)`` with actions and memory."""
+        shown = ((observation.float() - self.mean) / self.scale).clamp(-10.0, 10.0)
+        hidden = self.gru(shown, hidden)
+        return self.low + (self.high - self.low) * 0.5 * (1.0 + torch.tanh(self.head(hidden))), hidden
+
+    def arrays(self) -> dict[str, numpy.ndarray]:
+        """Return the policy as a :class:`~.learned_policy.LearnedPolicy` takes it."""
+        named = {
+            "observation_mean": self.mean,
+            "observation_scale": self.scale,
+            "gru_input_weight": self.gru.weight_ih,
+            "gru_input_bias": self.gru.bias_ih,
+            "gru_memory_weight": self.gru.weight_hh,
+            "gru_memory_bias": self.gru.bias_hh,
+            "weight_0": self.head.weight,
+            "bias_0": self.head.bias,
+        }
+        return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
+
+
+def detached(values: Any) -> Any:
+    """Cut the gradient of nested tuples of tensors."""
+    if isinstance(values, tuple):
+        parts = [detached(part) for part in values]
+        return type(values)(*parts) if hasattr(values, "_fields") else tuple(parts)
+    return values.detach() if isinstance(values, torch.Tensor) else values
+
+
+def cut_gradient(lanes: Lanes) -> None:
+    """Let later steps of the lanes not differentiate through what has happened so far."""
+    lanes.state, lanes.paper_state = detached(lanes.state), detached(lanes.paper_state)
+    lanes._interval_mean = detached(lanes._interval_mean)
+
+
+def descend_episodes(env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int) -> float:
+    """Fly one episode in every environment and add the gradient of the mean cost to the policy's.
+
+    Args:
+        env: with torch backend and autoreset mode "Disabled".
+        policy: whose gradients are added to.
+        truncation: decisions through which the gradient flows back.
+
+    Returns:
+        Mean cost of a measurement, the reward's (capped) one.
+    """
+    observation, _ = env.reset()
+    hidden = torch.zeros(env.num_envs, policy.gru.hidden_size)
+    total, pending = 0.0, torch.zeros(())
+    for decision in range(1, env.last_decision + 1):
+        action, hidden = policy(observation, hidden)
+        # In double, so that the filter's state is not rounded to the network's precision.
+        observation, reward, _, _, _ = env.step(action.double())
+        pending = pending - reward.mean() / env.last_decision
+        if decision % truncation == 0 or decision == env.last_decision:
+            pending.backward()
+            total += float(pending.detach())
+            pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
+            cut_gradient(env.lanes)
+    return total
+
+
+def measure_normalisation(env: TaskVectorEnv, policy: RecurrentPolicy) -> None:
+    """Set the policy's normalisation to the observations that its first actions bring about."""
+    observation, _ = env.reset()
+    hidden = torch.zeros(env.num_envs, policy.gru.hidden_size)
+    seen = []
+    with torch.no_grad():
+        for _ in range(env.last_decision):
+            seen.append(observation)
+            action, hidden = policy(observation, hidden)
+            observation = env.step(action.double())[0]
+        every = torch.cat(seen)
+        policy.mean.copy_(every.mean(0))
+        policy.scale.copy_(every.std(0).clamp_min(1e-3))
+
+
+def _saved_generators(env: TaskVectorEnv) -> str:
+    return json.dumps([generator.bit_generator.state for generator in env.lanes.generators])
+
+
+def _load(folder: Path, policy: RecurrentPolicy, optimiser: torch.optim.Adam, env: TaskVectorEnv) -> int:
+    """Go on from a checkpoint; returns the environment steps done."""
+    try:
+        # weights_only: nothing in the file is executed.
+        kept = torch.load(folder / "checkpoint.pt", weights_only=True)
+        policy.load_state_dict(kept["policy"])
+        optimiser.load_state_dict(kept["optimiser"])
+        for generator, state in zip(env.lanes.generators, json.loads(kept["generators"]), strict=True):
+            generator.bit_generator.state = state
+    except Exception as error:  # torch raises whatever a corrupt file makes it stumble over
+        raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
+    return int(kept["steps"])
+
+
+def train_bptt(
+    run: TrainingRun,
+    folder: Path,
+    resume: bool = False,
+    interval: int | None = None,
+    progress: Callable[[int], None] = lambda steps: None,
+    report: Callable[[str], None] = lambda line: None,
+) -> TrainingRun:
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
+
+    Arguments as in :func:`.sb3_training.train_sb3`.
+
+    Raises:
+        ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
+    """
+    task = make_task(run.environment, run.control, run.scenario)
+    space = task.action_space
+    if not isinstance(space, gymnasium.spaces.Box):
+        raise ValueError(
+            f"algorithm 'bptt' needs the gradient of continuous actions, but control {run.control!r} has "
+            f"{space}: choose dqn or ppo, or another control"
+        )
+    values = run.hyperparameters
+    torch.manual_seed(run.seed)
+    env = TaskVectorEnv(
+        run.environment,
+        run.envs,
+        control=run.control,
+        scenario=run.scenario,
+        backend="torch",
+        autoreset_mode="Disabled",
+    )
+    env.reset(seed=episode_seeds("train", run.seed, run.envs))
+    policy = RecurrentPolicy(len(task.fields), space, values["hidden_size"])
+    optimiser = torch.optim.Adam(policy.parameters(), lr=values["learning_rate"])
+    steps_done = 0
+    if resume:
+        steps_done = _load(folder / "checkpoint", policy, optimiser, env)
+    else:
+        measure_normalisation(env, policy)
+
+    def save_checkpoint(place: Path) -> None:
+        kept = {
+            "policy": policy.state_dict(),
+            "optimiser": optimiser.state_dict(),
+            "generators": _saved_generators(env),
+            "steps": steps_done,
+        }
+        torch.save(kept, place / "checkpoint.pt")
+
+    def save_agent(place: Path) -> None:
+        write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
+
+    log = folder / "log"
+    formats = ["csv"] + (["tensorboard"] if importlib.util.find_spec("tensorboard") else [])
+    logger = Logger(str(log), [make_output_format(f, str(log), f"_{steps_done}") for f in formats])
+    per_iteration = run.envs * env.last_decision
+    with interruption() as stop:
+        books = Bookkeeping(
+            run,
+            folder,
+            interval or max(1, run.steps // 20),
+            save_checkpoint,
+            save_agent,
+            lambda task: LearnedPolicy(task, policy.arrays(), "tanh"),
+            stop,
+            report,
+        )
+        stopping = False
+        while steps_done < run.steps and not stopping:
+            optimiser.zero_grad()
+            cost = descend_episodes(env, policy, values["truncation"])
+            norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
+            optimiser.step()
+            steps_done += per_iteration
+            logger.record("train/cost", cost)
+            logger.record("train/gradient_norm", float(norm))
+            logger.dump(steps_done)
+            progress(steps_done)
+            stopping = books.safe_point(steps_done)
+        if not stopping and run.steps_done < steps_done:
+            books.safe_point(steps_done, last=True)
+    logger.close()
+    return run

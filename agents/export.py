@@ -1,0 +1,75 @@
+"""From a training run to a learned policy without torch: the network's arrays and the run's record."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy
+import torch
+
+from .learned_policy import read_header, write_arrays
+from .sb3_training import Sb3Policy, load_sb3_policy
+from .training_run import TrainingRun, load_run, save_run
+
+
+def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
+    """Arrays of the linear layers in order, and the activation between them."""
+    parts = [part for module in modules for part in module.modules() if not list(part.children())]
+    linear = [part for part in parts if isinstance(part, torch.nn.Linear)]
+    between = {type(part) for part in parts} - {torch.nn.Linear, torch.nn.Flatten}
+    if not between <= {torch.nn.Tanh, torch.nn.ReLU} or len(between) > 1:
+        raise ValueError(f"cannot export a network with {', '.join(sorted(c.__name__ for c in between))}")
+    arrays = {}
+    for i, layer in enumerate(linear):
+        arrays[f"weight_{i}"], arrays[f"bias_{i}"] = (
+            layer.weight.detach().numpy(),
+            layer.bias.detach().numpy(),
+        )
+    return arrays, "relu" if torch.nn.ReLU in between else "tanh"
+
+
+def network_arrays(agent: Sb3Policy, algorithm: str) -> tuple[dict[str, numpy.ndarray], str, str]:
+    """Arrays, output and activation of a trained model's deterministic action.
+
+    Raises:
+        ValueError: for an algorithm or network that a learned policy cannot hold.
+    """
+    policy: Any = agent.model.policy
+    discrete = not hasattr(agent.action_space, "low")
+    if algorithm == "ppo":
+        arrays, activation = _layers(policy.mlp_extractor.policy_net, policy.action_net)
+        output = "argmax" if discrete else "clip"
+    elif algorithm == "sac":
+        arrays, activation = _layers(policy.actor.latent_pi, policy.actor.mu)
+        output = "tanh"
+    elif algorithm == "dqn":
+        arrays, activation = _layers(policy.q_net.q_net)
+        output = "argmax"
+    else:
+        raise ValueError(f"cannot export algorithm {algorithm!r}: choose from ppo, sac, dqn, bptt")
+    fields = arrays["weight_0"].shape[1]
+    mean, scale = numpy.zeros(fields), numpy.ones(fields)
+    if agent.normalisation is not None:
+        statistics: Any = agent.normalisation.obs_rms
+        mean, scale = statistics.mean, numpy.sqrt(statistics.var + agent.normalisation.epsilon)
+    return {"observation_mean": mean, "observation_scale": scale, **arrays}, output, activation
+
+
+def export_run(folder: Path, out: Path) -> TrainingRun:
+    """Write the best agent of a run as ``out``, with its ``run.json`` beside it under the same name.
+
+    Raises:
+        ValueError: if the folder holds no run, or none that can be exported.
+    """
+    run = load_run(folder)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if run.algorithm == "bptt":
+        source = folder / "best" / "agent.safetensors"
+        read_header(source)
+        shutil.copyfile(source, out)
+    else:
+        agent = load_sb3_policy(folder / "best" / "model.zip", run.algorithm)
+        arrays, output, activation = network_arrays(agent, run.algorithm)
+        write_arrays(out, arrays, run, output, activation)
+    save_run(run, out.with_suffix(".json"))
+    return run

@@ -1,0 +1,168 @@
+"""Learned policies as plain arrays: NumPy inference, no torch, nothing executed on load.
+
+A file is in the safetensors form: arrays, and a header of words. ``observation_mean`` and
+``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
+(reset, update, new), ``weight_i`` and ``bias_i`` the layers after it. The header names the environment, the
+control and the fields of the observation, so that an agent is never shown what it was not trained on.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy
+
+from ..baselines.policy import Policy
+from ..envs.catalogue import make_task, task_class
+from ..envs.task import Task
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
+    "tanh": numpy.tanh,
+    "relu": lambda x: numpy.maximum(x, 0.0),
+}
+OUTPUTS = ("clip", "tanh", "argmax")
+"""How the last layer becomes an action: cut to the box, squashed into it, or the largest entry's index."""
+OBSERVATION_LIMIT = 10.0
+"""Normalised observations are cut here, as in VecNormalize."""
+
+
+def _logistic(x: numpy.ndarray) -> numpy.ndarray:
+    return 0.5 * (1.0 + numpy.tanh(0.5 * x))
+
+
+class LearnedPolicy(Policy):
+    """A network with fixed weights, with or without memory.
+
+    Args:
+        task: whose observations it is shown.
+        arrays: float32, named as in the module's description.
+        output: one of ``OUTPUTS``.
+        activation: between layers, "tanh" or "relu".
+    """
+
+    def __init__(
+        self, task: Task, arrays: Mapping[str, numpy.ndarray], output: str, activation: str = "tanh"
+    ) -> None:
+        super().__init__(task)
+        self.control = task.control  # type: ignore[misc]  # as it was trained
+        self.arrays, self.output = arrays, output
+        self.activation = ACTIVATIONS[activation]
+        self.layers = [
+            (arrays[f"weight_{i}"], arrays[f"bias_{i}"])
+            for i in range(sum(name.startswith("weight_") for name in arrays))
+        ]
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Run the network in float32, as it was trained."""
+        a = self.arrays
+        x = (observation - a["observation_mean"]) / a["observation_scale"]
+        x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(numpy.float32)
+        if "gru_input_weight" in a:
+            width = a["gru_memory_weight"].shape[1]
+            memory = numpy.zeros((len(x), width), numpy.float32) if state is None else state
+            memory = numpy.where(start[:, None], numpy.float32(0.0), memory)
+            x = state = self._remembered(x, memory)
+        for i, (weight, bias) in enumerate(self.layers):
+            x = x @ weight.T + bias
+            if i < len(self.layers) - 1:
+                x = self.activation(x)
+        if self.output == "argmax":
+            return x.argmax(axis=1), state
+        space: Any = self.task.action_space
+        if self.output == "clip":
+            return numpy.clip(x, space.low, space.high), state
+        return space.low + (space.high - space.low) * 0.5 * (1.0 + numpy.tanh(x)), state
+
+    def _remembered(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
+        """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
+        a = self.arrays
+        from_input = numpy.split(x @ a["gru_input_weight"].T + a["gru_input_bias"], 3, axis=1)
+        from_memory = numpy.split(memory @ a["gru_memory_weight"].T + a["gru_memory_bias"], 3, axis=1)
+        reset = _logistic(from_input[0] + from_memory[0])
+        update = _logistic(from_input[1] + from_memory[1])
+        new = numpy.tanh(from_input[2] + reset * from_memory[2])
+        return (1.0 - update) * new + update * memory
+
+
+def write_arrays(
+    path: Path, arrays: Mapping[str, numpy.ndarray], run: Any, output: str, activation: str = "tanh"
+) -> None:
+    """Write a learned policy and the record of the run that it comes from."""
+    from safetensors.numpy import save
+
+    fields = [field.name for field in make_task(run.environment, run.control).fields]
+    header = {
+        "environment": run.environment,
+        "control": run.control,
+        "fields": json.dumps(fields),
+        "output": output,
+        "activation": activation,
+        "run": json.dumps(asdict(run)),
+    }
+    contiguous = {name: numpy.ascontiguousarray(a, dtype=numpy.float32) for name, a in arrays.items()}
+    partial = path.with_name(path.name + ".partial")
+    partial.write_bytes(save(contiguous, header))
+    partial.replace(path)
+
+
+def read_header(path: Path) -> dict[str, Any]:
+    """Return the header of a learned policy's file; ``run`` and ``fields`` are parsed.
+
+    Raises:
+        ValueError: if the file is not one.
+    """
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header: dict[str, Any] = dict(file.metadata() or {})
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        header |= {name: json.loads(header[name]) for name in ("fields", "run")}
+        if header["output"] not in OUTPUTS or header["activation"] not in ACTIVATIONS:
+            raise KeyError("output or activation")
+    except FileNotFoundError as error:
+        raise ValueError(f"no learned policy at {path}") from error
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{path} is not a learned policy of filtergym: {error}") from error
+    return arrays, header
+
+
+class _Stored:
+    """Makes the policy of a file for a task; what an evaluation calls."""
+
+    def __init__(self, path: Path) -> None:
+        self.arrays, self.header = _read(path)
+        self.path = path
+        self.control = self.header["control"]
+
+    def __call__(self, task: Task) -> LearnedPolicy:
+        fields = [field.name for field in task.fields]
+        if fields != self.header["fields"]:
+            raise ValueError(
+                f"{self.path} was trained on other fields than {task.id} shows: {self.header['fields']}"
+            )
+        return LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
+
+
+def stored_policy(id: str, path: Path) -> _Stored:
+    """Load a learned policy from a file.
+
+    Raises:
+        ValueError: if the file is not one, or it is of another environment.
+    """
+    stored = _Stored(path)
+    if stored.header["environment"] != task_class(id).id:
+        raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {task_class(id).id}")
+    return stored
+
+
+def pretrained_path(id: str, name: str) -> Path:
+    """File of a shipped agent, whether or not there is one."""
+    return PRETRAINED / task_class(id).id.removeprefix("filtergym/") / f"{name}.safetensors"

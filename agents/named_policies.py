@@ -1,0 +1,28 @@
+"""Policies that an evaluation finds by name or file: shipped agents, exported ones, and models' zips."""
+
+from pathlib import Path
+from typing import Any
+
+from .learned_policy import pretrained_path, stored_policy
+
+
+def learned_policy(id: str, name: str) -> Any:
+    """Return what makes a learned policy for a task, or None if the name means nothing here.
+
+    Args:
+        id: environment id.
+        name: of a shipped agent (``ppo``, ``bptt``), or a file: ``.safetensors``, or the ``.zip`` of a
+            Stable-Baselines3 model, which can execute code while it is loaded.
+    """
+    if name.endswith(".safetensors"):
+        return stored_policy(id, Path(name))
+    if name.endswith(".zip"):
+        try:
+            from .sb3_training import load_sb3_policy
+        except ImportError as error:
+            raise ValueError(
+                f"policy {name!r} needs more packages: pip install 'filtergym[agents]'"
+            ) from error
+        return load_sb3_policy(Path(name))
+    shipped = pretrained_path(id, name)
+    return stored_policy(id, shipped) if shipped.exists() else None

@@ -1,0 +1,93 @@
+"""Residual agents: the agent's action is added to that of a policy that already works.
+
+Zero is exactly the policy, so learning starts from it instead of from nothing. The sum is taken at the edge
+of the action space, as every action is. Training over many environments: ``to_sb3(env, residual_to=policy)``.
+"""
+
+from typing import Any
+
+import gymnasium
+import numpy
+
+from ..baselines.policy import Policy
+from ..envs.environment import TaskEnv
+from ..envs.task import Task
+
+
+def check_residual(task: Task, policy: Any) -> None:
+    """Raise ValueError if actions of this task and policy cannot be added."""
+    if not isinstance(task.action_space, gymnasium.spaces.Box):
+        raise ValueError(
+            f"a residual action is added: control {task.control!r} has {task.action_space}, choose another"
+        )
+    own = getattr(policy, "control", task.control)
+    if own != task.control:
+        raise ValueError(f"the policy is made for control {own!r}, but the environment has {task.control!r}")
+
+
+class ResidualActions(gymnasium.Wrapper):
+    """A single environment whose actions are added to a policy's.
+
+    Args:
+        env: a filtergym environment with a control of continuous actions.
+        policy: anything with Stable-Baselines3's ``predict``, for the same control.
+
+    Raises:
+        ValueError: if actions cannot be added.
+    """
+
+    def __init__(self, env: gymnasium.Env, policy: Any) -> None:
+        super().__init__(env)
+        inner: Any = env.unwrapped
+        if not isinstance(inner, TaskEnv):
+            raise ValueError(f"ResidualActions takes an environment of filtergym, got {type(inner).__name__}")
+        check_residual(inner.task, policy)
+        self.policy = policy
+        self._shown: Any = None
+        self._memory: Any = None
+        self._start = numpy.ones(1, dtype=bool)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[numpy.ndarray, dict[str, Any]]:
+        """Start an episode, and the policy's memory with it."""
+        self._shown, info = self.env.reset(seed=seed, options=options)
+        self._memory, self._start = None, numpy.ones(1, dtype=bool)
+        return self._shown, info
+
+    def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
+        """Add the policy's action and step."""
+        if self._shown is None:
+            raise gymnasium.error.ResetNeeded("call reset before the first step")
+        own, self._memory = self.policy.predict(
+            self._shown[None], self._memory, self._start, deterministic=True
+        )
+        self._start = numpy.zeros(1, dtype=bool)
+        self._shown, reward, terminated, truncated, info = self.env.step(own[0] + numpy.asarray(action))
+        return self._shown, reward, terminated, truncated, info
+
+
+class ResidualPolicy(Policy):
+    """A policy and the agent that corrects it, as one policy for an evaluation.
+
+    Args:
+        task: of both.
+        policy: the one that is corrected.
+        agent: the correction.
+
+    Raises:
+        ValueError: if actions cannot be added.
+    """
+
+    def __init__(self, task: Task, policy: Any, agent: Any) -> None:
+        super().__init__(task)
+        check_residual(task, policy)
+        self.control = task.control  # type: ignore[misc]
+        self.policy, self.agent = policy, agent
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Add both answers."""
+        memory, agent_memory = (None, None) if state is None else state
+        own, memory = self.policy.predict(observation, memory, start, deterministic=True)
+        correction, agent_memory = self.agent.predict(observation, agent_memory, start, deterministic=True)
+        return own + correction, (memory, agent_memory)

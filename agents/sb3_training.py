@@ -1,0 +1,266 @@
+"""Training with Stable-Baselines3 over the native vector environment, to be stopped and resumed at will.
+
+A checkpoint holds the model with its optimiser, the normalisation, the replay buffer if there is one, the
+environments in the middle of their episodes, and every random generator: a run that was resumed equals one
+that never stopped. It is loaded with pickle: never resume from a stranger's folder.
+"""
+
+import importlib.util
+import pickle
+import random
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy
+import torch
+from sb3_contrib import RecurrentPPO
+from stable_baselines3 import DQN, PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import VecNormalize
+
+from ..baselines.seeds import episode_seeds
+from ..envs.catalogue import make_task
+from .adapter import TaskVecEnv, to_sb3
+from .training_run import Bookkeeping, TrainingRun, interruption
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
+}  # fmt: skip
+SPACES: dict[str, tuple[type[gymnasium.Space], ...]] = {
+    "ppo": (gymnasium.spaces.Box, gymnasium.spaces.Discrete),
+    "recurrent-ppo": (gymnasium.spaces.Box, gymnasium.spaces.Discrete),
+    "sac": (gymnasium.spaces.Box,),
+    "dqn": (gymnasium.spaces.Discrete,),
+}
+
+
+# What unpickling a corrupt file stumbles over.
+UNREADABLE = (
+    OSError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError,
+    AttributeError, ImportError, RuntimeError,
+)  # fmt: skip
+
+
+class Sb3Policy:
+    """A trained model with the normalisation of its observations, as a policy for an evaluation."""
+
+    def __init__(self, model: BaseAlgorithm, normalisation: VecNormalize | None, control: str | None = None):
+        self.model, self.normalisation = model, normalisation
+        self.observation_space, self.action_space = model.observation_space, model.action_space
+        if control is not None:
+            self.control = control
+
+    def predict(
+        self,
+        observation: numpy.ndarray,
+        state: Any = None,
+        episode_start: numpy.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[numpy.ndarray, Any]:
+        """Choose actions, as Stable-Baselines3 does."""
+        if self.normalisation is not None:
+            normalised: Any = self.normalisation.normalize_obs(observation)
+            observation = normalised
+        return self.model.predict(observation, state, episode_start, deterministic)
+
+
+def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | None = None) -> Sb3Policy:
+    """Load a model's zip, with ``vecnormalize.pkl`` beside it if there is one.
+
+    Both can execute code while they are loaded: open only what you trust.
+
+    Raises:
+        ValueError: if there is no such file, or it is not a model.
+    """
+    try:
+        if algorithm is None:
+            data = load_from_zip_file(path, device="cpu")[0] or {}
+            base = {c.__name__ for c in data["policy_class"].__mro__}
+            algorithm = next(
+                name
+                for name, policy in (
+                    ("recurrent-ppo", "RecurrentActorCriticPolicy"), ("ppo", "ActorCriticPolicy"),
+                    ("sac", "SACPolicy"), ("dqn", "DQNPolicy"),
+                )
+                if policy in base
+            )  # fmt: skip
+        model = ALGORITHMS[algorithm].load(path, device="cpu")
+        beside = path.with_name("vecnormalize.pkl")
+        normalisation = None
+        if beside.exists():
+            with beside.open("rb") as file:
+                normalisation = pickle.load(file)
+            normalisation.training = False
+    except FileNotFoundError as error:
+        raise ValueError(f"no model at {path}") from error
+    except StopIteration as error:
+        raise ValueError(
+            f"{path} is a model of an algorithm that is not one of {', '.join(ALGORITHMS)}"
+        ) from error
+    except UNREADABLE as error:
+        raise ValueError(f"cannot read the model {path}: {error}") from error
+    return Sb3Policy(model, normalisation, control)
+
+
+class _Trainer(BaseCallback):
+    """Lets the bookkeeping work between an update and the next rollout."""
+
+    def __init__(self, books: Bookkeeping, progress: Callable[[int], None]) -> None:
+        super().__init__()
+        self.books, self.progress, self.stopping = books, progress, False
+
+    def _on_rollout_start(self) -> None:
+        self.stopping = self.stopping or self.books.safe_point(self.model.num_timesteps)
+
+    def _on_step(self) -> bool:
+        self.progress(self.model.num_timesteps)
+        return not self.stopping
+
+
+def training_environment(run: TrainingRun) -> TaskVecEnv:
+    """Make the environments of a run, seeded by the training split."""
+    env = gymnasium.make_vec(
+        run.environment,
+        num_envs=run.envs,
+        autoreset_mode="SameStep",
+        control=run.control,
+        scenario=run.scenario,
+    )
+    adapted = to_sb3(env)
+    adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
+    return adapted
+
+
+def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
+    """Write ``model.zip`` and ``vecnormalize.pkl``."""
+    model.save(folder / "model.zip")
+    if normalisation is not None:
+        normalisation.save(str(folder / "vecnormalize.pkl"))
+
+
+def save_checkpoint(
+    model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
+) -> None:
+    """Write everything that later steps depend on."""
+    save_model(model, normalisation, folder)
+    if isinstance(model, OffPolicyAlgorithm):
+        model.save_replay_buffer(folder / "replay_buffer.pkl")
+    rest = {
+        "environment": env.snapshot(),
+        "returns": None if normalisation is None else normalisation.returns,
+        "original": None if normalisation is None else (normalisation.old_obs, normalisation.old_reward),
+        "torch": torch.get_rng_state(),
+        "numpy": numpy.random.get_state(),  # noqa: NPY002 (what Stable-Baselines3 draws from)
+        "python": random.getstate(),
+        "action_space": model.action_space.np_random,
+        "lstm": getattr(model, "_last_lstm_states", None),
+    }
+    (folder / "rest.pkl").write_bytes(pickle.dumps(rest))
+
+
+def load_checkpoint(run: TrainingRun, folder: Path) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
+    """Go on where a checkpoint was written.
+
+    Raises:
+        ValueError: if a file is missing or corrupt.
+    """
+    adapted = training_environment(run)
+    env: Any = adapted
+    normalisation = None
+    try:
+        if (folder / "vecnormalize.pkl").exists():
+            env = normalisation = VecNormalize.load(str(folder / "vecnormalize.pkl"), adapted)
+        model = ALGORITHMS[run.algorithm].load(folder / "model.zip", env, device="cpu", force_reset=False)
+        if isinstance(model, OffPolicyAlgorithm):
+            model.load_replay_buffer(folder / "replay_buffer.pkl")
+        rest = pickle.loads((folder / "rest.pkl").read_bytes())
+        adapted.restore(rest["environment"])
+    except UNREADABLE as error:
+        raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
+    if normalisation is not None:
+        normalisation.returns = rest["returns"]
+        normalisation.old_obs, normalisation.old_reward = rest["original"]
+    torch.set_rng_state(rest["torch"])
+    numpy.random.set_state(rest["numpy"])  # noqa: NPY002
+    random.setstate(rest["python"])
+    model.action_space._np_random = rest["action_space"]
+    if isinstance(model, RecurrentPPO):
+        model._last_lstm_states = rest["lstm"]  # loading has set them to zero
+    return model, adapted, normalisation
+
+
+def check_algorithm(run: TrainingRun) -> None:
+    """Raise ValueError if the algorithm does not fit the control's action space."""
+    space = make_task(run.environment, run.control).action_space
+    if not isinstance(space, SPACES[run.algorithm]):
+        fitting = [name for name, kinds in SPACES.items() if isinstance(space, kinds)]
+        raise ValueError(
+            f"algorithm {run.algorithm!r} does not fit control {run.control!r} of {run.environment} with "
+            f"actions {space}: choose from {', '.join(fitting)}, or another control"
+        )
+
+
+def train_sb3(
+    run: TrainingRun,
+    folder: Path,
+    resume: bool = False,
+    interval: int | None = None,
+    progress: Callable[[int], None] = lambda steps: None,
+    report: Callable[[str], None] = lambda line: None,
+) -> TrainingRun:
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
+
+    Args:
+        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
+        folder: of the run; exists.
+        resume: go on from ``folder/checkpoint``.
+        interval: environment steps between two validations; default: a twentieth of the run.
+        progress: told of all environment steps done so far.
+        report: told of every validation.
+    """
+    check_algorithm(run)
+    values = dict(run.hyperparameters)
+    normalize = values.pop("normalize", False)
+    normalisation: VecNormalize | None = None
+    if resume:
+        model, adapted, normalisation = load_checkpoint(run, folder / "checkpoint")
+    else:
+        adapted = training_environment(run)
+        env: Any = adapted
+        if normalize:
+            # A Q-value of minus hundreds learns slowly; a discounted return of order one does not.
+            env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
+        model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
+        adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
+    log = folder / "log"
+    formats = ["csv"]
+    if importlib.util.find_spec("tensorboard") is not None:
+        formats.append("tensorboard")
+    suffix = f"_{model.num_timesteps}"
+    model.set_logger(Logger(str(log), [make_output_format(f, str(log), suffix) for f in formats]))
+    policy = Sb3Policy(model, normalisation, run.control)
+    with interruption() as stop:
+        books = Bookkeeping(
+            run,
+            folder,
+            interval or max(1, run.steps // 20),
+            lambda place: save_checkpoint(model, adapted, normalisation, place),
+            lambda place: save_model(model, normalisation, place),
+            policy,
+            stop,
+            report,
+        )
+        trainer = _Trainer(books, progress)
+        remaining = run.steps - model.num_timesteps
+        if remaining > 0:
+            model.learn(remaining, callback=trainer, reset_num_timesteps=not resume)
+        if not trainer.stopping:
+            books.safe_point(model.num_timesteps, last=True)
+    return run

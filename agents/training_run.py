@@ -1,0 +1,264 @@
+"""What every training run has, whatever the algorithm: its folder, its record, and its validation.
+
+A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
+one, from which ``--resume`` goes on), ``best/`` (the agent with the lowest validation cost) and the log.
+"""
+
+import importlib.metadata
+import json
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from ..baselines.evaluation import baselines_of, evaluate
+from ..baselines.metrics import tidy_records
+from ..envs.catalogue import find_scenario, nearest, task_class
+
+FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
+"""Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
+VALIDATION_EPISODES = 512
+
+
+@dataclass
+class TrainingRun:
+    """The content of ``run.json``."""
+
+    environment: str
+    control: str
+    scenario: str
+    algorithm: str
+    seed: int
+    envs: int
+    steps: int
+    """Environment steps asked for."""
+    hyperparameters: dict[str, Any]
+    command: str = ""
+    steps_done: int = 0
+    seconds: float = 0.0
+    """Time spent, over all sessions."""
+    versions: dict[str, str] = field(default_factory=dict)
+    validation: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def best(self) -> dict[str, Any] | None:
+        """The validation with the lowest cost."""
+        return min(self.validation, key=lambda entry: entry["cost"], default=None)
+
+
+def new_run(
+    environment: str,
+    algorithm: str,
+    control: str | None = None,
+    steps: int | None = None,
+    envs: int | None = None,
+    seed: int = 0,
+    scenario: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> TrainingRun:
+    """Describe a run; what is not given comes from the algorithm's hyperparameters.
+
+    Raises:
+        ValueError: for an unknown name, or a scenario that is held out.
+    """
+    cls = task_class(environment)
+    if algorithm not in FILES:
+        raise nearest("algorithm", algorithm, FILES)
+    if control is not None and control not in cls.controls:
+        raise nearest("control", control, cls.controls)
+    chosen = find_scenario(cls, scenario)
+    if not chosen.training:
+        allowed = [s.name for s in cls.scenarios.values() if s.training]
+        raise ValueError(
+            f"scenario {chosen.name!r} is held out: train on a training scenario ({', '.join(allowed)})"
+        )
+    values = {**stored_hyperparameters(cls.id, algorithm), **(overrides or {})}
+    default_envs, default_steps = values.pop("n_envs"), values.pop("n_timesteps")
+    envs, steps = envs or int(default_envs), steps or int(default_steps)
+    if envs < 1 or steps < 1:
+        raise ValueError(f"envs and steps must be at least 1, got {envs} and {steps}")
+    if seed < 0:
+        raise ValueError(f"seed must not be negative, got {seed}")
+    return TrainingRun(cls.id, control or cls.controls[0], chosen.name, algorithm, seed, envs, steps, values)
+
+
+def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
+    """Return the hyperparameters of an algorithm for an environment.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    import yaml
+
+    file: Any = files(__package__).joinpath("hyperparameters", f"{FILES[algorithm]}.yml")
+    table = yaml.safe_load(file.read_text(encoding="utf-8"))
+    if id not in table:
+        raise ValueError(f"no hyperparameters of {algorithm} for {id}: add them to {file}")
+    return dict(table[id])
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of what a run's result depends on."""
+    versions = {}
+    for name in ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib"):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def save_run(run: TrainingRun, path: Path) -> None:
+    """Write a run's record, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(asdict(run), indent=1) + "\n", encoding="utf-8")
+    partial.replace(path)
+
+
+def load_run(folder: Path) -> TrainingRun:
+    """Read ``run.json``.
+
+    Raises:
+        ValueError: if there is none, or it is not one.
+    """
+    try:
+        return TrainingRun(**json.loads((folder / "run.json").read_text(encoding="utf-8")))
+    except FileNotFoundError as error:
+        raise ValueError(f"no training run in {folder}: it has no run.json") from error
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"cannot read {folder / 'run.json'}: {error}") from error
+
+
+def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
+    """Read the run of a folder to go on with it, up to the steps asked for.
+
+    Raises:
+        ValueError: if it is a run of something else.
+    """
+    run = load_run(folder)
+    for name in ("environment", "control", "scenario", "algorithm", "seed", "envs", "hyperparameters"):
+        if getattr(run, name) != getattr(asked, name):
+            raise ValueError(
+                f"{folder} holds a run with {name} {getattr(run, name)!r}, not {getattr(asked, name)!r}"
+            )
+    if not (folder / "checkpoint").is_dir():
+        raise ValueError(f"{folder} has no checkpoint to resume from")
+    run.steps = asked.steps
+    return run
+
+
+@contextmanager
+def replaced_folder(folder: Path) -> Iterator[Path]:
+    """Give a new folder that takes the place of an old one only when it is complete."""
+    partial, old = folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".old")
+    for leftover in (partial, old):
+        shutil.rmtree(leftover, ignore_errors=True)
+    partial.mkdir(parents=True)
+    yield partial
+    if folder.exists():
+        folder.rename(old)
+    partial.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def validation_score(run: TrainingRun, policy: Any) -> dict[str, Any]:
+    """Score an agent and the paper's algorithm on the same episodes of the validation split."""
+    paper = baselines_of(run.environment).score_paper
+    dataset = evaluate(
+        run.environment,
+        {"agent": policy, paper: paper},
+        run.scenario,
+        VALIDATION_EPISODES,
+        split="validation",
+    )
+    # The score's window is the first record of its kind: the whole episode, or the scenario's first window.
+    found: dict[tuple[str, str], Any] = {}
+    for record in tidy_records(dataset):
+        if record.window == "all" or (record.policy, record.metric) not in found:
+            found[record.policy, record.metric] = record
+    difference = found["agent", "relative_cost_difference"]
+    return {
+        "steps": run.steps_done,
+        "cost": found["agent", "cost"].value,
+        "paper": paper,
+        "paper_cost": found[paper, "cost"].value,
+        "relative_cost_difference": [difference.value, difference.low, difference.high],
+    }
+
+
+@contextmanager
+def interruption() -> Iterator[Callable[[], bool]]:
+    """Turn the first Ctrl-C into a wish to stop at the next safe point; the second one stops at once."""
+    wished = False
+
+    def wish(*_: Any) -> None:
+        nonlocal wished
+        wished = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, wish)
+    try:
+        yield lambda: wished
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class Bookkeeping:
+    """Decides when a run is validated and checkpointed, and does what that takes.
+
+    Args:
+        run: the record, kept up to date.
+        folder: of the run.
+        interval: environment steps between two validations, each followed by a checkpoint.
+        save_checkpoint: writes one into an empty folder.
+        save_agent: writes the agent alone into an empty folder.
+        policy: the agent as a policy for an evaluation.
+        stop: whether somebody wishes to stop.
+    """
+
+    def __init__(
+        self,
+        run: TrainingRun,
+        folder: Path,
+        interval: int,
+        save_checkpoint: Callable[[Path], None],
+        save_agent: Callable[[Path], None],
+        policy: Any,
+        stop: Callable[[], bool],
+        report: Callable[[str], None],
+    ) -> None:
+        self.run, self.folder, self.interval, self.policy, self.stop = run, folder, interval, policy, stop
+        self.save_checkpoint, self.save_agent, self.report = save_checkpoint, save_agent, report
+        self.due = run.steps_done + interval
+        self.began, self.seconds_before = time.monotonic(), run.seconds
+
+    def safe_point(self, steps_done: int, last: bool = False) -> bool:
+        """Between two updates: validate and save if it is time; returns whether to stop."""
+        stopping = self.stop()
+        if not (stopping or last or steps_done >= self.due):
+            return False
+        self.due = steps_done + self.interval
+        run = self.run
+        run.steps_done = steps_done
+        entry = validation_score(run, self.policy)
+        is_best = run.best is None or entry["cost"] < run.best["cost"]
+        run.validation.append(entry)
+        run.seconds = self.seconds_before + time.monotonic() - self.began
+        if is_best:
+            with replaced_folder(self.folder / "best") as best:
+                self.save_agent(best)
+        with replaced_folder(self.folder / "checkpoint") as checkpoint:
+            self.save_checkpoint(checkpoint)
+        save_run(run, self.folder / "run.json")
+        value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
+        self.report(
+            f"{steps_done:,} steps: validation cost {entry['cost']:.4g}, {entry['paper']} "
+            f"{entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
+        )
+        return stopping

@@ -1,0 +1,152 @@
+"""Shipped agents score what their records say; residual agents with zero correction are the policy itself."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
+from filtergym.agents.residual import ResidualActions, ResidualPolicy
+from filtergym.baselines.evaluation import evaluate, load_policy
+from filtergym.baselines.policy import ConstantPolicy
+from filtergym.envs.catalogue import make_task
+
+ID = "filtergym/ManeuveringTarget-v0"
+SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
+
+
+class Correction(ConstantPolicy):
+    control = "gain"
+    action = (0.0,)
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_shipped_agent_scores_what_its_record_says(file):
+    record = json.loads(file.with_suffix(".json").read_text(encoding="utf-8"))
+    best = min(record["validation"], key=lambda entry: entry["cost"])
+    dataset = evaluate(record["environment"], [file.stem, best["paper"]], episodes=512, split="validation")
+    cost = dataset["cost"].mean(["episode", "time"]).values
+    # The paper's algorithm amplifies rounding between processors; the agent's network is float32.
+    assert cost[0] == pytest.approx(best["cost"], rel=1e-3)
+    assert cost[1] == pytest.approx(best["paper_cost"], rel=1e-6)
+    assert cost[0] < cost[1]
+
+
+def test_there_are_shipped_agents():
+    assert {file.stem for file in SHIPPED} == {"ppo", "bptt"}
+
+
+def test_policy_of_another_environment_is_refused(tmp_path):
+    from filtergym.agents.learned_policy import stored_policy
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(SHIPPED[0], framework="numpy") as file:
+        header = dict(file.metadata())
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    save_file(arrays, tmp_path / "other.safetensors", header | {"environment": "filtergym/Other-v0"})
+    with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
+        stored_policy(ID, tmp_path / "other.safetensors")
+    save_file(arrays, tmp_path / "fields.safetensors", header | {"fields": '["range"]'})
+    with pytest.raises(ValueError, match="was trained on other fields"):
+        evaluate(ID, [str(tmp_path / "fields.safetensors")], episodes=1)
+
+
+def test_layers_by_hand():
+    task = make_task(ID, "gain")
+    count = len(task.fields)
+    arrays = {
+        "observation_mean": np.full(count, 1.0, np.float32),
+        "observation_scale": np.full(count, 2.0, np.float32),
+        "weight_0": np.eye(2, count, dtype=np.float32),
+        "bias_0": np.array([0.0, -1.0], np.float32),
+        "weight_1": np.array([[0.5, 0.25]], np.float32),
+        "bias_1": np.array([0.1], np.float32),
+    }
+    shown = np.zeros((3, count))
+    shown[:, 0], shown[:, 1] = [1.0, 2.0, 1e6], [1.0, 5.0, 1.0]
+    action = LearnedPolicy(task, arrays, "clip", "relu").predict(shown)[0]
+    # Normalised: (0, 0), (0.5, 2), (10 by the limit, 0); after the first layer (0, 0), (0.5, 1), (10, 0).
+    np.testing.assert_allclose(action[:, 0], [0.1, 0.6, 1.0], rtol=1e-6)
+
+
+def paid(env, actions):
+    shown, _ = env.reset(seed=3)
+    rows = [shown]
+    for action in actions:
+        shown, reward, _, truncated, _ = env.step(action(shown))
+        rows += [shown, reward]
+        assert not truncated
+    return rows
+
+
+def test_zero_correction_is_exactly_the_policy():
+    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+    env = ResidualActions(gymnasium.make(ID), policy)
+    memory = None
+
+    def alone(shown):
+        nonlocal memory
+        action, memory = policy.predict(shown[None], memory, np.array([memory is None]))
+        return action[0]
+
+    expected = paid(gymnasium.make(ID), [alone] * 60)
+    for _ in range(2):  # twice: the policy's memory starts anew with the episode
+        for one, other in zip(paid(env, [lambda _: np.zeros(1, np.float32)] * 60), expected, strict=True):
+            np.testing.assert_array_equal(one, other)
+    corrected = paid(env, [lambda _: np.full(1, 0.2)] * 60)
+    assert corrected[2] != expected[2]
+
+
+def test_zero_correction_is_exactly_the_policy_in_an_evaluation():
+    def corrected(task):
+        return ResidualPolicy(task, load_policy(ID, "adaptive")(task), Correction(task))
+
+    corrected.control = "gain"
+    dataset = evaluate(ID, {"adaptive": "adaptive", "residual": corrected}, episodes=20)
+    np.testing.assert_array_equal(dataset["cost"][0], dataset["cost"][1])
+
+
+def test_zero_correction_is_exactly_the_policy_through_the_adapter():
+    pytest.importorskip("stable_baselines3")
+    from filtergym.agents import to_sb3
+
+    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+
+    def native():
+        return gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", horizon=30)
+
+    env, alone = to_sb3(native(), staggered=True, residual_to=policy), to_sb3(native(), staggered=True)
+    env.seed(0)
+    alone.seed(0)
+    shown = env.reset()
+    np.testing.assert_array_equal(alone.reset(), shown)
+    memory, start = None, np.ones(5, dtype=bool)
+    for _ in range(70):
+        action, memory = policy.predict(shown, memory, start)
+        shown, reward, start, _ = alone.step(action)
+        other = env.step(np.zeros((5, 1), np.float32))
+        np.testing.assert_array_equal(other[0], shown)
+        np.testing.assert_array_equal(other[1], reward)
+
+
+def test_residuals_that_cannot_be():
+    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+    with pytest.raises(ValueError, match="made for control 'gain', but the environment has 'weights'"):
+        ResidualActions(gymnasium.make(ID, control="weights"), policy)
+    with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
+        ResidualActions(gymnasium.make(ID, control="mode"), policy)
+    with pytest.raises(ValueError, match="takes an environment of filtergym"):
+        ResidualActions(gymnasium.make("CartPole-v1"), policy)
+
+
+def test_shipped_agents_need_no_torch():
+    code = (
+        "import sys, filtergym\n"
+        "from filtergym.baselines import evaluate\n"
+        f"evaluate({ID!r}, ['ppo', 'bptt'], episodes=2)\n"
+        "assert not {'torch', 'stable_baselines3', 'yaml'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

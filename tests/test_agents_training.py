@@ -1,0 +1,290 @@
+"""Training runs: what they refuse, that a resumed one equals one that never stopped, and what they export."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+from filtergym.baselines.evaluation import evaluate, load_policy
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.environment import TaskVectorEnv
+
+pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+import torch
+from filtergym.agents import training_run
+from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
+from filtergym.agents.export import export_run
+from filtergym.agents.learned_policy import LearnedPolicy, read_header
+from filtergym.agents.sb3_training import load_sb3_policy, train_sb3
+from filtergym.agents.training_run import load_run, new_run, resumed_run
+
+ID = "filtergym/ManeuveringTarget-v0"
+SMALL = {
+    "ppo": {"n_steps": 30, "batch_size": 60, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}},
+    "recurrent-ppo": {
+        "n_steps": 30, "batch_size": 60, "n_epochs": 1, "policy_kwargs": {"net_arch": [4], "lstm_hidden_size": 4},
+    },
+    "sac": {"learning_starts": 60, "buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}},
+    "dqn": {"learning_starts": 60, "buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}},
+    "bptt": {"hidden_size": 4, "truncation": 40},
+}  # fmt: skip
+CONTROL = {"dqn": "mode"}
+
+
+@pytest.fixture(autouse=True)
+def few_validation_episodes(monkeypatch):
+    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 16)
+
+
+def small_run(algorithm, steps, envs=4, **keywords):
+    control = keywords.pop("control", CONTROL.get(algorithm, "gain"))
+    return new_run(ID, algorithm, control, steps, envs, overrides=SMALL[algorithm], **keywords)
+
+
+def train(run, folder, **keywords):
+    folder.mkdir(exist_ok=True)
+    trainer = train_bptt if run.algorithm == "bptt" else train_sb3
+    return trainer(run, folder, interval=keywords.pop("interval", 10**9), **keywords)
+
+
+def weights(algorithm, folder):
+    if algorithm == "bptt":
+        return torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]
+    agent = load_sb3_policy(folder / "checkpoint" / "model.zip", algorithm)
+    statistics = agent.normalisation.obs_rms
+    return {
+        **agent.model.policy.state_dict(),
+        "mean": torch.as_tensor(statistics.mean),
+        "var": torch.as_tensor(statistics.var),
+    }
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt"])
+def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
+    # Interrupted at about a third, in the middle of an episode except for bptt, which learns from whole ones.
+    steps = 1200 if algorithm == "bptt" else 720
+    train(small_run(algorithm, steps), tmp_path / "whole")
+    parts = tmp_path / "parts"
+    asked = []
+
+    def interrupt(done):
+        if done >= 200 and not asked:
+            asked.append(done)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    train(small_run(algorithm, steps), parts, progress=interrupt)
+    assert 200 <= load_run(parts).steps_done < 600
+    train(resumed_run(parts, small_run(algorithm, steps)), parts, resume=True)
+    assert load_run(parts).steps_done == load_run(tmp_path / "whole").steps_done == steps
+    one, other = weights(algorithm, parts), weights(algorithm, tmp_path / "whole")
+    assert one.keys() == other.keys()
+    for name, tensor in one.items():
+        assert torch.equal(tensor, other[name]), name
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_control_c_leaves_a_checkpoint_to_resume_from(algorithm, tmp_path):
+    told = []
+
+    def interrupt(steps):
+        if not told:
+            os.kill(os.getpid(), signal.SIGINT)
+        told.append(steps)
+
+    train(small_run(algorithm, 10_000), tmp_path, progress=interrupt)
+    done = load_run(tmp_path).steps_done
+    assert 0 < done < 2000
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    train(resumed_run(tmp_path, small_run(algorithm, 2000)), tmp_path, resume=True)
+    assert load_run(tmp_path).steps_done >= 2000
+    assert len(load_run(tmp_path).validation) == 2
+
+
+def test_validation_is_that_of_evaluate(tmp_path):
+    run = train(small_run("ppo", 240), tmp_path)
+    (entry,) = run.validation
+    zip_file = str(tmp_path / "best" / "model.zip")
+    dataset = evaluate(ID, [zip_file, "imm"], episodes=16, split="validation")
+    cost = dataset["cost"].mean(["episode", "time"])
+    # The mean of a bootstrap weights the episodes equally, in another order of summation.
+    assert entry["cost"] == pytest.approx(float(cost.sel(policy=zip_file)), rel=1e-12)
+    assert entry["paper_cost"] == pytest.approx(float(cost.sel(policy="imm")), rel=1e-12)
+    assert entry["relative_cost_difference"][0] == pytest.approx(
+        entry["cost"] / entry["paper_cost"] - 1, rel=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "control"),
+    [("ppo", "gain"), ("ppo", "mode"), ("ppo", "weights"), ("sac", "gain"), ("dqn", "mode")],
+)
+def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
+    train(small_run(algorithm, 240, control=control), tmp_path)
+    file = tmp_path / "agent.safetensors"
+    export_run(tmp_path, file)
+    policy = load_policy(ID, str(file))(make_task(ID, control))
+    model = load_sb3_policy(tmp_path / "best" / "model.zip")
+    shown = np.random.default_rng(0).normal(0.0, 3.0, (50, *model.observation_space.shape))
+    action, expected = policy.predict(shown)[0], model.predict(shown)[0]
+    assert action.shape == expected.shape
+    # float32 in both, with sums in another order.
+    np.testing.assert_allclose(action, expected, atol=3e-6)
+    assert load_run(tmp_path).command == read_header(file)["run"]["command"]
+
+
+def test_exported_recurrent_policy_acts_like_the_network(tmp_path):
+    task = make_task(ID, "weights")
+    torch.manual_seed(0)
+    network = RecurrentPolicy(len(task.fields), task.action_space, 5)
+    network.head.weight.data.mul_(20.0)
+    network.mean.fill_(0.3)
+    network.scale.fill_(2.0)
+    policy = LearnedPolicy(task, network.arrays(), "tanh")
+    rng = np.random.default_rng(1)
+    hidden, state = torch.zeros(6, 5), None
+    for step in range(12):
+        shown = rng.normal(0.0, 4.0, (6, len(task.fields)))
+        start = rng.random(6) < 0.3 if step else np.ones(6, dtype=bool)
+        action, state = policy.predict(shown, state, start)
+        hidden[torch.as_tensor(start)] = 0.0
+        with torch.no_grad():
+            expected, hidden = network(torch.as_tensor(shown), hidden)
+        # float32 in both; the logistic function is computed from tanh here.
+        np.testing.assert_allclose(action, expected.numpy(), atol=3e-6)
+
+
+def gradient_of_bias(truncation, horizon=6):
+    env = TaskVectorEnv(ID, 3, horizon=horizon, backend="torch", autoreset_mode="Disabled")
+    env.reset(seed=1)
+    torch.manual_seed(0)
+    policy = RecurrentPolicy(len(env.task.fields), env.task.action_space, 4).double()
+    # Observations are cut to float32 by the policy; here in double, for differences.
+    policy.forward = lambda shown, hidden: double_forward(policy, shown, hidden)
+
+    def cost(shift):
+        env.reset(seed=2)
+        state = [g.bit_generator.state for g in env.lanes.generators]
+        policy.zero_grad()
+        policy.head.bias.data += shift
+        value = descend_episodes(env, policy, truncation)
+        policy.head.bias.data -= shift
+        for generator, kept in zip(env.lanes.generators, state, strict=True):
+            generator.bit_generator.state = kept
+        return value, float(policy.head.bias.grad)
+
+    value, gradient = cost(0.0)
+    difference = (cost(1e-5)[0] - cost(-1e-5)[0]) / 2e-5
+    return value, gradient, difference
+
+
+def double_forward(policy, shown, hidden):
+    hidden = policy.gru(shown.double(), hidden.double())
+    return torch.tanh(policy.head(hidden)), hidden
+
+
+def test_gradient_through_the_episode_is_that_of_the_cost():
+    value, gradient, difference = gradient_of_bias(truncation=6)
+    # Central differences of a smooth function with step 1e-5: about 1e-8 relative, plus rounding.
+    assert gradient == pytest.approx(difference, rel=1e-5)
+    same_value, cut, _ = gradient_of_bias(truncation=2)
+    assert same_value == pytest.approx(value, rel=1e-12)
+    assert abs(cut / gradient - 1.0) > 0.01
+
+
+def test_held_out_scenario_is_refused():
+    with pytest.raises(
+        ValueError, match=r"scenario 'paper' is held out: train on a training scenario \(random"
+    ):
+        small_run("ppo", 100, scenario="paper")
+
+
+def test_unknown_algorithm():
+    with pytest.raises(ValueError, match="unknown algorithm 'pop': did you mean 'ppo'"):
+        new_run(ID, "pop")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "control", "message"),
+    [
+        ("dqn", "gain", "'dqn' does not fit control 'gain'.*choose from ppo, recurrent-ppo, sac"),
+        ("sac", "mode", "'sac' does not fit control 'mode'.*choose from ppo, recurrent-ppo, dqn"),
+        ("bptt", "mode", "'bptt' needs the gradient of continuous actions, but control 'mode'"),
+    ],
+)
+def test_algorithm_that_does_not_fit(algorithm, control, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        train(small_run(algorithm, 100, control=control), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
+    run = small_run(algorithm, 400)
+    with pytest.raises(ValueError, match=r"it has no run\.json"):
+        resumed_run(tmp_path, run)
+    train(run, tmp_path)
+    with pytest.raises(ValueError, match="holds a run with control 'gain', not 'weights'"):
+        resumed_run(tmp_path, small_run(algorithm, 400, control="weights"))
+    with pytest.raises(ValueError, match="holds a run with seed 0, not 3"):
+        resumed_run(tmp_path, small_run(algorithm, 400, seed=3))
+    for file in (tmp_path / "checkpoint").iterdir():
+        file.write_bytes(b"\x80garbage" * 20)
+    with pytest.raises(ValueError, match=r"cannot read the checkpoint in"):
+        train(resumed_run(tmp_path, small_run(algorithm, 800)), tmp_path, resume=True)
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(ValueError, match=r"cannot read .*run\.json"):
+        resumed_run(tmp_path, run)
+
+
+def test_files_that_are_no_policies(tmp_path):
+    for name in ("a.zip", "a.safetensors"):
+        with pytest.raises(ValueError, match=r"no (model|learned policy) at"):
+            load_policy(ID, str(tmp_path / name))
+        (tmp_path / name).write_bytes(b"garbage" * 30)
+        with pytest.raises(ValueError, match=r"cannot read the model|is not a learned policy"):
+            load_policy(ID, str(tmp_path / name))
+
+
+def test_recurrent_agent_cannot_be_exported(tmp_path):
+    train(small_run("recurrent-ppo", 240), tmp_path)
+    with pytest.raises(ValueError, match="cannot export algorithm 'recurrent-ppo'"):
+        export_run(tmp_path, tmp_path / "agent.safetensors")
+    assert not (tmp_path / "agent.safetensors").exists()
+
+
+class TestCommandLine:
+    def run(self, monkeypatch, capsys, *words):
+        from filtergym.__main__ import main
+
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr()
+
+    def test_train_resume_export_evaluate(self, monkeypatch, capsys, tmp_path):
+        train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run")
+        assert self.run(monkeypatch, capsys, *train, "--steps", 400)[0] == 0
+        code, printed = self.run(monkeypatch, capsys, *train, "--steps", 400)
+        assert code == 2
+        assert "add --resume" in printed.err
+        assert self.run(monkeypatch, capsys, *train, "--steps", 800, "--resume")[0] == 0
+        run = load_run(tmp_path / "run")
+        assert run.steps_done == 800
+        assert run.command.startswith("filtergym train " + ID)
+        assert run.versions["torch"] == torch.__version__
+        assert run.seconds > 0.0
+        assert self.run(monkeypatch, capsys, "export", tmp_path / "run")[0] == 0
+        file = tmp_path / "run" / "agent.safetensors"
+        words = ("evaluate", ID, "--policy", file, "--policy", "imm", "--episodes", 4)
+        assert self.run(monkeypatch, capsys, *words)[0] == 0
+
+    def test_wrong_input_writes_nothing(self, monkeypatch, capsys, tmp_path):
+        code, printed = self.run(
+            monkeypatch, capsys, "train", ID, "--scenario", "paper", "--out", tmp_path / "x"
+        )
+        assert code == 2
+        assert printed.err.startswith("Error: scenario 'paper' is held out")
+        assert self.run(monkeypatch, capsys, "export", tmp_path / "x")[0] == 2
+        assert not (tmp_path / "x").exists()
