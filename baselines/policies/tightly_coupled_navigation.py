@@ -490,8 +490,8 @@ def _measures(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
 
     moved = true_mode != true_mode[:, :1]
     begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
-    after = numpy.arange(true_mode.shape[1]) >= begin[:, None]
-    outside = lasting((run["rate_outside_aperture"].values > 0.0) & after)
+    in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
+    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
     lost = outside.any(axis=1)
     yield Measure("track_loss_rate", "", "all", bootstrap.estimate(lost.astype(float)), "1")
     if lost.any():

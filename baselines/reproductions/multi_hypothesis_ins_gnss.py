@@ -243,7 +243,7 @@ def run_everything(progress: Callable[[float], None], episodes: int) -> Results:
         name: done(simulate("paper", {ADAPTIVE: episodes}, horizon=MOTION + 99, **keywords))[ADAPTIVE]
         for name, keywords in WAITS.items()
     }
-    short = {}
+    short: dict[tuple[str, str], Run] = {}
     legs = {"leg_steps": (SHORT_LEG, SHORT_LEG + 1000), "horizon": SHORT_LEG + 200}
     for course, scenario in (("increment", "paper"), ("kinematic", "kinematic")):
         runs = done(simulate(scenario, {"rest": few, "constant velocity": few}, **legs))

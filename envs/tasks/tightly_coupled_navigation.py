@@ -422,7 +422,7 @@ class TightlyCoupledNavigation(Task[State]):
         *(Component(f"{angle}_error", "rad") for angle in ("heading", "pitch", "roll")),
         *(Component(f"{angle}_rate_error", "rad/s") for angle in ("heading", "pitch", "roll")),
     )
-    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {
+    groups = {
         "position": ("position_east", "position_north", "position_up"),
         "velocity": ("velocity_east", "velocity_north", "velocity_up"),
         "acceleration": ("acceleration_east", "acceleration_north", "acceleration_up"),
