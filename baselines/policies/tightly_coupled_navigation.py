@@ -492,7 +492,7 @@ def _measures(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
     begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
     in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
     outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
-    lost = outside.any(axis=1)
+    lost = numpy.asarray(outside.any(axis=1))
     yield Measure("track_loss_rate", "", "all", bootstrap.estimate(lost.astype(float)), "1")
     if lost.any():
         time = (outside.argmax(axis=1) - begin + 1.0) * step
