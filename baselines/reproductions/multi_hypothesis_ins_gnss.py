@@ -493,8 +493,8 @@ def claims(r: Results) -> list[Claim]:
             "Physics of leg 2",
             "Why is there anything to jump at step 2000, when the speed already grows by 30 m/s²?",
             "only if the accelerometers show nothing in leg 2, as if stuck at zero (increment). Where they feel "
-            "it (kinematic) Singer's filter follows, and in leg 2 the errors of the adaptive measurer are "
-            f"larger: ratio of RMS, position {_ratio_text(excess[0])}, velocity {_ratio_text(excess[1])}",
+            "it (kinematic) Singer's filter follows; RMS in leg 2, adaptive over Singer: position "
+            f"{_ratio_text(excess[0])}, velocity {_ratio_text(excess[1])}",
             f"{few} paired runs",
             silent,
         ),
@@ -745,7 +745,7 @@ def draw_matched(r: Results) -> Any:
     axis.set_xlabel(f"mean weight of the other two channels, % ({LEAST:g} stands for less)")
     axis.set_ylabel("RMS above that of the matched filter, %")
     axis.grid(alpha=0.25, lw=0.4)
-    axis.legend(fontsize=9, frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.72))
+    axis.legend(fontsize=9, frameon=False, loc="upper left")
     return figure
 
 
