@@ -71,7 +71,7 @@ def tune(
         id: environment id.
         policy: name of the policy, for the record.
         tunable: its limits and what values mean.
-        budget: environment steps to spend on candidates.
+        budget: environment steps (decisions, as in training) to spend on candidates.
         scenario: a training scenario; default: the environment's own.
         seed: of the training episodes and of the search.
         episodes: training episodes that every candidate meets.
@@ -89,14 +89,15 @@ def tune(
         raise ValueError(
             f"scenario {chosen.name!r} is held out: tune on a training scenario ({', '.join(allowed)})"
         )
-    horizon = make_task(cls.id, tunable.control, chosen.name).horizon
+    task = make_task(cls.id, tunable.control, chosen.name)
+    steps = episodes * (task.horizon // task.decision_interval)
     names, limits = list(tunable.limits), list(tunable.limits.values())
-    evaluations = budget // (episodes * horizon)
+    evaluations = budget // steps
     population = 4 * len(names) + 4
     if evaluations < 2 * population:
         raise ValueError(
             f"a budget of {budget} steps is {evaluations} candidates of {episodes} episodes; "
-            f"the search needs at least {2 * population}: give {2 * population * episodes * horizon} steps"
+            f"the search needs at least {2 * population}: give {2 * population * steps} steps"
         )
     train = episode_seeds("train", seed, episodes)
     best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
@@ -109,7 +110,7 @@ def tune(
         values = dict(zip(names, map(float, vector), strict=True))
         cost = mean_cost(cls.id, chosen.name, tunable, values, train)
         spent += 1
-        progress(episodes * horizon)
+        progress(steps)
         best = min(best, (cost, values), key=lambda pair: pair[0])
         return cost
 
@@ -134,7 +135,7 @@ def tune(
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
     rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
-    return Tuned(cls.id, policy, chosen.name, rounded, cost, untuned, spent * episodes * horizon, seed)
+    return Tuned(cls.id, policy, chosen.name, rounded, cost, untuned, spent * steps, seed)
 
 
 def _file_name(id: str) -> str:
