@@ -12,9 +12,7 @@ from ..rendering import (
     BLUE,
     CURVES,
     FIGURE_SIZE,
-    GREEN,
     PALE,
-    VERMILLION,
     History,
     Picture,
     Strip,
@@ -31,8 +29,8 @@ from ..tasks.tightly_coupled_navigation import (
     TightlyCoupledNavigation,
 )
 
-COURSE = (0.065, 0.50, 0.43, 0.40)
-MOTION = (0.065, 0.275, 0.43, 0.165)
+COURSE = (0.065, 0.53, 0.43, 0.37)
+MOTION = (0.125, 0.29, 0.37, 0.15)
 SENSORS = (0.125, 0.075, 0.37, 0.13)
 """Left, bottom, width, height of the panels as shares of the figure."""
 FAULTS = ("two satellites out", "rates lost", "noisy rate", "accelerometers stuck")
@@ -120,7 +118,8 @@ class TightlyCoupledNavigationPicture(Picture):
 
     def strips(self) -> Sequence[Strip]:
         """What is steered, innovations, errors."""
-        weights = {name.replace("-", " "): f"weight.{i}" for i, name in enumerate(HYPOTHESES)}
+        names = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
+        weights = {name: f"weight.{i}" for i, name in enumerate(names)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
         if self.task.control == "gain":
             gains = {name: f"gain.{i}" for i, name in enumerate(GROUPS)}
@@ -200,14 +199,14 @@ class TightlyCoupledNavigationPicture(Picture):
         sensors.set_yticks([MOTION_ROW, *range(len(FAULTS))], ["true motion", *FAULTS], fontsize=7)
         sensors.set_xlabel(self.clock, fontsize=9, labelpad=1)
         self.fault_lines = [
-            sensors.plot([], [], color=VERMILLION, linewidth=5.0, solid_capstyle="butt")[0] for _ in FAULTS
+            sensors.plot([], [], color=BLACK, linewidth=5.0, solid_capstyle="butt")[0] for _ in FAULTS
         ]
         # In the colours of their weights.
         self.modes = [
             sensors.plot([], [], color=color, linewidth=5.0, solid_capstyle="butt")[0]
             for _, (color, _) in zip(HYPOTHESES, CURVES, strict=False)
         ]
-        (self.now,) = sensors.plot([], [], color=GREEN, linewidth=1.4)
+        (self.now,) = sensors.plot([], [], color=BLACK, linewidth=0.8)
 
     def arrange(self) -> None:
         """Limits of the start; they grow with the flight, which is not known in advance."""
