@@ -108,15 +108,18 @@ class NisAdaptive(Policy):
     """Innovation-based adaptation of the noise, under the paper's probabilities.
 
     Where the short average of the normalised innovation squared exceeds ``threshold`` under every hypothesis,
-    the model and the sensors disagree. An excess of the pseudoranges or of the accelerometers is put down to
-    these sensors. Rates that disagree may be noisy, or right while the accelerometers stick: ``rates`` and
-    ``accelerometers`` say how much of the rates' excess goes to either.
+    the model and the sensors disagree. An excess of the pseudoranges is put down to these. Rates that disagree
+    may be noisy, or right while the accelerometers stick: ``rates`` and ``accelerometers`` say how much of the
+    rates' excess goes to either. Accelerometers that disagree may be wrong, or the first to feel a manoeuvre:
+    ``own`` says how much of their excess goes to them. With these three at zero it is nearly the constant
+    action ``base``.
 
     Args:
         task: the problem.
         threshold: of the average per observation; 1 is what a consistent filter has.
         rates: power of the rates' excess in their own variance.
         accelerometers: power of the rates' excess in the variance of the accelerometers.
+        own: power of the accelerometers' excess in their own variance.
         base: what is always added to the action of the accelerometers.
     """
 
@@ -128,12 +131,14 @@ class NisAdaptive(Policy):
         threshold: float = 3.0,
         rates: float = 1.0,
         accelerometers: float = 1.0,
+        own: float = 1.0,
         base: float = 0.0,
     ) -> None:
         super().__init__(task)
         self.columns = [task.columns([f"average_nis_{group}_{h}" for h in HYPOTHESES]) for group in GROUPS]
         self.nats = 2.0 * math.log(task.parameters.noise_scale)
-        self.threshold, self.rates, self.accelerometers, self.base = threshold, rates, accelerometers, base
+        self.threshold, self.rates, self.accelerometers = threshold, rates, accelerometers
+        self.own, self.base = own, base
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Turn excesses into logarithms of factors."""
@@ -145,7 +150,7 @@ class NisAdaptive(Policy):
         action = [
             ranges,
             self.rates * rates,
-            self.base + forces + self.accelerometers * rates,
+            self.base + self.own * forces + self.accelerometers * rates,
             attitude,
         ]
         return numpy.clip(numpy.stack(action, axis=1), -1.0, 1.0), None
@@ -158,15 +163,8 @@ class StuckCheck(NisAdaptive):
     the decision after it sticks the filter trusts it.
     """
 
-    def __init__(
-        self,
-        task: TightlyCoupledNavigation,
-        threshold: float = 3.0,
-        rates: float = 0.0,
-        accelerometers: float = 0.0,
-        base: float = 0.0,
-    ) -> None:
-        super().__init__(task, threshold, rates, accelerometers, base)
+    def __init__(self, task: TightlyCoupledNavigation, threshold: float = 3.0, rates: float = 0.0) -> None:
+        super().__init__(task, threshold, rates, accelerometers=0.0)
         self.readings = task.columns([f"accelerometer_{axis}" for axis in ("forward", "right", "down")])
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
@@ -527,8 +525,14 @@ TUNABLE = {
     ),
     "nis-adaptive": Tunable(
         "gain",
-        {"threshold": (0.5, 10.0), "rates": (0.0, 2.0), "accelerometers": (0.0, 4.0), "base": (0.0, 1.0)},
-        {"threshold": 3.0, "rates": 1.0, "accelerometers": 1.0, "base": 0.0},
+        {
+            "threshold": (0.5, 10.0),
+            "rates": (0.0, 2.0),
+            "accelerometers": (0.0, 4.0),
+            "own": (0.0, 2.0),
+            "base": (0.0, 1.0),
+        },
+        {"threshold": 3.0, "rates": 1.0, "accelerometers": 1.0, "own": 1.0, "base": 0.0},
         _adaptive(NisAdaptive),
     ),
     "stuck-check": Tunable(
