@@ -359,15 +359,15 @@ class TightlyCoupledNavigation(Task[State]):
 
     ## Action Space
 
-    * `evidence` (default): `Box(-1, 1, (3,))`, 10 nats each added to the log-posterior of the hypotheses;
-      zero is the paper's algorithm.
+    * `gain` (default): `Box(-1, 1, (4,))`, what the standard deviation of the noise is taken to be, over the
+      nominal one, for each sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of
+      a positive action, 3 to that of a negative one; under the paper's probabilities, for faults that no
+      weight can cure. Zero is the paper's algorithm.
+    * `evidence`: `Box(-1, 1, (3,))`, 10 nats each added to the log-posterior of the hypotheses; zero is the
+      paper's algorithm.
     * `mode`: `Discrete(3)`, the one hypothesis believed. The bank mixes on its weights, so this collapses it
       to one filter that switches its model.
     * `weights`: `Box(0, 1, (3,))`, normalised; all zero is uniform.
-    * `gain`: `Box(-1, 1, (4,))`, what the standard deviation of the noise is taken to be, over the nominal one,
-      for each sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a positive
-      action, 3 to that of a negative one; under the paper's probabilities, for faults that no weight can
-      cure. Zero is the paper's algorithm.
 
     The weights are used for the combination and as the prior of the next mixing.
 
@@ -410,7 +410,7 @@ class TightlyCoupledNavigation(Task[State]):
         "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "
         "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"
     )
-    controls = ("evidence", "mode", "weights", "gain")
+    controls = ("gain", "evidence", "mode", "weights")
     Parameters: ClassVar[type] = Parameters
     scenarios: ClassVar[Mapping[str, Scenario]] = SCENARIOS
     components = (
