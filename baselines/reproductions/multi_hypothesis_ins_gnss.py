@@ -699,7 +699,7 @@ def draw_loss_times(r: Results) -> Any:
     for place, name in enumerate(names):
         found = loss(r.settings[name], SHORTEST_LEG + 1)
         if found.rate == 0.0:
-            axis.text(0.02, place, "no track lost", va="center", fontsize=8, color=colours[1])
+            axis.text(1.58, place, "no track lost", ha="right", va="center", fontsize=8, color=colours[1])
             continue
         axis.plot([found.first, found.last], [place, place], color=colours[0], lw=2.0)
         axis.plot([found.median], [place], "o", color=colours[0], ms=5)
@@ -744,7 +744,7 @@ def draw_matched(r: Results) -> Any:
     )
     axis.set_xscale("log")
     axis.set_yscale("symlog", linthresh=0.1)
-    axis.set_ylim(-0.1, 1500.0)
+    axis.set_ylim(-0.03, 1500.0)
     axis.yaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_major_formatter("{x:g}")
     axis.set_xlabel(f"mean weight of the other two channels, % ({LEAST:g} stands for less)")
@@ -780,8 +780,7 @@ def reproduce(progress: Callable[[float], None], episodes: int | None = None) ->
         "bands; dotted lines: the motion begins, and changes.",
         "figure_2_probabilities": f"Figure 2: mean probabilities over {count} runs, 95 % bands.",
         "loss_times": "When Singer's filter loses track in the increment variant, one setting changed at a time, "
-        "within 1.6 s; "
-        "grey: the paper's 0.5 to 1 s.",
+        "within 1.6 s; grey: the paper's 0.5 to 1 s.",
         "matched": "What the parallel channels cost where Singer's model is right, over the weight that they "
         "have: sensors and stay probability differ from point to point.",
     }
