@@ -26,9 +26,9 @@ def pytest_generate_tests(metafunc):
 
 @pytest.fixture
 def short(env_id):
-    """Keywords that make episodes of an environment five decisions long."""
-    interval = make_task(env_id).decision_interval
-    return {"horizon": DECISIONS * interval}
+    """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
+    interval = min(make_task(env_id).decision_interval, 2)
+    return {"horizon": DECISIONS * interval, "decision_interval": interval}
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from filtergym.baselines.reproduction import save_reproduction
 from filtergym.baselines.reproductions import multi_hypothesis_ins_gnss as paper
 from filtergym.baselines.rollout import run_bound, run_policy
 from filtergym.baselines.seeds import episode_seeds
+from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.tasks.tightly_coupled_navigation import HYPOTHESES, LINE, REST, SINGER
 from filtergym.filters import extended_kalman, gnss_ins
@@ -162,7 +163,14 @@ def test_nis_adaptive_divides_the_excess():
     excess = math.log(9.0) / (2 * math.log(300.0))
     assert action[0] == pytest.approx([0.0, 0.5 * excess, 0.1 + 3.0 * excess, 0.0], rel=1e-12)
     assert action[1] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
-    # One hypothesis that is content is enough.
+    policy = policies.NisAdaptive(task, threshold=2.0, own=0.5)
+    action, _ = policy.predict(observed(task, average_nis_accelerometers=math.log1p(2.0 * 9.0)))
+    assert action[0] == pytest.approx([0.0, 0.0, 0.5 * excess, 0.0], rel=1e-12)
+
+
+def test_nis_adaptive_listens_to_the_hypothesis_that_is_content():
+    task = make_task(ID, "gain")
+    policy = policies.NisAdaptive(task, threshold=2.0, base=0.1)
     quiet = observed(task, average_nis_rates=5.0, average_nis_rates_rest=0.0)
     assert policy.predict(quiet)[0][0] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
 
@@ -185,6 +193,12 @@ def test_stuck_check_switches_stuck_accelerometers_off():
     both = stuck[1:] & stuck[:-1]
     assert off[1:][both].all()
     assert not off[~stuck].any()
+
+
+def test_tuning_counts_decisions():
+    # 16 candidates on 256 episodes of 60 decisions, each 10 measurements.
+    with pytest.raises(ValueError, match="give 245760 steps"):
+        tune(ID, "sticky", KNOWN.tunable["sticky"], 245_759)
 
 
 # --- metrics
@@ -304,6 +318,7 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
         }
 
     monkeypatch.setattr(paper, "simulate", simulate)
+    monkeypatch.setattr(paper, "RESAMPLES", 20)
     done = []
     result = paper.reproduce(done.append, 5)
     assert sum(done) == paper.STEPS

@@ -219,6 +219,7 @@ def test_other_numbers_of_satellites(slots):
         ({"satellites": ()}, "at least one"),
         ({"satellites": (1, 10, 11, 19)}, "satellite 10 stands at .* below elevation_mask"),
         ({"satellites": (1, 11, 19, 25)}, "1 to 24"),
+        ({"satellites": (1, 2, 11, 19), "epoch": 505.292}, "degenerate geometry"),
         ({"transition": ((0.9, 0.2, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "must sum to 1"),
         ({"initial_probabilities": (0.5, 0.5)}, "3 numbers"),
         ({"pseudorange_sigma": 0.0}, "pseudorange_sigma must be a finite number above 0"),

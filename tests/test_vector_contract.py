@@ -105,9 +105,9 @@ def test_every_reward_equals_that_of_the_single_environment(env_id, reward, shor
 
 def test_long_episodes_that_draw_noise_in_blocks(env_id, random_actions):
     # More than 256 measurements: blocks from a child generator, and resets that fall inside a block.
-    ours, theirs = (make(env_id, 3, horizon=300, decision_interval=10) for make in (native, synchronous))
+    ours, theirs = (make(env_id, 3, horizon=260, decision_interval=10) for make in (native, synchronous))
     ours.reset(seed=5), theirs.reset(seed=5)
-    for step in range(40):
+    for step in range(30):
         actions = random_actions(ours.single_action_space, 3, step)
         assert_same_step(ours.step(actions), theirs.step(actions))
         if step == 17:
