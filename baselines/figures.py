@@ -34,11 +34,12 @@ def _axes(rows: int = 1, width: float = 8.0, height: float = 3.6) -> Any:
 
 
 def _logarithmic(axis: Any) -> None:
-    """Label a logarithmic axis with plain numbers, every digit where it spans less than a decade."""
+    """Label a logarithmic axis with plain numbers: decades; 2 and 5 within four; all digits within one."""
 
     def label(x: float, _: int) -> str:
         low, high = axis.get_view_interval()
-        return f"{x:g}" if f"{x:.0e}"[0] in ("25" if high > 10.0 * low else "2345678") else ""
+        digits = "2345678" if high <= 10.0 * low else "25" if high <= 1e4 * low else ""
+        return f"{x:g}" if f"{x:.0e}"[0] in digits else ""
 
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(label)
