@@ -1,10 +1,10 @@
 """How fast the environments step, beside what the machine could do and beside a peer.
 
-    python benchmarks/throughput.py [--full] [--compile] [--environment ID]
+    python benchmarks/throughput.py [--full] [--compile] [--environment ID] [--size N]
 
 **What is timed.** The public ``step`` of the vector environment: action check, filters, reward, observation,
 autoreset (NEXT_STEP; every 100 steps or at the end of the episode, whichever comes first; for long episodes
-that is more resets than they really have). One thread. A rate is the median over repeats of 101 steps. Where
+that is more resets than they really have). Every step is one measurement (``decision_interval`` 1). One thread. A rate is the median over repeats of 101 steps. Where
 other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
 process was given; both are shown, and shares and ratios use the latter for both sides. Actions are random and
 drawn beforehand, in float32 as the space has them.
@@ -33,7 +33,7 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
@@ -129,7 +129,7 @@ def work_of_step(id: str, control: str, lanes: int = 64) -> Work:
     xp: Any = numpy
     if torch is not None:
         import array_api_compat.torch as xp
-    task = make_task(id, control, xp=xp)
+    task = make_task(id, control, xp=xp, decision_interval=1)
     generator = numpy.random.default_rng(0)
     noise, space = task.noise, task.action_space
     uniforms = task.constant(generator.random((noise.uniforms, lanes)))
@@ -149,15 +149,10 @@ def work_of_step(id: str, control: str, lanes: int = 64) -> Work:
 
     old = {id_of(array): array for array in _leaves(state)}
     new = {id_of(array): array for array in _leaves(after)}
-    held = task.decision_interval
-    counted = (
-        (None, None)
-        if torch is None
-        else (held * counter.operations / lanes, held * counter.functions / lanes)
-    )
+    counted = (None, None) if torch is None else (counter.operations / lanes, counter.functions / lanes)
     return Work(
-        held * (size(old.values()) + size([row])) + size([action]),
-        held * size(array for key, array in new.items() if key not in old) + size([cost, shown]),
+        size([*old.values(), row, action]),
+        size(array for key, array in new.items() if key not in old) + size([cost, shown]),
         *counted,
     )
 
@@ -215,8 +210,10 @@ def elementwise_costs() -> tuple[float, float]:
 
 def vector_rates(id: str, control: str, count: int, repeats: int, **backend: Any) -> tuple[float, float]:
     """Environment steps through the public vector ``step`` per second, by the wall and by the processor."""
-    steps = min(STEPS, make_task(id, control).horizon // make_task(id, control).decision_interval)
-    env = gymnasium.make_vec(id, num_envs=count, control=control, max_episode_steps=steps, **backend)
+    steps = min(STEPS, make_task(id, control).horizon)
+    env = gymnasium.make_vec(
+        id, num_envs=count, control=control, max_episode_steps=steps, decision_interval=1, **backend
+    )
     env.reset(seed=0)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(8)]
@@ -237,7 +234,7 @@ def vector_rates(id: str, control: str, count: int, repeats: int, **backend: Any
 
 def single_step(id: str, control: str, repeats: int) -> Duration:
     """Time of ``step`` of the environment that ``gymnasium.make`` makes, wrappers included."""
-    env = gymnasium.make(id, control=control)
+    env = gymnasium.make(id, control=control, decision_interval=1)
     env.action_space.seed(0)
     action = env.action_space.sample()
     steps = min(STEPS, env.unwrapped.lanes.decisions_per_episode)  # type: ignore[attr-defined]
@@ -285,7 +282,7 @@ def _millions(rate: float | None) -> str:
     return "-" if rate is None else f"{rate / 1e6:.3g}"
 
 
-def report(ids: list[str], full: bool, with_compile: bool) -> None:
+def report(ids: list[str], full: bool, with_compile: bool, sizes: Sequence[int]) -> None:
     """Measure everything and print the tables."""
     repeats = 7 if full else 3
     backends: list[tuple[str, dict[str, Any]]] = [("numpy", {})]
@@ -294,7 +291,6 @@ def report(ids: list[str], full: bool, with_compile: bool) -> None:
         devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
         backends += [(f"torch {d}", {"backend": "torch", "device": d}) for d in devices]
     cells = [(id, control) for id in ids for control in catalogue()[id].controls]
-    sizes = FULL if full else QUICK
     # Wide enough for the tables where the output is a file.
     console = Console(width=None if sys.stdout.isatty() else 150)
 
@@ -388,6 +384,7 @@ def main() -> None:
         "--compile", action="store_true", help="also torch.compile, a minute for each control"
     )
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
+    parser.add_argument("--size", action="append", type=int, metavar="N", help="only this N; may be repeated")
     arguments = parser.parse_args()
     ids = arguments.environment or list(catalogue())
     unknown = [id for id in ids if id not in catalogue()]
@@ -396,7 +393,9 @@ def main() -> None:
     if arguments.compile and torch is None:
         parser.error("--compile needs torch: pip install 'filtergym[agents]'")
     filtergym.register()
-    report(ids, arguments.full, arguments.compile)
+    if any(size < 1 for size in arguments.size or ()):
+        parser.error("--size must be at least 1")
+    report(ids, arguments.full, arguments.compile, arguments.size or (FULL if arguments.full else QUICK))
 
 
 if __name__ == "__main__":
