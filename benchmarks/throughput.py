@@ -4,10 +4,10 @@
 
 **What is timed.** The public ``step`` of the vector environment: action check, filters, reward, observation,
 autoreset (NEXT_STEP; every 100 steps or at the end of the episode, whichever comes first; for long episodes
-that is more resets than they really have). Every step is one measurement (``decision_interval`` 1). One thread. A rate is the median over repeats of 101 steps. Where
-other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
-process was given; both are shown, and shares and ratios use the latter for both sides. Actions are random and
-drawn beforehand, in float32 as the space has them.
+that is more resets than they really have). Every step is one measurement (``decision_interval`` 1). One thread.
+A rate is the median over repeats of 101 steps. Where other jobs share the processor, the rate by the clock on
+the wall drops below the rate by the time that the process was given; both are shown, and shares and ratios use
+the latter for both sides. Actions are random and drawn beforehand, in float32 as the space has them.
 
 **Floors**, as rates that no implementation of the same arithmetic on this machine and thread can be expected
 to pass by much:
