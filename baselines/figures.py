@@ -1,6 +1,6 @@
-"""Pictures of an evaluation: error over time, distribution of errors, mode probabilities."""
+"""Pictures of an evaluation (error over time, distribution, mode probabilities), and of training."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -177,6 +177,42 @@ def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
     )
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
+def draw_learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]], title: str, paper: str
+) -> Any:
+    """Cost of validations against the paper's algorithm over training, one line for each run.
+
+    Args:
+        curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
+        title: of the figure.
+        paper: name of the paper's algorithm, whose line is at zero.
+    """
+    figure, axes = _axes()
+    axis = axes[0]
+    for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
+        for i, (steps, differences) in enumerate(runs):
+            plural = "s" if len(runs) > 1 else ""
+            label = f"{name}, {len(runs)} run{plural}" if i == 0 else None
+            millions, percent = numpy.array(steps) / 1e6, 100.0 * numpy.array(differences)
+            axis.plot(millions, percent, label=label, **style | {"linewidth": 1.1})
+            best = percent.argmin()
+            axis.plot(millions[best], percent[best], "o", ms=4, color=style["color"])
+    axis.axhline(0.0, color="0.3", lw=1.0)
+    everything = numpy.concatenate([values for runs in curves.values() for _, values in runs])
+    if everything.max() > 1.0:
+        # An untrained agent can cost a hundred times as much; what is learned is told apart near zero.
+        axis.set_yscale("symlog", linthresh=10.0, linscale=1.5)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_ylim(bottom=min(1.2 * 100.0 * everything.min(), -2.0))
+    axis.set_xlim(left=0.0)
+    axis.set_xlabel("environment steps, millions")
+    axis.set_ylabel(f"validation cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     return figure
 
 

@@ -358,6 +358,7 @@ def seeds(
     split: Annotated[str, typer.Option(help="test, validation or train.")] = "test",
     out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="PNG file for the learning curves.")] = None,
 ) -> None:
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
 
@@ -370,10 +371,13 @@ def seeds(
     scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
     opponents = policy or training_seeds.default_opponents(cls.id)
     marker = f"seeds {cls.id.removeprefix('filtergym/')}"
-    if out is not None:
-        writable_folder(out.parent)
+    for file in (out, curves):
+        if file is not None:
+            writable_folder(file.parent)
     if into is not None:
         split_at_markers(into, marker)
+    if curves is not None:
+        save(training_seeds.learning_curves(found), curves)
     records: list[training_seeds.Comparison] = []
     grids = []
     with progress_bar() as bar:

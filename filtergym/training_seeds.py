@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 from .agents.training_run import TrainingRun, best_agent, load_run
 from .baselines.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from .baselines.evaluation import baselines_of, evaluate, load_policy
+from .baselines.figures import draw_learning_curves
 from .baselines.metrics import reported_components, score, squared_errors, whole_window
 from .baselines.reproduction import Grid, markdown_table
 from .baselines.tuning import tuned_names
@@ -140,6 +141,18 @@ def load_runs(folders: Sequence[Path]) -> list[SeedRun]:
             raise ValueError(f"{folder} is a second run of {member.name}")
         found[member.name] = member
     return sorted(found.values(), key=lambda member: (member.algorithm, member.run.seed))
+
+
+def learning_curves(runs: Sequence[SeedRun]) -> Any:
+    """Picture of every run's validations; a dot marks its best agent."""
+    first = runs[0].run
+    curves: dict[str, list[tuple[list[float], list[float]]]] = {}
+    for member in runs:
+        steps = [entry["steps"] for entry in member.run.validation]
+        values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
+        curves.setdefault(member.algorithm, []).append((steps, values))
+    title = f"{first.environment}, scenario {first.scenario}; dots: best agents"
+    return draw_learning_curves(curves, title, baselines_of(first.environment).score_paper)
 
 
 def default_opponents(id: str) -> list[str]:

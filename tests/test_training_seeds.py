@@ -108,7 +108,19 @@ def test_command_fills_the_page(folders, tmp_path):
     page.write_text(
         "a\n<!-- seeds ManeuveringTarget-v0: begin -->\nold\n<!-- seeds ManeuveringTarget-v0: end -->\nb"
     )
-    arguments = (*folders, "--episodes", 20, "--split", "validation", "--out", "seeds.json", "--into", page)
+    arguments = (
+        *folders,
+        "--episodes",
+        20,
+        "--split",
+        "validation",
+        "--out",
+        "seeds.json",
+        "--into",
+        page,
+        "--curves",
+        "curves.png",
+    )
     result = seeds_command(*arguments, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "bptt seed 1" in result.stdout
@@ -116,6 +128,7 @@ def test_command_fills_the_page(folders, tmp_path):
     assert (text[:2], text[-2:], "old" in text) == ("a\n", "\nb", False)
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
         assert word in text
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
     records = json.loads((tmp_path / "seeds.json").read_text())
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 
