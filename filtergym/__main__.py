@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from . import training_seeds
+from . import comparison, training_seeds
 from .baselines.evaluation import baselines_of, evaluate
 from .baselines.figures import evaluation_figures, save
 from .baselines.metrics import Record, tidy_records
@@ -147,12 +147,20 @@ def evaluate_policies(
 
 @app.command("benchmark")
 def benchmark(
-    full: Annotated[bool, typer.Option("--full", help="Every scenario and ten times the episodes.")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
     seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
     environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+    split: Annotated[
+        str, typer.Option(help="test; or validation, for development: training scenarios only.")
+    ] = "test",
 ) -> None:
-    """Run every environment with its policies; quick by default, resumes after an interruption."""
+    """Run every environment with its policies; quick by default, resumes after an interruption.
+
+    Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
+    """
     with progress_bar() as bar:
 
         def started(cell: Cell, total: int) -> Any:
@@ -162,8 +170,37 @@ def benchmark(
         def finished(records: list[Record]) -> None:
             console.print(results_table(records))
 
-        run_benchmark(out, full, seed, environment or (), started, finished)
+        run_benchmark(out, full, seed, environment or (), split, started, finished)
     console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+
+
+@app.command("comparison")
+def comparison_page(
+    records: Annotated[Path, typer.Argument(help="benchmark.json of a full benchmark.")],
+    into: Annotated[
+        Path | None,
+        typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
+    ] = None,
+) -> None:
+    """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
+
+    Example: filtergym comparison results/benchmark.json --into docs/comparison.md
+    """
+    found = comparison.read_benchmark(records)
+    markers = {id: f"comparison {id.removeprefix('filtergym/')}" for id in found}
+    if into is not None:
+        for marker in markers.values():
+            split_at_markers(into, marker)
+    for id, own in found.items():
+        compared = comparison.compare_environment(own)
+        for grid in compared.grids:
+            console.print(grid_table(grid))
+        if into is not None:
+            picture = f"images/comparison_{id.removeprefix('filtergym/')}.png"
+            save(compared.figure, writable_folder(into.parent / "images") / Path(picture).name)
+            command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
+            text = comparison.comparison_markdown(compared, own, picture, command)
+            insert_between_markers(into, markers[id], text)
 
 
 @app.command("tune")

@@ -84,7 +84,7 @@ def grid_table(grid: Grid) -> Table:
     """Return a table of text for the terminal: numbers to the right, without the marks of Markdown."""
 
     def plain(cell: str) -> str:
-        return escape(cell.replace("`", ""))
+        return escape(cell.replace("`", "").replace("<br>", "\n"))
 
     table = Table(title=plain(grid.title), title_justify="left")
     for i, name in enumerate(grid.header):

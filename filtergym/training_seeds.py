@@ -156,11 +156,11 @@ def learning_curves(runs: Sequence[SeedRun]) -> Any:
 
 
 def default_opponents(id: str) -> list[str]:
-    """Names that runs are compared with: paper, tunable policies untuned and tuned, references."""
+    """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
     known = baselines_of(id)
     untuned = [name for name in known.tunable if name != known.best_constant]
     tuned = tuned_names(id, known.tunable)
-    return list(dict.fromkeys([known.score_paper, *untuned, *tuned, *known.references]))
+    return list(dict.fromkeys([known.score_paper, *known.compared, *untuned, *tuned, *known.references]))
 
 
 def episode_means(
