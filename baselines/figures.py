@@ -263,7 +263,8 @@ def draw_differences(
         low, high = max(1.0 + min(*ends, 0.0) / 100.0, 1e-6), 1.0 + max(*ends, 0.0) / 100.0
         margin = (high / low) ** 0.04
         axis.set_xlim(100.0 * (low / margin - 1.0), 100.0 * (high * margin - 1.0))
-        digits = (1, 2, 5) if high / low < 200.0 else (1,)
+        span = high / low
+        digits = (1, 1.5, 2, 3, 5, 7) if span < 10.0 else (1, 2, 5) if span < 200.0 else (1,)
         ticks = [digit * 10.0**power for power in range(-6, 7) for digit in digits]
         axis.set_xticks([100.0 * (x - 1.0) for x in ticks if low / margin <= x <= high * margin])
         axis.xaxis.set_major_formatter("{x:.6g}")

@@ -74,7 +74,7 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
     def rows(metric: str, component: str, names: Sequence[str], scale: float = 1.0) -> list[list[str]]:
         return [
             [
-                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else ", held out"),
+                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
                 *(_two_lines(found.get((scenario, name, metric, component)), scale) for name in names),
             ]
             for scenario in sizes

@@ -286,6 +286,7 @@ def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison])
     scored = {c.against for c in comparisons if c.metric == "score"}
     policies = {c.policy: c.statistic for c in comparisons if c.metric == "rmse"}
     opponents = [name for name, statistic in policies.items() if statistic == "opponent"]
+    references = baselines_of(first.environment).references
     algorithms = dict.fromkeys(member.algorithm for member in runs)
     steps = {member.name: f"{member.run.best['steps']:,}" for member in runs if member.run.best}
 
@@ -297,7 +298,7 @@ def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison])
         ["agent", "at step", f"cost against `{paper}`, %", *errors, *(["score"] if scored else [])],
         [
             [
-                f"`{name}`",
+                f"`{name}`" + (" (reference)" if name in references else ""),
                 steps.get(name, ""),
                 cost(name, statistic),
                 *(with_interval(found[name, statistic, "", "rmse", component]) for component in units),
