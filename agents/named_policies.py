@@ -6,6 +6,11 @@ from typing import Any
 from .learned_policy import pretrained_path, stored_policy
 
 
+def shipped_agents(id: str) -> list[str]:
+    """Names of the agents that are shipped for an environment."""
+    return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
+
+
 def learned_policy(id: str, name: str) -> Any:
     """Return what makes a learned policy for a task, or None if the name means nothing here.
 

@@ -134,6 +134,18 @@ def load_run(folder: Path) -> TrainingRun:
         raise ValueError(f"cannot read {folder / 'run.json'}: {error}") from error
 
 
+def best_agent(folder: Path) -> Path:
+    """File of a run's agent with the lowest validation cost, as an evaluation takes it.
+
+    Raises:
+        ValueError: if the run has not been validated yet.
+    """
+    for name in ("agent.safetensors", "model.zip"):
+        if (folder / "best" / name).is_file():
+            return folder / "best" / name
+    raise ValueError(f"{folder} has no best agent yet: train it up to its first validation")
+
+
 def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
     """Read the run of a folder to go on with it, up to the steps asked for.
 

@@ -1,6 +1,6 @@
-"""Pictures of an evaluation: error over time, distribution of errors, mode probabilities."""
+"""Pictures of an evaluation (error over time, distribution, mode probabilities), and of training."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -178,6 +178,103 @@ def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
     )
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
+def draw_learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]], title: str, paper: str
+) -> Any:
+    """Cost of validations against the paper's algorithm over training, one line for each run.
+
+    Args:
+        curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
+        title: of the figure.
+        paper: name of the paper's algorithm, whose line is at zero.
+    """
+    figure, axes = _axes()
+    axis = axes[0]
+    for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
+        for i, (steps, differences) in enumerate(runs):
+            plural = "s" if len(runs) > 1 else ""
+            label = f"{name}, {len(runs)} run{plural}" if i == 0 else None
+            millions, percent = numpy.array(steps) / 1e6, 100.0 * numpy.array(differences)
+            axis.plot(millions, percent, label=label, **style | {"linewidth": 1.1})
+            best = percent.argmin()
+            axis.plot(millions[best], percent[best], "o", ms=4, color=style["color"])
+    axis.axhline(0.0, color="0.3", lw=1.0)
+    everything = numpy.concatenate([values for runs in curves.values() for _, values in runs])
+    if everything.max() > 1.0:
+        # An untrained agent can cost a hundred times as much; what is learned is told apart near zero.
+        axis.set_yscale("symlog", linthresh=10.0, linscale=1.5)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_ylim(bottom=min(1.2 * 100.0 * everything.min(), -2.0))
+    axis.set_xlim(left=0.0)
+    axis.set_xlabel("environment steps, millions")
+    axis.set_ylabel(f"validation cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4)
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
+def draw_differences(
+    differences: Mapping[str, Mapping[str, Sequence[float]]],
+    names: Sequence[str],
+    learned: Sequence[str],
+    title: str,
+    paper: str,
+) -> Any:
+    """Dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+
+    Args:
+        differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
+        names: policies in the order of the legend.
+        learned: those that are drawn as diamonds.
+        title: of the figure.
+        paper: name of the paper's algorithm, whose line is at zero.
+    """
+    height = 0.8 + len(differences) * (0.25 + 0.07 * len(names))
+    figure, axes = _axes(height=height)
+    axis = axes[0]
+    gap = 0.8 / len(names)
+    for i, (name, style) in enumerate(styles(list(names)).items()):
+        for row, found in enumerate(differences.values()):
+            if name not in found:
+                continue
+            value, low, high = found[name]
+            axis.errorbar(
+                value,
+                row + gap * (i - 0.5 * (len(names) - 1)),
+                xerr=[[value - low], [high - value]],
+                fmt="D" if name in learned else "o",
+                ms=4.5 if name in learned else 3.5,
+                color=style["color"],
+                markerfacecolor=style["color"] if name in learned else "white",
+                elinewidth=1.2,
+                label=name if row == 0 else None,
+            )
+    for row in range(0, len(differences), 2):
+        axis.axhspan(row - 0.5, row + 0.5, color="0.95", zorder=0, lw=0)
+    axis.axvline(0.0, color="0.3", lw=1.0)
+    ends = [x for found in differences.values() for interval in found.values() for x in interval]
+    if ends and (max(ends) > 100.0 or min(ends) < -80.0):
+        # Logarithmic in the ratio of the costs: half and twice the paper's are as far from it.
+        ratio = (lambda x: numpy.log(numpy.maximum(1.0 + x / 100.0, 1e-9)), lambda y: 100.0 * numpy.expm1(y))
+        axis.set_xscale("function", functions=ratio)
+        low, high = max(1.0 + min(*ends, 0.0) / 100.0, 1e-6), 1.0 + max(*ends, 0.0) / 100.0
+        margin = (high / low) ** 0.04
+        axis.set_xlim(100.0 * (low / margin - 1.0), 100.0 * (high * margin - 1.0))
+        span = high / low
+        digits = (1, 1.5, 2, 3, 5, 7) if span < 10.0 else (1, 2, 5) if span < 200.0 else (1,)
+        ticks = [digit * 10.0**power for power in range(-6, 7) for digit in digits]
+        axis.set_xticks([100.0 * (x - 1.0) for x in ticks if low / margin <= x <= high * margin])
+        axis.xaxis.set_major_formatter("{x:.6g}")
+    axis.set_yticks(range(len(differences)), list(differences))
+    axis.set_ylim(len(differences) - 0.5, -0.5)
+    axis.set_xlabel(f"cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4, axis="x")
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
     return figure
 
 

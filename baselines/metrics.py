@@ -63,6 +63,12 @@ def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
     return units | {name: units[parts[0]] for name, parts in dataset.attrs["groups"].items()}
 
 
+def whole_window(dataset: xarray.Dataset) -> str:
+    """Name of the window that stands for the episode: "all", or the scenario's first."""
+    windows = dataset.attrs["windows"]
+    return "all" if "all" in windows else next(iter(windows))
+
+
 def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
     """Mean over episodes and times of what is there: NaN stands for no measurement, or no event.
 
@@ -86,7 +92,7 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
     run = dataset.sel(policy=name)
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
     is_bound = str(run["kind"].values) == "bound"
-    whole = "all" if "all" in windows else next(iter(windows))
+    whole = whole_window(dataset)
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
     for component, unit in reported_components(dataset).items():
         squares = squared_errors(run, component, groups)
@@ -127,12 +133,22 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         yield Measure("beyond_huber_bound", "", whole, bootstrap.estimate(beyond), "1")
 
 
+def score(
+    cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
+) -> Estimate:
+    """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
+    room = paper - reference
+    interval = bootstrap.interval(room)
+    # Where the room may be nothing, a ratio to it says nothing: "no room".
+    has_room = interval.low > 0.0 or interval.high < 0.0
+    return bootstrap.interval((paper - cost) / room) if has_room else NOTHING
+
+
 def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
     known = baselines_of(dataset.attrs["environment"])
     present = dataset["policy"].values.tolist()
-    windows = dataset.attrs["windows"]
-    whole = "all" if "all" in windows else next(iter(windows))
+    whole = whole_window(dataset)
     if known.score_paper not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
     cost = {
@@ -143,12 +159,7 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
     yield Measure("cost_difference", "", whole, bootstrap.interval(cost[name] - paper), "1")
     yield Measure("relative_cost_difference", "", whole, bootstrap.interval(cost[name] / paper - 1.0), "1")
     if known.score_bound in cost:
-        room = paper - cost[known.score_bound]
-        interval = bootstrap.interval(room)
-        # Where the room may be nothing, a ratio to it says nothing: "no room".
-        has_room = interval.low > 0.0 or interval.high < 0.0
-        score = bootstrap.interval((paper - cost[name]) / room) if has_room else NOTHING
-        yield Measure("score", "", whole, score, "1")
+        yield Measure("score", "", whole, score(cost[name], paper, cost[known.score_bound], bootstrap), "1")
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:

@@ -148,6 +148,13 @@ class Baselines:
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
     """Names that the quick benchmark runs, in the order of the table."""
+    compared: tuple[str, ...] = ()
+    """Untuned policies that learned agents are compared with, beside the paper's and the tuned ones."""
+    physical: tuple[str, str] = ("rmse", "position")
+    """Metric and component that the comparison shows beside the cost."""
+    measurement_seconds: float = 5e-6
+    """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
+    full benchmark."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     best_constant: str = ""

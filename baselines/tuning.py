@@ -7,7 +7,7 @@ best candidate is kept by its cost on the validation split only if it beats the 
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -156,6 +156,18 @@ def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
             if policy in table:
                 return table[policy]["values"], str(place)
     raise ValueError(f"no tuned values of policy {policy!r}: run filtergym tune {id} --policy {policy}")
+
+
+def tuned_names(id: str, tunables: Iterable[str]) -> list[str]:
+    """Return ``NAME-tuned`` of every tunable policy that has stored values."""
+    names = []
+    for policy in tunables:
+        try:
+            stored_values(id, policy)
+        except ValueError:
+            continue
+        names.append(f"{policy}-tuned")
+    return names
 
 
 def tuned_policy(id: str, policy: str, tunables: Mapping[str, Tunable]) -> tuple[dict[str, Any], str, Any]:

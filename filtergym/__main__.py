@@ -11,16 +11,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from . import comparison, training_seeds
 from .baselines.evaluation import baselines_of, evaluate
 from .baselines.figures import evaluation_figures, save
 from .baselines.metrics import Record, tidy_records
 from .baselines.reproduction import paper_module, papers, save_reproduction
 from .baselines.tuning import FOLDER, merged_table, table_path, tune
 from .benchmark import Cell, run_benchmark
-from .envs.catalogue import catalogue, nearest, parameter_names, task_class
-from .results import writable_folder, write_records, write_text
-from .room import insert, measure_room, room_markdown
-from .tables import results_table
+from .envs.catalogue import catalogue, find_scenario, nearest, parameter_names, task_class
+from .results import insert_between_markers, split_at_markers, writable_folder, write_records, write_text
+from .room import MARKER, measure_room, room_markdown
+from .tables import grid_table, results_table
 
 app = typer.Typer(
     help="Gymnasium environments for adaptive-filter benchmarking.",
@@ -146,12 +147,20 @@ def evaluate_policies(
 
 @app.command("benchmark")
 def benchmark(
-    full: Annotated[bool, typer.Option("--full", help="Every scenario and ten times the episodes.")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
     seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
     environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+    split: Annotated[
+        str, typer.Option(help="test; or validation, for development: training scenarios only.")
+    ] = "test",
 ) -> None:
-    """Run every environment with its policies; quick by default, resumes after an interruption."""
+    """Run every environment with its policies; quick by default, resumes after an interruption.
+
+    Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
+    """
     with progress_bar() as bar:
 
         def started(cell: Cell, total: int) -> Any:
@@ -161,8 +170,37 @@ def benchmark(
         def finished(records: list[Record]) -> None:
             console.print(results_table(records))
 
-        run_benchmark(out, full, seed, environment or (), started, finished)
+        run_benchmark(out, full, seed, environment or (), split, started, finished)
     console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+
+
+@app.command("comparison")
+def comparison_page(
+    records: Annotated[Path, typer.Argument(help="benchmark.json of a full benchmark.")],
+    into: Annotated[
+        Path | None,
+        typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
+    ] = None,
+) -> None:
+    """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
+
+    Example: filtergym comparison results/benchmark.json --into docs/comparison.md
+    """
+    found = comparison.read_benchmark(records)
+    markers = {id: f"comparison {id.removeprefix('filtergym/')}" for id in found}
+    if into is not None:
+        for marker in markers.values():
+            split_at_markers(into, marker)
+    for id, own in found.items():
+        compared = comparison.compare_environment(own)
+        for grid in compared.grids:
+            console.print(grid_table(grid))
+        if into is not None:
+            picture = f"images/comparison_{id.removeprefix('filtergym/')}.png"
+            save(compared.figure, writable_folder(into.parent / "images") / Path(picture).name)
+            command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
+            text = comparison.comparison_markdown(compared, own, picture, command)
+            insert_between_markers(into, markers[id], text)
 
 
 @app.command("tune")
@@ -220,13 +258,15 @@ def room(
     Example: filtergym room filtergym/ManeuveringTarget-v0
     """
     cls = task_class(environment)
+    if into is not None:
+        split_at_markers(into, MARKER)  # a page that cannot take the table is refused before the work
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
     console.print(results_table(records))
     if into is not None:
         command = f"filtergym room {cls.id} --episodes {episodes} --seed {seed} --into {into}"
-        insert(into, room_markdown(records, command))
+        insert_between_markers(into, MARKER, room_markdown(records, command))
 
 
 @app.command("reproduce")
@@ -338,6 +378,63 @@ def export(
     path = out or folder / "agent.safetensors"
     run = export_run(folder, path)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")
+
+
+@app.command("seeds")
+def seeds(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
+    scenario: Annotated[
+        list[str] | None, typer.Option(help="Scenario; repeatable. Default: the training distribution.")
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(help="Opponent; repeatable. Default: tunable policies, tuned ones and references."),
+    ] = None,
+    episodes: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 2000,
+    seed: Annotated[int, typer.Option(help="Number of the experiment.")] = 0,
+    split: Annotated[str, typer.Option(help="test, validation or train.")] = "test",
+    out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+    into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="PNG file for the learning curves.")] = None,
+) -> None:
+    """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
+
+    Loads models, which can execute code: score only runs that you trust.
+
+    Example: filtergym seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
+    """
+    found = training_seeds.load_runs(runs)
+    cls = task_class(found[0].run.environment)
+    scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
+    opponents = policy or training_seeds.default_opponents(cls.id)
+    marker = f"seeds {cls.id.removeprefix('filtergym/')}"
+    for file in (out, curves):
+        if file is not None:
+            writable_folder(file.parent)
+    if into is not None:
+        split_at_markers(into, marker)
+    if curves is not None:
+        save(training_seeds.learning_curves(found), curves)
+    records: list[training_seeds.Comparison] = []
+    grids = []
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        for name in scenarios:
+            means = training_seeds.episode_means(
+                found, opponents, name, episodes, seed, split, lambda done: bar.update(line, advance=done)
+            )
+            comparisons = training_seeds.compare(found, means, name, seed, split)
+            records += comparisons
+            grids += training_seeds.comparison_grids(found, comparisons)
+    for grid in grids:
+        console.print(grid_table(grid))
+    if out is not None:
+        write_records(out, records)
+    if into is not None:
+        command = f"filtergym seeds RUN ... {' '.join(f'--scenario {name}' for name in scenarios)} "
+        command += "".join(f"--policy {name} " for name in policy or ())
+        command += f"--episodes {episodes} --split {split} --seed {seed}"
+        insert_between_markers(into, marker, training_seeds.grids_as_markdown(grids, found, command))
 
 
 def main() -> None:

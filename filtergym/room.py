@@ -1,30 +1,22 @@
 """The room table: how much there is to win on an environment's training distribution."""
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 from .baselines.evaluation import baselines_of, evaluate
 from .baselines.metrics import Record, tidy_records
 from .baselines.reproduction import markdown_table
-from .baselines.tuning import stored_values
+from .baselines.tuning import tuned_names
 from .envs.catalogue import task_class
-from .results import write_text
 from .tables import main_components, with_interval
 
-BEGIN, END = "<!-- room table: begin -->", "<!-- room table: end -->"
+MARKER = "room table"
+"""What the markers of a page are called, between which the table stands."""
 
 
 def room_policies(id: str) -> list[str]:
     """Names in the room table: best constant action, paper, tuned policies, references, bounds."""
     known = baselines_of(id)
-    tuned = []
-    for name in known.tunable:
-        try:
-            stored_values(id, name)
-        except ValueError:
-            continue
-        tuned.append(f"{name}-tuned")
+    tuned = tuned_names(id, known.tunable)
     constant = f"{known.best_constant}-tuned"
     first = [constant] if constant in tuned else []
     others = [name for name in tuned if name != constant]
@@ -67,17 +59,3 @@ def room_markdown(records: list[Record], command: str) -> str:
         f"95 % bootstrap intervals. Made by `{command}`."
     )
     return "\n".join([*markdown_table(header, rows), "", note])
-
-
-def insert(path: Path, text: str) -> None:
-    """Replace what stands between the two markers of a page.
-
-    Raises:
-        ValueError: if the page does not exist or has no markers.
-    """
-    page: Any = path.read_text(encoding="utf-8") if path.is_file() else ""
-    if BEGIN not in page or END not in page:
-        raise ValueError(f"{path} needs the lines {BEGIN} and {END}, between which the table is put")
-    before, _, rest = page.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    write_text(path, f"{before}{BEGIN}\n\n{text}\n\n{END}{after}")

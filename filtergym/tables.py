@@ -3,7 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
+
+from .baselines.reproduction import Grid
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3) -> str:
@@ -26,8 +29,13 @@ def main_components(records: Sequence[Any], whole: str = "all") -> list[str]:
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == whole
     ]
+    return shown_components(names)
+
+
+def shown_components(names: Sequence[str]) -> list[str]:
+    """Of components and groups of them: the groups where there are any, else the first three."""
     # One namesake is no group: "range" is not made of "range_rate".
-    return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or names[:3]
+    return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
 
 def results_table(records: Sequence[Any], whole: str = "all") -> Table:
@@ -69,4 +77,19 @@ def results_table(records: Sequence[Any], whole: str = "all") -> Table:
         "References and bounds know what no policy can."
     )
     table.caption_justify = "left"
+    return table
+
+
+def grid_table(grid: Grid) -> Table:
+    """Return a table of text for the terminal: numbers to the right, without the marks of Markdown."""
+
+    def plain(cell: str) -> str:
+        return escape(cell.replace("`", "").replace("<br>", "\n"))
+
+    table = Table(title=plain(grid.title), title_justify="left")
+    for i, name in enumerate(grid.header):
+        words = any(row[i].startswith("`") for row in grid.rows)
+        table.add_column(plain(name), justify="left" if words else "right")
+    for row in grid.rows:
+        table.add_row(*map(plain, row))
     return table

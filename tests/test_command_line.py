@@ -72,6 +72,7 @@ def test_a_flight_from_a_file(tmp_path):
         (("tune", ENV, "--policy", "random"), "unknown tunable policy"),
         (("reproduce", "imm"), "unknown paper"),
         (("benchmark", "--environment", "Nothing"), "unknown environment"),
+        (("comparison", "missing.json"), "cannot read the records of a benchmark"),
     ],
 )
 def test_a_mistake_gets_one_clear_sentence(tmp_path, arguments, expected):
@@ -87,8 +88,8 @@ def test_a_mistake_gets_one_clear_sentence(tmp_path, arguments, expected):
 def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
     from filtergym import benchmark
 
-    cells = [benchmark.Cell(ENV, scenario, 20) for scenario in ("paper", "random")]
-    monkeypatch.setattr(benchmark, "cells", lambda full, environments: cells)
+    cells = [benchmark.Cell(ENV, scenario, 20, ("imm", "known-turn")) for scenario in ("paper", "random")]
+    monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
     ran = []
     original = benchmark.run_cell
 
@@ -107,3 +108,45 @@ def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
     assert {r.scenario for r in records} == {"paper", "random"}
     assert len(json.loads((tmp_path / "benchmark.json").read_text())) == len(records)
     assert not (tmp_path / "unfinished").exists()
+
+
+def test_full_benchmark_compares_everything():
+    from filtergym import benchmark
+
+    cells = benchmark.cells(True, [ENV, "filtergym/TightlyCoupledNavigation-v0"])
+    own, dear = cells[0], cells[-1]
+    assert own.policies[0] == "imm"
+    expected = {"fixed-low", "adaptive-rearm-tuned", "ppo", "bptt", "known-turn", "known-input-bound"}
+    assert expected <= set(own.policies)
+    assert own.episodes == 5000
+    assert 20 <= dear.episodes < 1000
+    # Held-out scenarios are run for final tables only.
+    assert [cell.scenario for cell in benchmark.cells(True, [ENV], "validation")] == ["random"]
+
+
+def test_comparison_shows_what_the_records_say(tmp_path):
+    from filtergym.baselines import evaluate, tidy_records
+
+    from filtergym import comparison
+    from filtergym.results import write_records
+
+    names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]
+    records = tidy_records(evaluate(ENV, names, episodes=10, split="validation"))
+    write_records(tmp_path / "benchmark.json", records)
+    found = comparison.read_benchmark(tmp_path / "benchmark.json")
+    assert found == {ENV: records}
+    cost, error = comparison.compare_environment(records).grids
+    assert cost.header == ["scenario", "`imm-tuned`", "`ppo` (learned)", "`known-turn` (reference)"]
+    assert error.header[1] == "`imm` (paper)"
+    assert error.header[-1] == "`known-input-bound` (bound)"
+    [difference] = [
+        100.0 * r.value for r in records if (r.policy, r.metric) == ("ppo", "relative_cost_difference")
+    ]
+    assert float(cost.rows[0][2].partition("<br>")[0]) == pytest.approx(difference, rel=5e-3)
+    page = tmp_path / "page.md"
+    page.write_text(
+        "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
+    )
+    assert run("comparison", "benchmark.json", "--into", "page.md", cwd=tmp_path).returncode == 0
+    assert "`ppo` (learned)" in page.read_text()
+    assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000

@@ -471,6 +471,7 @@ BASELINES = Baselines(
     score_bound="matched",
     tunable=TUNABLE,
     best_constant="best-constant",
+    compared=("augmented",),
     benchmark=(
         "plain-reduced",
         "plain-white",

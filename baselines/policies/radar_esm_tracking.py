@@ -467,6 +467,7 @@ BASELINES = Baselines(
     score_bound="ideal",
     tunable=TUNABLE,
     best_constant="fixed-weights",
+    physical=("rmse", "acceleration"),
     benchmark=(
         "quasi-optimal",
         "joint-type",

@@ -483,6 +483,7 @@ BASELINES = Baselines(
     score_bound="matched",
     tunable=TUNABLE,
     best_constant="fixed-best",
+    physical=("tracking_rmse", ""),
     benchmark=(
         "kalman",
         "over-smoothed",

@@ -1,0 +1,157 @@
+"""Training seeds: the spread against naive sums, what its interval promises, and the command from end to end."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from filtergym.agents.learned_policy import PRETRAINED
+
+from filtergym.training_seeds import compare, episode_means, load_runs, spread
+
+ENV = "filtergym/ManeuveringTarget-v0"
+
+
+def two_way(rng, seeds=5, episodes=60, of_seeds=1.0, of_episodes=2.0, of_both=1.0):
+    return (
+        3.0
+        + of_seeds * rng.normal(size=(seeds, 1))
+        + of_episodes * rng.normal(size=(1, episodes))
+        + of_both * rng.normal(size=(seeds, episodes))
+    )
+
+
+def test_spread_against_naive_sums():
+    values = two_way(np.random.default_rng(0), seeds=4, episodes=7)
+    found = spread(values)
+    S, E = values.shape
+    mean = sum(values[s, e] for s in range(S) for e in range(E)) / (S * E)
+    row = [sum(values[s]) / E for s in range(S)]
+    column = [sum(values[:, e]) / S for e in range(E)]
+    rest = sum((values[s, e] - row[s] - column[e] + mean) ** 2 for s in range(S) for e in range(E))
+    seeds = E * sum((r - mean) ** 2 for r in row) / (S - 1)
+    rest /= (S - 1) * (E - 1)
+    assert found.mean.value == pytest.approx(mean, rel=1e-12)
+    assert found.between_seeds == pytest.approx(((seeds - rest) / E) ** 0.5, rel=1e-12)
+    assert found.over_episodes == pytest.approx(
+        (sum((c - mean) ** 2 for c in column) / (E - 1) / E) ** 0.5, rel=1e-12
+    )
+
+
+def test_interval_of_the_mean_covers_new_seeds_and_episodes():
+    rng = np.random.default_rng(1)
+    for spreads in ((1.0, 0.5, 1.0), (0.1, 3.0, 1.0), (0.0, 0.0, 1.0)):
+        found = [spread(two_way(rng, 5, 60, *spreads)) for _ in range(500)]
+        hits = sum(f.mean.low <= 3.0 <= f.mean.high for f in found)
+        # 4 standard errors of a share of 500 are 4 %; where nothing but noise varies the interval is too wide.
+        assert hits / 500 > 0.91
+        assert hits / 500 < 0.99 or spreads[0] == 0.0
+        squares = np.mean([f.between_seeds**2 for f in found])
+        # Moment estimates are unbiased but for the cut at zero, which adds a little of the noise's variance.
+        assert squares == pytest.approx(spreads[0] ** 2, rel=0.15, abs=0.02)
+
+
+def test_one_seed_has_no_variance_between_seeds():
+    found = spread(two_way(np.random.default_rng(2), seeds=1))
+    assert np.isnan(found.between_seeds)
+    assert found.mean.low < found.mean.value < found.mean.high
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Runs of two training seeds; their agents are shipped ones."""
+    made = []
+    for seed, shipped in ((0, "ppo"), (1, "bptt")):
+        folder = tmp_path / f"run-{seed}"
+        (folder / "best").mkdir(parents=True)
+        source = PRETRAINED / "ManeuveringTarget-v0" / shipped
+        shutil.copyfile(source.with_suffix(".safetensors"), folder / "best" / "agent.safetensors")
+        record = json.loads((PRETRAINED / "ManeuveringTarget-v0" / "bptt.json").read_text(encoding="utf-8"))
+        command = record["command"].removesuffix(f" --seed {record['seed']}") + f" --seed {seed}"
+        (folder / "run.json").write_text(json.dumps(record | {"seed": seed, "command": command}))
+        made.append(folder)
+    return made
+
+
+def test_the_numbers_follow_from_the_episodes(folders):
+    runs = load_runs(folders)
+    means = episode_means(runs, ["adaptive"], "random", 30, 0, "validation")
+    found = {
+        (c.policy, c.statistic, c.against, c.metric, c.component): c
+        for c in compare(runs, means, "random", 0, "validation")
+    }
+    cost = {name: values.mean() for name, values in means.cost.items()}
+    each = [cost[f"bptt seed {seed}"] for seed in (0, 1)]
+    mean = found["bptt", "mean", "imm", "relative_cost_difference", ""]
+    assert mean.value == pytest.approx(np.mean(each) / cost["imm"] - 1.0, rel=1e-12)
+    assert mean.low < mean.value < mean.high
+    median = found["bptt", "median", "adaptive", "relative_cost_difference", ""]
+    assert median.value == pytest.approx(np.median(each) / cost["adaptive"] - 1.0, rel=1e-12)
+    rmse = {name: np.sqrt(values.mean()) for name, values in means.squares["position"].items()}
+    difference = found["bptt", "median", "imm", "rmse_difference", "position"]
+    expected = np.median([rmse[f"bptt seed {seed}"] - rmse["imm"] for seed in (0, 1)])
+    assert difference.value == pytest.approx(expected, rel=1e-12)
+    assert (difference.unit, difference.episodes) == ("m", 30)
+
+
+def seeds_command(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "filtergym", "seeds", *map(str, arguments)],
+        capture_output=True, text=True, cwd=cwd, check=False,
+    )  # fmt: skip
+
+
+def test_command_fills_the_page(folders, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "a\n<!-- seeds ManeuveringTarget-v0: begin -->\nold\n<!-- seeds ManeuveringTarget-v0: end -->\nb"
+    )
+    arguments = (
+        *folders,
+        "--episodes",
+        20,
+        "--split",
+        "validation",
+        "--out",
+        "seeds.json",
+        "--into",
+        page,
+        "--curves",
+        "curves.png",
+    )
+    result = seeds_command(*arguments, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "bptt seed 1" in result.stdout
+    text = page.read_text()
+    assert (text[:2], text[-2:], "old" in text) == ("a\n", "\nb", False)
+    for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
+        assert word in text
+    assert (tmp_path / "curves.png").stat().st_size > 10_000
+    records = json.loads((tmp_path / "seeds.json").read_text())
+    assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
+
+
+def test_what_cannot_be_compared(folders, tmp_path):
+    def fails(expected, *arguments):
+        result = seeds_command(*arguments, cwd=tmp_path)
+        assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
+        assert expected in result.stderr
+
+    fails("is a bound, which has no cost", folders[0], "--policy", "known-input-bound")
+    (tmp_path / "page.md").write_text("no markers")
+    fails("needs the lines <!-- seeds", folders[0], "--into", "page.md")
+    record = json.loads((folders[1] / "run.json").read_text())
+    (folders[1] / "run.json").write_text(json.dumps(record | {"envs": 3}))
+    with pytest.raises(ValueError, match=r"may differ in the seed only: .* has envs 3"):
+        load_runs(folders)
+    (folders[1] / "run.json").write_text(json.dumps(record | {"seed": 0}))
+    with pytest.raises(ValueError, match="is a second run of bptt seed 0"):
+        load_runs(folders)
+    (folders[1] / "run.json").write_text(json.dumps(record | {"environment": "filtergym/UavAutopilot-v0"}))
+    with pytest.raises(ValueError, match="runs of one environment are compared"):
+        load_runs(folders)
+    shutil.rmtree(folders[0] / "best")
+    with pytest.raises(ValueError, match="has no best agent yet"):
+        load_runs(folders[:1])
