@@ -8,6 +8,7 @@ from filtergym.baselines.reproduction import (
     Grid,
     Reproduction,
     as_markdown,
+    episode_count,
     paper_module,
     papers,
     save_reproduction,
@@ -41,6 +42,14 @@ def test_every_module_is_a_paper_with_the_whole_interface() -> None:
 def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
     with pytest.raises(ValueError, match=r"unknown paper 'imm-alpha-gamma'.*'imm-alpha-beta'"):
         paper_module("imm-alpha-gamma")
+
+
+def test_every_paper_refuses_episodes_without_an_interval() -> None:
+    assert (episode_count(None, 50), episode_count(2, 50)) == (50, 2)
+    for name in papers():
+        for episodes in (0, 1):
+            with pytest.raises(ValueError, match=f"episodes must be at least .* got {episodes}"):
+                paper_module(name).reproduce(lambda done=1: None, episodes)
 
 
 def test_the_page_holds_claims_tables_and_figures() -> None:

@@ -22,7 +22,7 @@ from ..evaluation import evaluate
 from ..figures import styles
 from ..gain_schedules import Flight, best_schedule, maneuver_flight, mean_square_errors, ramp_schedule
 from ..imm_readings import Likelihood, Reading, Recording, interacting_multiple_model, recorded
-from ..reproduction import Claim, Grid, Reproduction, Verdict
+from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
 
 TITLE = "Tracking a manoeuvring target with an IMM algorithm over two alpha-beta filters"
 EPISODES = 5000
@@ -997,9 +997,7 @@ def reproduce(progress: Callable[[float], None], episodes: int | None = None) ->
     Raises:
         ValueError: for fewer than two episodes, which have no interval.
     """
-    count = EPISODES if episodes is None else episodes
-    if count < 2:
-        raise ValueError(f"episodes must be at least 2 for intervals over them, got {count}")
+    count = episode_count(episodes, EPISODES)
     r = run_everything(progress, count)
     figures = {
         "figure_2_trajectory": draw_trajectory(r),
