@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from filtergym.baselines.figures import save
 from filtergym.baselines.reproduction import (
     Claim,
     Grid,
@@ -82,3 +83,16 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
         save_reproduction(result, tmp_path, write_text)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == "the last one"
+
+
+def test_a_figure_that_fails_halfway_leaves_the_one_before(tmp_path: Path) -> None:
+    class HalfPainted:
+        def savefig(self, file: Path, **_: object) -> None:
+            file.write_bytes(b"half")
+            raise RuntimeError("no ink")
+
+    (tmp_path / "figure.png").write_bytes(b"the last one")
+    with pytest.raises(RuntimeError, match="no ink"):
+        save(HalfPainted(), tmp_path / "figure.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
+    assert (tmp_path / "figure.png").read_bytes() == b"the last one"
