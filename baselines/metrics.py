@@ -86,7 +86,6 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
     run = dataset.sel(policy=name)
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
     is_bound = str(run["kind"].values) == "bound"
-    whole = "all" if "all" in windows else next(iter(windows))
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
     for component, unit in reported_components(dataset).items():
         squares = squared_errors(run, component, groups)
@@ -95,7 +94,7 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
             value = bootstrap.estimate(squares[:, times].mean(axis=1), numpy.sqrt)
             yield Measure("rmse", component, window, value, unit)
         peak = bootstrap.interval(over_time.max(axis=1))
-        yield Measure("peak_rmse", component, whole, peak, unit)
+        yield Measure("peak_rmse", component, "all", peak, unit)
         if not is_bound and component not in groups:
             signed = run["error"].sel(component=component).values
             for window, times in slices.items():
@@ -122,17 +121,15 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         cost, capped = run["cost"].values, run["capped_cost"].values
         for window, times in slices.items():
             yield Measure("cost", "", window, bootstrap.estimate(cost[:, times].mean(axis=1)), "1")
-        yield Measure("return", "", whole, bootstrap.estimate(-capped.sum(axis=1)), "1")
+        yield Measure("return", "", "all", bootstrap.estimate(-capped.sum(axis=1)), "1")
         beyond = (cost > dataset.attrs["huber_bound"] ** 2).mean(axis=1)
-        yield Measure("beyond_huber_bound", "", whole, bootstrap.estimate(beyond), "1")
+        yield Measure("beyond_huber_bound", "", "all", bootstrap.estimate(beyond), "1")
 
 
 def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
     known = baselines_of(dataset.attrs["environment"])
     present = dataset["policy"].values.tolist()
-    windows = dataset.attrs["windows"]
-    whole = "all" if "all" in windows else next(iter(windows))
     if known.score_paper not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
     cost = {
@@ -140,15 +137,15 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
         for p in {name, known.score_paper, known.score_bound} & set(present)
     }
     paper = cost[known.score_paper]
-    yield Measure("cost_difference", "", whole, bootstrap.interval(cost[name] - paper), "1")
-    yield Measure("relative_cost_difference", "", whole, bootstrap.interval(cost[name] / paper - 1.0), "1")
+    yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
+    yield Measure("relative_cost_difference", "", "all", bootstrap.interval(cost[name] / paper - 1.0), "1")
     if known.score_bound in cost:
         room = paper - cost[known.score_bound]
         interval = bootstrap.interval(room)
         # Where the room may be nothing, a ratio to it says nothing: "no room".
         has_room = interval.low > 0.0 or interval.high < 0.0
         score = bootstrap.interval((paper - cost[name]) / room) if has_room else NOTHING
-        yield Measure("score", "", whole, score, "1")
+        yield Measure("score", "", "all", score, "1")
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:

@@ -41,7 +41,7 @@ HIGH_GAINS = (0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 LOW_BOX, HIGH_BOX = (0.3, 0.45), (0.7, 0.95)
 """Gains that the paper recommends."""
 
-WINDOWS = dict(ManeuveringTarget.scenarios["paper"].windows)
+WINDOWS = {**ManeuveringTarget.scenarios["paper"].windows, "all": (1, 100)}
 SECTION = (WINDOWS["turn"][0], WINDOWS["recovery"][1])
 
 LIKELIHOODS: dict[Likelihood, str] = {

@@ -50,11 +50,7 @@ FILTERS: dict[str, int | None] = {
     "constant velocity": LINE,
     "Singer": SINGER,
 }
-WINDOWS = {
-    name: window
-    for name, window in TightlyCoupledNavigation.scenarios["paper"].windows.items()
-    if name != "all"
-}
+WINDOWS = TightlyCoupledNavigation.scenarios["paper"].windows
 MOTION = 1001
 """First step that carries the motion of leg 2."""
 JUMP = 2000
