@@ -28,6 +28,20 @@ def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
     return arrays, "relu" if torch.nn.ReLU in between else "tanh"
 
 
+def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
+    """Arrays of a long short-term memory of one layer."""
+    names = {
+        "weight_ih_l0": "lstm_input_weight", "bias_ih_l0": "lstm_input_bias",
+        "weight_hh_l0": "lstm_memory_weight", "bias_hh_l0": "lstm_memory_bias",
+    }  # fmt: skip
+    parameters = {name: values.detach().numpy() for name, values in module.named_parameters()}
+    if parameters.keys() != names.keys():
+        raise ValueError(
+            f"cannot export {module}: a learned policy holds one layer, with biases and no projection"
+        )
+    return {names[name]: values for name, values in parameters.items()}
+
+
 def network_arrays(agent: Sb3Policy, algorithm: str) -> tuple[dict[str, numpy.ndarray], str, str]:
     """Arrays, output and activation of a trained model's deterministic action.
 
@@ -36,18 +50,18 @@ def network_arrays(agent: Sb3Policy, algorithm: str) -> tuple[dict[str, numpy.nd
     """
     policy: Any = agent.model.policy
     discrete = not hasattr(agent.action_space, "low")
-    if algorithm == "ppo":
+    if algorithm in ("ppo", "recurrent-ppo"):
         arrays, activation = _layers(policy.mlp_extractor.policy_net, policy.action_net)
         output = "argmax" if discrete else "clip"
+        if algorithm == "recurrent-ppo":
+            arrays |= _lstm(policy.lstm_actor)
     elif algorithm == "sac":
         arrays, activation = _layers(policy.actor.latent_pi, policy.actor.mu)
         output = "tanh"
-    elif algorithm == "dqn":
+    else:  # dqn
         arrays, activation = _layers(policy.q_net.q_net)
         output = "argmax"
-    else:
-        raise ValueError(f"cannot export algorithm {algorithm!r}: choose from ppo, sac, dqn, bptt")
-    fields = arrays["weight_0"].shape[1]
+    fields: Any = agent.observation_space.shape
     mean, scale = numpy.zeros(fields), numpy.ones(fields)
     if agent.normalisation is not None:
         statistics: Any = agent.normalisation.obs_rms

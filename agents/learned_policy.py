@@ -2,8 +2,9 @@
 
 A file is in the safetensors form: arrays, and a header of words. ``observation_mean`` and
 ``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
-(reset, update, new), ``weight_i`` and ``bias_i`` the layers after it. The header names the environment, the
-control and the fields of the observation, so that an agent is never shown what it was not trained on.
+(reset, update, new), ``lstm_*`` a long short-term memory (input, forget, cell, output), ``weight_i`` and
+``bias_i`` the layers after it. The header names the environment, the control and the fields of the
+observation, so that an agent is never shown what it was not trained on.
 """
 
 import json
@@ -61,10 +62,12 @@ class LearnedPolicy(Policy):
         x = (observation - a["observation_mean"]) / a["observation_scale"]
         x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(numpy.float32)
         if "gru_input_weight" in a:
-            width = a["gru_memory_weight"].shape[1]
-            memory = numpy.zeros((len(x), width), numpy.float32) if state is None else state
-            memory = numpy.where(start[:, None], numpy.float32(0.0), memory)
-            x = state = self._remembered(x, memory)
+            memory = self._memory(state, start, a["gru_memory_weight"].shape[1])
+            x = state = self._gated_unit(x, memory)
+        elif "lstm_input_weight" in a:
+            memory = self._memory(state, start, 2 * a["lstm_memory_weight"].shape[1])
+            state = self._long_short_term(x, memory)
+            x = numpy.split(state, 2, axis=1)[0]
         for i, (weight, bias) in enumerate(self.layers):
             x = x @ weight.T + bias
             if i < len(self.layers) - 1:
@@ -76,7 +79,12 @@ class LearnedPolicy(Policy):
             return numpy.clip(x, space.low, space.high), state
         return space.low + (space.high - space.low) * 0.5 * (1.0 + numpy.tanh(x)), state
 
-    def _remembered(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
+    def _memory(self, state: Any, start: numpy.ndarray, width: int) -> numpy.ndarray:
+        """What is remembered, ``(N, width)``: nothing at the start of an episode."""
+        memory = numpy.zeros((len(start), width), numpy.float32) if state is None else state
+        return numpy.where(start[:, None], numpy.float32(0.0), memory)
+
+    def _gated_unit(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
         """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
         a = self.arrays
         from_input = numpy.split(x @ a["gru_input_weight"].T + a["gru_input_bias"], 3, axis=1)
@@ -85,6 +93,16 @@ class LearnedPolicy(Policy):
         update = _logistic(from_input[1] + from_memory[1])
         new = numpy.tanh(from_input[2] + reset * from_memory[2])
         return (1.0 - update) * new + update * memory
+
+    def _long_short_term(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
+        """One step of the long short-term memory (Gers et al., 2000): what it shows, beside its cells."""
+        a = self.arrays
+        shown, cells = numpy.split(memory, 2, axis=1)
+        gates = x @ a["lstm_input_weight"].T + a["lstm_input_bias"]
+        gates = gates + shown @ a["lstm_memory_weight"].T + a["lstm_memory_bias"]
+        admit, keep, new, show = numpy.split(gates, 4, axis=1)
+        cells = _logistic(keep) * cells + _logistic(admit) * numpy.tanh(new)
+        return numpy.concatenate([_logistic(show) * numpy.tanh(cells), cells], axis=1)
 
 
 def write_arrays(

@@ -188,11 +188,7 @@ def validation_score(run: TrainingRun, policy: Any) -> dict[str, Any]:
         VALIDATION_EPISODES,
         split="validation",
     )
-    # The score's window is the first record of its kind: the whole episode, or the scenario's first window.
-    found: dict[tuple[str, str], Any] = {}
-    for record in tidy_records(dataset):
-        if record.window == "all" or (record.policy, record.metric) not in found:
-            found[record.policy, record.metric] = record
+    found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
     difference = found["agent", "relative_cost_difference"]
     return {
         "steps": run.steps_done,

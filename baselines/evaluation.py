@@ -250,7 +250,7 @@ def _dataset(
             "seed": seed,
             "windows": {
                 name: (first, min(last, task.horizon))
-                for name, (first, last) in (scenario.windows or {"all": (1, task.horizon)}).items()
+                for name, (first, last) in {**scenario.windows, "all": (1, task.horizon)}.items()
                 if first <= task.horizon
             },
             "groups": dict(task.groups),

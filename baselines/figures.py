@@ -292,5 +292,8 @@ def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
 def save(figure: Any, path: Path) -> None:
     """Save a figure as PNG, whole or not at all."""
     partial = path.with_suffix(".partial")
-    figure.savefig(partial, format="png", dpi=130)
-    partial.replace(path)
+    try:
+        figure.savefig(partial, format="png", dpi=130)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

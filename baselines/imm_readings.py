@@ -12,9 +12,9 @@ from typing import Any, Literal, NamedTuple
 import numpy
 
 from ..envs.catalogue import make_task
-from ..envs.lanes import Lanes
 from ..filters import alpha_beta, imm, kalman
 from ..filters.gaussian import log_density
+from .rollout import started_lanes
 from .seeds import episode_seeds
 
 
@@ -45,10 +45,7 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
         **keywords: parameters of the task.
     """
     task: Any = make_task("filtergym/ManeuveringTarget-v0", "gain", scenario, **keywords)
-    lanes = Lanes(task, episodes)
-    for lane, episode_seed in enumerate(episode_seeds("test", seed, episodes)):
-        lanes.seed(lane, numpy.random.default_rng(episode_seed))
-    lanes.restart()
+    lanes = started_lanes(task, episode_seeds("test", seed, episodes))
     # The filter has just predicted to the first scan; taking that step back gives the start.
     predicted = lanes.state.estimator
     start = numpy.concatenate([predicted.position - task.T * predicted.velocity, predicted.velocity])

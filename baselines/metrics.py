@@ -63,12 +63,6 @@ def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
     return units | {name: units[parts[0]] for name, parts in dataset.attrs["groups"].items()}
 
 
-def whole_window(dataset: xarray.Dataset) -> str:
-    """Name of the window that stands for the episode: "all", or the scenario's first."""
-    windows = dataset.attrs["windows"]
-    return "all" if "all" in windows else next(iter(windows))
-
-
 def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
     """Mean over episodes and times of what is there: NaN stands for no measurement, or no event.
 
@@ -92,7 +86,6 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
     run = dataset.sel(policy=name)
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
     is_bound = str(run["kind"].values) == "bound"
-    whole = whole_window(dataset)
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
     for component, unit in reported_components(dataset).items():
         squares = squared_errors(run, component, groups)
@@ -101,7 +94,7 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
             value = bootstrap.estimate(squares[:, times].mean(axis=1), numpy.sqrt)
             yield Measure("rmse", component, window, value, unit)
         peak = bootstrap.interval(over_time.max(axis=1))
-        yield Measure("peak_rmse", component, whole, peak, unit)
+        yield Measure("peak_rmse", component, "all", peak, unit)
         if not is_bound and component not in groups:
             signed = run["error"].sel(component=component).values
             for window, times in slices.items():
@@ -128,9 +121,9 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         cost, capped = run["cost"].values, run["capped_cost"].values
         for window, times in slices.items():
             yield Measure("cost", "", window, bootstrap.estimate(cost[:, times].mean(axis=1)), "1")
-        yield Measure("return", "", whole, bootstrap.estimate(-capped.sum(axis=1)), "1")
+        yield Measure("return", "", "all", bootstrap.estimate(-capped.sum(axis=1)), "1")
         beyond = (cost > dataset.attrs["huber_bound"] ** 2).mean(axis=1)
-        yield Measure("beyond_huber_bound", "", whole, bootstrap.estimate(beyond), "1")
+        yield Measure("beyond_huber_bound", "", "all", bootstrap.estimate(beyond), "1")
 
 
 def score(
@@ -148,7 +141,6 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
     """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
     known = baselines_of(dataset.attrs["environment"])
     present = dataset["policy"].values.tolist()
-    whole = whole_window(dataset)
     if known.score_paper not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
     cost = {
@@ -156,10 +148,10 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
         for p in {name, known.score_paper, known.score_bound} & set(present)
     }
     paper = cost[known.score_paper]
-    yield Measure("cost_difference", "", whole, bootstrap.interval(cost[name] - paper), "1")
-    yield Measure("relative_cost_difference", "", whole, bootstrap.interval(cost[name] / paper - 1.0), "1")
+    yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
+    yield Measure("relative_cost_difference", "", "all", bootstrap.interval(cost[name] / paper - 1.0), "1")
     if known.score_bound in cost:
-        yield Measure("score", "", whole, score(cost[name], paper, cost[known.score_bound], bootstrap), "1")
+        yield Measure("score", "", "all", score(cost[name], paper, cost[known.score_bound], bootstrap), "1")
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:

@@ -74,6 +74,18 @@ def paper_module(name: str) -> ModuleType:
     return importlib.import_module(f"{reproductions.__name__}.{known[name]}")
 
 
+def episode_count(episodes: int | None, default: int) -> int:
+    """Return the number of Monte Carlo runs of a reproduction.
+
+    Raises:
+        ValueError: for fewer than two, which have no interval.
+    """
+    count = default if episodes is None else episodes
+    if count < 2:
+        raise ValueError(f"episodes must be at least 2 for intervals over them, got {count}")
+    return count
+
+
 def as_markdown(result: Reproduction) -> str:
     """Claims, tables and figures as one page."""
     lines = [f"# {result.title}", "", "## Claims", ""]

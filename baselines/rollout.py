@@ -13,7 +13,8 @@ Progress = Callable[[int], None]
 """Told the number of measurements just done."""
 
 
-def _started(task: Task, seeds: Sequence[int]) -> Lanes:
+def started_lanes(task: Task, seeds: Sequence[int]) -> Lanes:
+    """Return one episode for each seed, side by side, with its first measurement made."""
     lanes = Lanes(task, len(seeds))
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
@@ -33,7 +34,7 @@ def run_policy(
         record: called with every state after the action; lanes beyond ``len(seeds)`` are padding.
         tick: told of progress.
     """
-    lanes = _started(task, seeds)
+    lanes = started_lanes(task, seeds)
     memory: Any = None
     start = numpy.ones(lanes.count, dtype=bool)
     for _ in range(lanes.decisions_per_episode):
@@ -52,7 +53,7 @@ def run_reference(
     task: Task, reference: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
 ) -> None:
     """Run a reference estimator in place of actions; arguments as in :func:`run_policy`."""
-    lanes = _started(task, seeds)
+    lanes = started_lanes(task, seeds)
     memory = reference.start(lanes.state)
 
     def update(state: Any) -> Any:
@@ -69,7 +70,7 @@ def run_bound(
     task: Task, bound: Any, seeds: Sequence[int], record: Callable[[Array], None], tick: Progress
 ) -> None:
     """Compute a bound along the episodes; ``record`` gets its mean squares, ``(C, N)``."""
-    lanes = _started(task, seeds)
+    lanes = started_lanes(task, seeds)
     memory = bound.start(lanes.state)
     neutral = lanes.widened(numpy.zeros((lanes.count, *(task.action_space.shape or ()))))
 

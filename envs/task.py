@@ -70,7 +70,8 @@ class Scenario:
     description: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
     windows: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    """First and last measurement of each window, both included; measurement 1 is the first one acted on."""
+    """First and last measurement of each window, both included; measurement 1 is the first one acted on. An
+    evaluation adds the window ``all``, the whole episode."""
     training: bool = False
     """Whether agents may be trained and policies tuned on it."""
 

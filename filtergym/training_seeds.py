@@ -15,7 +15,7 @@ from .agents.training_run import TrainingRun, best_agent, load_run
 from .baselines.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from .baselines.evaluation import baselines_of, evaluate, load_policy
 from .baselines.figures import draw_learning_curves
-from .baselines.metrics import reported_components, score, squared_errors, whole_window
+from .baselines.metrics import reported_components, score, squared_errors
 from .baselines.reproduction import Grid, markdown_table
 from .baselines.tuning import tuned_names
 from .tables import shown_components, with_interval
@@ -193,7 +193,7 @@ def episode_means(
         dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
         data = dataset.isel(policy=0)
         cost[name] = data["cost"].values.mean(axis=1)
-        first, last = dataset.attrs["windows"][whole_window(dataset)]
+        first, last = dataset.attrs["windows"]["all"]
         units = reported_components(dataset)
         for component in shown_components(list(units)):
             values = squared_errors(data, component, dataset.attrs["groups"])[:, first - 1 : last]

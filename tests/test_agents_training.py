@@ -3,6 +3,7 @@
 import os
 import signal
 
+import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines.evaluation import evaluate, load_policy
@@ -14,11 +15,13 @@ pytest.importorskip("stable_baselines3")
 pytest.importorskip("sb3_contrib")
 import torch
 from filtergym.agents import training_run
+from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
-from filtergym.agents.export import export_run
+from filtergym.agents.export import export_run, network_arrays
 from filtergym.agents.learned_policy import LearnedPolicy, read_header
-from filtergym.agents.sb3_training import load_sb3_policy, train_sb3
+from filtergym.agents.sb3_training import Sb3Policy, load_sb3_policy, train_sb3
 from filtergym.agents.training_run import load_run, new_run, resumed_run
+from sb3_contrib import RecurrentPPO
 
 ID = "filtergym/ManeuveringTarget-v0"
 SMALL = {
@@ -118,7 +121,14 @@ def test_validation_is_that_of_evaluate(tmp_path):
 
 @pytest.mark.parametrize(
     ("algorithm", "control"),
-    [("ppo", "gain"), ("ppo", "mode"), ("ppo", "weights"), ("sac", "gain"), ("dqn", "mode")],
+    [
+        ("ppo", "gain"),
+        ("ppo", "mode"),
+        ("ppo", "weights"),
+        ("sac", "gain"),
+        ("dqn", "mode"),
+        ("recurrent-ppo", "gain"),
+    ],
 )
 def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     train(small_run(algorithm, 240, control=control), tmp_path)
@@ -247,11 +257,39 @@ def test_files_that_are_no_policies(tmp_path):
             load_policy(ID, str(tmp_path / name))
 
 
-def test_recurrent_agent_cannot_be_exported(tmp_path):
-    train(small_run("recurrent-ppo", 240), tmp_path)
-    with pytest.raises(ValueError, match="cannot export algorithm 'recurrent-ppo'"):
-        export_run(tmp_path, tmp_path / "agent.safetensors")
-    assert not (tmp_path / "agent.safetensors").exists()
+def recurrent_agent(control, layers=1):
+    """An untrained recurrent PPO agent and environments whose episodes end at different times."""
+    env = to_sb3(
+        gymnasium.make_vec(ID, 5, autoreset_mode="SameStep", control=control, horizon=30), staggered=True
+    )
+    kwargs = {"net_arch": [6], "lstm_hidden_size": 4, "n_lstm_layers": layers}
+    model = RecurrentPPO("MlpLstmPolicy", env, seed=0, policy_kwargs=kwargs, device="cpu")
+    # It starts with actions near zero, which would hide its memory.
+    model.policy.action_net.weight.data.mul_(100.0)
+    return Sb3Policy(model, None, control), env
+
+
+@pytest.mark.parametrize("control", ["gain", "mode"])
+def test_exported_recurrent_agent_remembers_like_the_model(control):
+    agent, env = recurrent_agent(control)
+    arrays, output, activation = network_arrays(agent, "recurrent-ppo")
+    policy = LearnedPolicy(make_task(ID, control), arrays, output, activation)
+    shown, start = env.reset(), np.ones(5, dtype=bool)
+    memory = state = None
+    met = []
+    for _ in range(70):
+        expected, state = agent.predict(shown, state, start)
+        action, memory = policy.predict(shown, memory, start)
+        # float32 in both; the logistic function is computed from tanh here.
+        np.testing.assert_allclose(action, expected, atol=3e-6)
+        met.append(action)
+        shown, _, start, _ = env.step(expected)
+    assert np.std(met) > 0.1
+
+
+def test_recurrent_agent_that_cannot_be_exported():
+    with pytest.raises(ValueError, match=r"cannot export LSTM\(.*num_layers=2.*holds one layer"):
+        network_arrays(recurrent_agent("gain", layers=2)[0], "recurrent-ppo")
 
 
 class TestCommandLine:

@@ -77,6 +77,13 @@ def test_records_follow_from_the_dataset(dataset):
     assert ("known-input-bound", "score", "", "all") not in records
 
 
+def test_window_all_is_the_whole_episode_however_long():
+    windows = evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=120).attrs["windows"]
+    assert (windows["all"], windows["post"]) == ((1, 120), (70, 100))
+    windows = evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=60).attrs["windows"]
+    assert (windows["all"], windows["recovery"]) == ((1, 60), (56, 60))
+
+
 def test_score_is_zero_for_the_paper_and_one_for_the_reference(dataset):
     records = {r.policy: r for r in tidy_records(dataset) if r.metric == "score"}
     assert records["imm"].value == 0.0

@@ -10,8 +10,8 @@ from filtergym.baselines.bootstrap import Bootstrap
 from filtergym.baselines.evaluation import baselines_of
 from filtergym.baselines.policies import radar_esm_tracking as baselines
 from filtergym.baselines.reproductions import radar_esm_class_fusion as reproduction
+from filtergym.baselines.rollout import started_lanes
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.lanes import Lanes
 
 import filtergym  # noqa: F401  # registers the environments
 
@@ -150,10 +150,7 @@ def test_exact_errors_after_a_minute():
 
 def played(task, estimator, seeds, decisions):
     """States after the estimator's update, with the task's own before it."""
-    lanes = Lanes(task, len(seeds))
-    for lane, seed in enumerate(seeds):
-        lanes.seed(lane, numpy.random.default_rng(seed))
-    lanes.restart()
+    lanes = started_lanes(task, seeds)
     memory = estimator.start(lanes.state)
     states = []
 
@@ -236,10 +233,7 @@ def test_ideal_keeps_its_bound_where_the_class_changes():
 
 def decided(task, policy, seeds, decisions):
     """States after measurement and after the policy's action."""
-    lanes = Lanes(task, len(seeds))
-    for lane, seed in enumerate(seeds):
-        lanes.seed(lane, numpy.random.default_rng(seed))
-    lanes.restart()
+    lanes = started_lanes(task, seeds)
     for _ in range(decisions):
         before = lanes.state
         action, _ = policy.predict(lanes.observe())

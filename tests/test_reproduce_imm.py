@@ -299,11 +299,6 @@ def test_figures_can_be_drawn_with_axes_named(results: SimpleNamespace) -> None:
         assert any(axis.get_xlabel() for axis in axes)
 
 
-def test_one_episode_has_no_interval() -> None:
-    with pytest.raises(ValueError, match="episodes must be at least 2 for intervals over them, got 1"):
-        paper.reproduce(lambda done: None, episodes=1)
-
-
 def test_readings_differ(recording: Recording) -> None:
     readings = [Reading(likelihood=kind) for kind in paper.LIKELIHOODS]
     readings += [replace(readings[0], per_axis=True), replace(readings[0], stay=0.8)]

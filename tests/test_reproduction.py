@@ -3,11 +3,13 @@
 from pathlib import Path
 
 import pytest
+from filtergym.baselines.figures import save
 from filtergym.baselines.reproduction import (
     Claim,
     Grid,
     Reproduction,
     as_markdown,
+    episode_count,
     paper_module,
     papers,
     save_reproduction,
@@ -43,6 +45,14 @@ def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
         paper_module("imm-alpha-gamma")
 
 
+def test_every_paper_refuses_episodes_without_an_interval() -> None:
+    assert (episode_count(None, 50), episode_count(2, 50)) == (50, 2)
+    for name in papers():
+        for episodes in (0, 1):
+            with pytest.raises(ValueError, match=f"episodes must be at least .* got {episodes}"):
+                paper_module(name).reproduce(lambda done=1: None, episodes)
+
+
 def test_the_page_holds_claims_tables_and_figures() -> None:
     lines = as_markdown(example()).splitlines()
     assert lines[0] == "# A paper"
@@ -73,3 +83,16 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
         save_reproduction(result, tmp_path, write_text)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == "the last one"
+
+
+def test_a_figure_that_fails_halfway_leaves_the_one_before(tmp_path: Path) -> None:
+    class HalfPainted:
+        def savefig(self, file: Path, **_: object) -> None:
+            file.write_bytes(b"half")
+            raise RuntimeError("no ink")
+
+    (tmp_path / "figure.png").write_bytes(b"the last one")
+    with pytest.raises(RuntimeError, match="no ink"):
+        save(HalfPainted(), tmp_path / "figure.png")
+    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
+    assert (tmp_path / "figure.png").read_bytes() == b"the last one"

@@ -402,16 +402,15 @@ def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     if numpy.isnan(times).all():
         return []
     lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
-    whole = "all" if "all" in run.attrs["windows"] else next(iter(run.attrs["windows"]))
     return [
         Measure(
             "recovery_time",
             "position",
-            whole,
+            "all",
             mean_of_present(times[:, None] * parameters.step, bootstrap),
             "s",
         ),
-        Measure("not_recovered", "position", whole, mean_of_present(lost[:, None], bootstrap), "1"),
+        Measure("not_recovered", "position", "all", mean_of_present(lost[:, None], bootstrap), "1"),
     ]
 
 

@@ -22,7 +22,7 @@ from ..evaluation import evaluate
 from ..figures import styles
 from ..gain_schedules import Flight, best_schedule, maneuver_flight, mean_square_errors, ramp_schedule
 from ..imm_readings import Likelihood, Reading, Recording, interacting_multiple_model, recorded
-from ..reproduction import Claim, Grid, Reproduction, Verdict
+from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
 
 TITLE = "Tracking a manoeuvring target with an IMM algorithm over two alpha-beta filters"
 EPISODES = 5000
@@ -41,7 +41,7 @@ HIGH_GAINS = (0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 LOW_BOX, HIGH_BOX = (0.3, 0.45), (0.7, 0.95)
 """Gains that the paper recommends."""
 
-WINDOWS = dict(ManeuveringTarget.scenarios["paper"].windows)
+WINDOWS = {**ManeuveringTarget.scenarios["paper"].windows, "all": (1, 100)}
 SECTION = (WINDOWS["turn"][0], WINDOWS["recovery"][1])
 
 LIKELIHOODS: dict[Likelihood, str] = {
@@ -997,9 +997,7 @@ def reproduce(progress: Callable[[float], None], episodes: int | None = None) ->
     Raises:
         ValueError: for fewer than two episodes, which have no interval.
     """
-    count = EPISODES if episodes is None else episodes
-    if count < 2:
-        raise ValueError(f"episodes must be at least 2 for intervals over them, got {count}")
+    count = episode_count(episodes, EPISODES)
     r = run_everything(progress, count)
     figures = {
         "figure_2_trajectory": draw_trajectory(r),

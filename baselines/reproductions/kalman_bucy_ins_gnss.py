@@ -22,7 +22,7 @@ from ...filters.linear_systems import steady_kalman_bucy, van_loan
 from ..bootstrap import Bootstrap, Estimate
 from ..evaluation import evaluate, load_policy
 from ..figures import styles
-from ..reproduction import Claim, Grid, Reproduction
+from ..reproduction import Claim, Grid, Reproduction, episode_count
 from ..rollout import run_policy
 from ..seeds import episode_seeds
 
@@ -352,8 +352,11 @@ def reproduce(progress: Callable[..., None], episodes: int | None = None) -> Rep
     Args:
         progress: called with the units of work done, ``STEPS`` in all.
         episodes: runs of every experiment; default 4000.
+
+    Raises:
+        ValueError: for fewer than two episodes, which have no interval.
     """
-    runs = episodes or EPISODES
+    runs = episode_count(episodes, EPISODES)
     bootstrap = Bootstrap(runs)
     example = first_order(runs)
     progress(1)

@@ -27,7 +27,7 @@ from ..bootstrap import Bootstrap, Estimate
 from ..figures import styles
 from ..policies.tightly_coupled_navigation import KnownMode, chain, lasting, switches
 from ..policy import Policy
-from ..reproduction import Claim, Grid, Reproduction, Verdict
+from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
 from ..rollout import run_policy, run_reference
 from ..seeds import episode_seeds
 
@@ -50,11 +50,7 @@ FILTERS: dict[str, int | None] = {
     "constant velocity": LINE,
     "Singer": SINGER,
 }
-WINDOWS = {
-    name: window
-    for name, window in TightlyCoupledNavigation.scenarios["paper"].windows.items()
-    if name != "all"
-}
+WINDOWS = TightlyCoupledNavigation.scenarios["paper"].windows
 MOTION = 1001
 """First step that carries the motion of leg 2."""
 JUMP = 2000
@@ -765,9 +761,7 @@ def reproduce(progress: Callable[[float], None], episodes: int | None = None) ->
     Raises:
         ValueError: for fewer than two episodes, which have no interval.
     """
-    count = EPISODES if episodes is None else episodes
-    if count < 2:
-        raise ValueError(f"episodes must be at least 2 for intervals over them, got {count}")
+    count = episode_count(episodes, EPISODES)
     r = run_everything(progress, count)
     figures = {
         "figure_1_errors": draw_errors(r),

@@ -21,7 +21,7 @@ from ...filters import linear_systems
 from ..evaluation import evaluate
 from ..figures import COLOURS
 from ..policies.uav_autopilot import Kalman, RawSensors, TrueState, stationary
-from ..reproduction import Claim, Grid, Reproduction
+from ..reproduction import Claim, Grid, Reproduction, episode_count
 from ..rollout import run_policy, run_reference
 from ..seeds import episode_seeds
 
@@ -410,10 +410,11 @@ def reproduce(progress: Progress = lambda done: None, episodes: int | None = Non
     Args:
         progress: told of measurements done; ``STEPS`` of them by default.
         episodes: Monte Carlo runs.
+
+    Raises:
+        ValueError: for fewer than two episodes, which have no interval.
     """
-    M = episodes or EPISODES
-    if M < 2:
-        raise ValueError(f"episodes must be at least 2 for standard errors, got {M}")
+    M = episode_count(episodes, EPISODES)
     unit_of_progress = EPISODES / M
     done = 0.0
 

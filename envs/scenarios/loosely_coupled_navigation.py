@@ -7,12 +7,12 @@ from ..task import Scenario
 DECADE = (10**-0.5, 10**0.5)
 """A decade around the modelled value."""
 
-_ALWAYS = {"all": (1, 500), "late": (250, 500)}
+_LATE = {"late": (250, 500)}
 
 SCENARIOS: Mapping[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
-        Scenario("paper", "The fusion example: noises as modelled, no disturbance.", {}, _ALWAYS),
+        Scenario("paper", "The fusion example: noises as modelled, no disturbance.", {}, _LATE),
         Scenario(
             "random",
             "Drift, coloured, white and receiver noise over a decade each; the receiver noise changes once "
@@ -28,14 +28,14 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "outage_start": (0.5, 4.0),
                 "outage_duration": (0.2, 1.0),
             },
-            _ALWAYS,
+            _LATE,
             training=True,
         ),
         Scenario(
             "outage",
             "No measurement from 2.0 to 3.5 s.",
             {"outage_probability": 1.0, "outage_start": (2.0, 2.0), "outage_duration": (1.5, 1.5)},
-            {**_ALWAYS, "during": (200, 349), "after": (350, 500)},
+            {**_LATE, "during": (200, 349), "after": (350, 500)},
         ),
         Scenario(
             "jamming",
@@ -46,7 +46,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "jamming_duration": (1.0, 1.0),
                 "jamming_factor": 100.0,
             },
-            {**_ALWAYS, "during": (200, 299), "after": (300, 500)},
+            {**_LATE, "during": (200, 299), "after": (300, 500)},
         ),
         Scenario(
             "spoof-ramp",
@@ -57,7 +57,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "spoofing_duration": (1.5, 1.5),
                 "spoofing_rate": 2.0,
             },
-            {**_ALWAYS, "during": (200, 349), "after": (350, 500)},
+            {**_LATE, "during": (200, 349), "after": (350, 500)},
         ),
         Scenario(
             "quiet",
@@ -67,7 +67,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "coloured_factor": (0.01, 0.01),
                 "white_factor": (0.01, 0.01),
             },
-            _ALWAYS,
+            _LATE,
         ),
     )
 }

@@ -21,14 +21,13 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "turn": (50, 55),
                 "recovery": (56, 62),
                 "post": (70, 100),
-                "all": (1, 100),
             },
         ),
         Scenario(
             "random",
             "Training distribution: any start, speed and course; up to three manoeuvres of any kind.",
             {"flight": "random"},
-            {"start": (1, 10), "settled": (11, 100), "all": (1, 100)},
+            {"start": (1, 10), "settled": (11, 100)},
             training=True,
         ),
         Scenario(
@@ -48,7 +47,6 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "straight-2": (49, 68),
                 "fast-turn": (69, 74),
                 "straight-3": (80, 98),
-                "all": (1, 98),
             },
         ),
         Scenario(
@@ -62,7 +60,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "initial_velocity": (-172.0, -246.0),
                 "legs": ((61.0, 0.0), (45.0, 3.74), (44.0, 0.0)),
             },
-            {"straight-1": (6, 12), "turn": (13, 21), "straight-2": (25, 30), "all": (1, 30)},
+            {"straight-1": (6, 12), "turn": (13, 21), "straight-2": (25, 30)},
         ),
         Scenario(
             "benchmark-s2",
@@ -75,7 +73,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "initial_velocity": (-172.0, -246.0),
                 "legs": ((61.0, 0.0), (35.0, 4.68), (54.0, 0.0)),
             },
-            {"straight-1": (6, 12), "turn": (13, 19), "straight-2": (23, 30), "all": (1, 30)},
+            {"straight-1": (6, 12), "turn": (13, 19), "straight-2": (23, 30)},
         ),
     )
 }

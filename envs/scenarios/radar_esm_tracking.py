@@ -8,7 +8,7 @@ from typing import Any
 
 from ..task import Scenario
 
-_WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120), "all": (1, 120)}
+_WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}
 
 _ANY_TARGET: dict[str, Any] = {
     "emitter": "fixed",

@@ -6,9 +6,9 @@ from typing import Any
 
 from ..task import Scenario
 
-WINDOWS = MappingProxyType({"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000), "all": (1, 3000)})
+WINDOWS = MappingProxyType({"leg1": (200, 999), "leg2": (1100, 1999), "leg3": (2100, 3000)})
 """Steady parts of the three legs of the paper's experiment."""
-RANDOM_WINDOWS = MappingProxyType({"all": (1, 600), "settled": (100, 600)})
+RANDOM_WINDOWS = MappingProxyType({"settled": (100, 600)})
 
 EXPERIMENT: Mapping[str, Any] = MappingProxyType(
     {

@@ -27,20 +27,20 @@ SCENARIOS: Mapping[str, Scenario] = {
             "paper-noise",
             "White noise only, nominal and known: the filter is optimal and the loop stationary.",
             {},
-            {"steady": (200, 550), "all": (1, 600)},
+            {"steady": (200, 550)},
         ),
         Scenario(
             "paper-step",
             "A unit step of the command added to the white noise.",
             {"step_size": 1.0, "step_time": 200},
-            {"before": (100, 199), "transient": (200, 299), "steady": (300, 600), "all": (1, 600)},
+            {"before": (100, 199), "transient": (200, 299), "steady": (300, 600)},
         ),
         Scenario(
             "random",
             "Steps and doublets of the command; gust level and sensor noise drawn for each episode and "
             "changing inside it; short dropouts of single sensors.",
             _RANDOM,
-            {"steady": (50, 600), "all": (1, 600)},
+            {"steady": (50, 600)},
             training=True,
         ),
         Scenario(
@@ -51,7 +51,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "disturbance_levels": ((1.0, 1.0), (4.0, 4.0)),
                 "disturbance_times": ((200, 200),),
             },
-            {"before": (100, 199), "front": (200, 249), "after": (250, 600), "all": (1, 600)},
+            {"before": (100, 199), "front": (200, 249), "after": (250, 600)},
         ),
         Scenario(
             "sensor-degradation",
@@ -62,13 +62,13 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "sensor_times": ((200, 200),),
                 "changing_sensors": ("rate",),
             },
-            {"before": (100, 199), "after": (200, 600), "all": (1, 600)},
+            {"before": (100, 199), "after": (200, 600)},
         ),
         Scenario(
             "actuator-lag",
             "The actuator is twice as slow as the filter and the autopilot believe (plant U).",
             {**_NOMINAL_WITH_COMMANDS, "actuator_lag": 2.0},
-            {"steady": (100, 600), "all": (1, 600)},
+            {"steady": (100, 600)},
         ),
     )
 }

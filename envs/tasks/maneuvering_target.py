@@ -367,7 +367,6 @@ class ManeuveringTarget(Task[State]):
             trajectory.name,
             "A flight given by its positions.",
             {"flight": "track", "horizon": horizon, "track": tuple(map(tuple, track.tolist()))},
-            {"all": (1, horizon)},
         )
 
     # --- what the agent is shown
