@@ -3,7 +3,8 @@
 The task on torch tensors is differentiable from the action to the reward of every later measurement. So no
 value function and no exploration are needed: the mean cost of a batch of episodes is differentiated through
 filter and policy (back-propagation through time) and descended by Adam. Where an episode is long, the
-gradient is cut every ``truncation`` measurements (truncated back-propagation): values go on, gradients stop.
+gradient is cut and descended every ``truncation`` decisions (truncated back-propagation): values go on,
+gradients stop.
 """
 
 import importlib.util
@@ -22,7 +23,7 @@ from ..envs.catalogue import make_task
 from ..envs.environment import TaskVectorEnv
 from ..envs.lanes import Lanes
 from .learned_policy import LearnedPolicy, write_arrays
-from .training_run import Bookkeeping, TrainingRun, interruption
+from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
 
 
 class RecurrentPolicy(torch.nn.Module):
@@ -81,13 +82,17 @@ def cut_gradient(lanes: Lanes) -> None:
     lanes._interval_mean = detached(lanes._interval_mean)
 
 
-def descend_episodes(env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int) -> float:
-    """Fly one episode in every environment and add the gradient of the mean cost to the policy's.
+def descend_episodes(
+    env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int, descend: Callable[[], None]
+) -> float:
+    """Fly one episode in every environment and descend the gradient of the mean cost.
 
     Args:
         env: with torch backend and autoreset mode "Disabled".
         policy: whose gradients are added to.
         truncation: decisions through which the gradient flows back.
+        descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
+            the mean cost of a decision since the last time; uses and clears them.
 
     Returns:
         Mean cost of a measurement, the reward's (capped) one.
@@ -99,13 +104,15 @@ def descend_episodes(env: TaskVectorEnv, policy: RecurrentPolicy, truncation: in
         action, hidden = policy(observation, hidden)
         # In double, so that the filter's state is not rounded to the network's precision.
         observation, reward, _, _, _ = env.step(action.double())
-        pending = pending - reward.mean() / env.last_decision
-        if decision % truncation == 0 or decision == env.last_decision:
-            pending.backward()
+        pending = pending - reward.mean()
+        window = (decision - 1) % truncation + 1
+        if window == truncation or decision == env.last_decision:
+            (pending / window).backward()
             total += float(pending.detach())
+            descend()
             pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
             cut_gradient(env.lanes)
-    return total
+    return total / env.last_decision
 
 
 def measure_normalisation(env: TaskVectorEnv, policy: RecurrentPolicy) -> None:
@@ -175,12 +182,19 @@ def train_bptt(
     )
     env.reset(seed=episode_seeds("train", run.seed, run.envs))
     policy = RecurrentPolicy(len(task.fields), space, values["hidden_size"])
-    optimiser = torch.optim.Adam(policy.parameters(), lr=values["learning_rate"])
+    learning_rate = learning_rate_schedule(values["learning_rate"])
+    optimiser = torch.optim.Adam(policy.parameters(), lr=learning_rate(1.0))
     steps_done = 0
     if resume:
         steps_done = _load(folder / "checkpoint", policy, optimiser, env)
     else:
         measure_normalisation(env, policy)
+
+    def descend() -> None:
+        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
+        logger.record_mean("train/gradient_norm", float(norm))
+        optimiser.step()
+        optimiser.zero_grad()
 
     def save_checkpoint(place: Path) -> None:
         kept = {
@@ -211,13 +225,11 @@ def train_bptt(
         )
         stopping = False
         while steps_done < run.steps and not stopping:
-            optimiser.zero_grad()
-            cost = descend_episodes(env, policy, values["truncation"])
-            norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
-            optimiser.step()
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(1.0 - steps_done / run.steps)
+            cost = descend_episodes(env, policy, values["truncation"], descend)
             steps_done += per_iteration
             logger.record("train/cost", cost)
-            logger.record("train/gradient_norm", float(norm))
             logger.dump(steps_done)
             progress(steps_done)
             stopping = books.safe_point(steps_done)

@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from ..baselines.seeds import episode_seeds
 from ..envs.catalogue import make_task
 from .adapter import TaskVecEnv, to_sb3
-from .training_run import Bookkeeping, TrainingRun, interruption
+from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
@@ -132,6 +132,7 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
         autoreset_mode="SameStep",
         control=run.control,
         scenario=run.scenario,
+        **run.hyperparameters.get("env_kwargs", {}),
     )
     adapted = to_sb3(env)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
@@ -227,6 +228,8 @@ def train_sb3(
     """
     check_algorithm(run)
     values = dict(run.hyperparameters)
+    values["learning_rate"] = learning_rate_schedule(values["learning_rate"])
+    values.pop("env_kwargs", None)
     normalize = values.pop("normalize", False)
     normalisation: VecNormalize | None = None
     if resume:

@@ -16,6 +16,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import xarray
+
 from ..baselines.evaluation import baselines_of, evaluate
 from ..baselines.metrics import tidy_records
 from ..envs.catalogue import find_scenario, nearest, task_class
@@ -102,6 +104,25 @@ def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
     return dict(table[id])
 
 
+def learning_rate_schedule(rate: float | str) -> Callable[[float], float]:
+    """Return the learning rate over the share of the run that is left, 1 to 0.
+
+    Args:
+        rate: a constant, or in rl-zoo3's form "lin_0.001": from there linearly to zero.
+
+    Raises:
+        ValueError: for another form.
+    """
+    from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
+
+    text = str(rate)
+    try:
+        start = float(text.removeprefix("lin_"))
+    except ValueError as error:
+        raise ValueError(f"learning_rate must be a number or lin_ and a number, got {rate!r}") from error
+    return LinearSchedule(start, 0.0, 1.0) if text.startswith("lin_") else ConstantSchedule(start)
+
+
 def installed_versions() -> dict[str, str]:
     """Versions of what a run's result depends on."""
     versions = {}
@@ -178,25 +199,38 @@ def replaced_folder(folder: Path) -> Iterator[Path]:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def validation_score(run: TrainingRun, policy: Any) -> dict[str, Any]:
-    """Score an agent and the paper's algorithm on the same episodes of the validation split."""
-    paper = baselines_of(run.environment).score_paper
-    dataset = evaluate(
-        run.environment,
-        {"agent": policy, paper: paper},
-        run.scenario,
-        VALIDATION_EPISODES,
-        split="validation",
-    )
-    found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
-    difference = found["agent", "relative_cost_difference"]
-    return {
-        "steps": run.steps_done,
-        "cost": found["agent", "cost"].value,
-        "paper": paper,
-        "paper_cost": found[paper, "cost"].value,
-        "relative_cost_difference": [difference.value, difference.low, difference.high],
-    }
+class Validation:
+    """Scores an agent and the paper's algorithm on the same episodes of the validation split.
+
+    Args:
+        run: what is trained.
+    """
+
+    def __init__(self, run: TrainingRun) -> None:
+        self.run = run
+        self.paper = baselines_of(run.environment).score_paper
+        # Once: neither the paper's algorithm nor the episodes change in a run.
+        self.paper_dataset = self._evaluated(self.paper, self.paper)
+
+    def _evaluated(self, name: str, policy: Any) -> xarray.Dataset:
+        run = self.run
+        return evaluate(
+            run.environment, {name: policy}, run.scenario, VALIDATION_EPISODES, split="validation"
+        )
+
+    def score(self, policy: Any) -> dict[str, Any]:
+        """Return an entry of ``TrainingRun.validation``."""
+        agent = self._evaluated("agent", policy)
+        dataset = xarray.concat([agent, self.paper_dataset], "policy", combine_attrs="override")
+        found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
+        difference = found["agent", "relative_cost_difference"]
+        return {
+            "steps": self.run.steps_done,
+            "cost": found["agent", "cost"].value,
+            "paper": self.paper,
+            "paper_cost": found[self.paper, "cost"].value,
+            "relative_cost_difference": [difference.value, difference.low, difference.high],
+        }
 
 
 @contextmanager
@@ -243,6 +277,7 @@ class Bookkeeping:
     ) -> None:
         self.run, self.folder, self.interval, self.policy, self.stop = run, folder, interval, policy, stop
         self.save_checkpoint, self.save_agent, self.report = save_checkpoint, save_agent, report
+        self.validation = Validation(run)
         self.due = run.steps_done + interval
         self.began, self.seconds_before = time.monotonic(), run.seconds
 
@@ -254,7 +289,7 @@ class Bookkeeping:
         self.due = steps_done + self.interval
         run = self.run
         run.steps_done = steps_done
-        entry = validation_score(run, self.policy)
+        entry = self.validation.score(self.policy)
         is_best = run.best is None or entry["cost"] < run.best["cost"]
         run.validation.append(entry)
         run.seconds = self.seconds_before + time.monotonic() - self.began
