@@ -16,6 +16,14 @@ from filtergym.envs.catalogue import make_task
 ID = "filtergym/ManeuveringTarget-v0"
 SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
 
+OPTIMAL = {
+    "UavAutopilot-v0": ("paper-noise", "kalman", {}, slice(200, 550)),
+    "RadarEsmTracking-v0": ("paper", "quasi-optimal", {"association_error": 1e-12}, slice(None)),
+    "LooselyCoupledNavigation-v0": ("paper", "matched", {}, slice(None)),
+    "TightlyCoupledNavigation-v0": ("matched", "singer", {"horizon": 200, "decision_interval": 10}, slice(None)),
+}
+"""Where a filter is provably optimal, and over which measurements (see the tests of each environment's baselines)."""
+
 
 class Correction(ConstantPolicy):
     control = "gain"
@@ -32,6 +40,22 @@ def test_shipped_agent_scores_what_its_record_says(file):
     assert cost[0] == pytest.approx(best["cost"], rel=1e-3)
     assert cost[1] == pytest.approx(best["paper_cost"], rel=1e-6)
     assert cost[0] < cost[1]
+
+
+@pytest.mark.parametrize(
+    "file",
+    [file for file in SHIPPED if file.parent.name in OPTIMAL],
+    ids=lambda file: f"{file.parent.name}-{file.stem}",
+)
+def test_shipped_agent_does_not_beat_what_is_optimal(file):
+    """An agent that is significantly better than the optimum has found a leak."""
+    scenario, optimum, keywords, times = OPTIMAL[file.parent.name]
+    episodes = 32 if "horizon" in keywords else 256
+    id = f"filtergym/{file.parent.name}"
+    dataset = evaluate(id, [file.stem, optimum], scenario, episodes, split="validation", **keywords)
+    cost = dataset["cost"].isel(time=times).mean("time").values
+    difference = cost[0] - cost[1]
+    assert difference.mean() > -3.0 * difference.std() / np.sqrt(episodes) - 1e-9
 
 
 def test_there_are_shipped_agents():
