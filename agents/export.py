@@ -7,9 +7,12 @@ from typing import Any
 import numpy
 import torch
 
+from ..baselines.evaluation import evaluate
 from .learned_policy import read_header, write_arrays
 from .sb3_training import Sb3Policy, load_sb3_policy
 from .training_run import TrainingRun, load_run, save_run
+
+CHECK_EPISODES = 32
 
 
 def _layers(*modules: torch.nn.Module) -> tuple[dict[str, numpy.ndarray], str]:
@@ -85,5 +88,7 @@ def export_run(folder: Path, out: Path) -> TrainingRun:
         agent = load_sb3_policy(folder / "best" / "model.zip", run.algorithm)
         arrays, output, activation = network_arrays(agent, run.algorithm)
         write_arrays(out, arrays, run, output, activation)
+    dataset = evaluate(run.environment, [str(out)], run.scenario, CHECK_EPISODES, split="validation")
+    run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
     save_run(run, out.with_suffix(".json"))
     return run

@@ -72,7 +72,7 @@ class Sb3Policy:
 
 
 def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | None = None) -> Sb3Policy:
-    """Load a model's zip, with ``vecnormalize.pkl`` beside it if there is one.
+    """Load a model's zip, with its ``vecnormalize.pkl`` if there is one: beside it, or where rl-zoo3 puts it.
 
     Both can execute code while they are loaded: open only what you trust.
 
@@ -92,12 +92,14 @@ def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | Non
                 if policy in base
             )  # fmt: skip
         model = ALGORITHMS[algorithm].load(path, device="cpu")
-        beside = path.with_name("vecnormalize.pkl")
         normalisation = None
-        if beside.exists():
-            with beside.open("rb") as file:
-                normalisation = pickle.load(file)
-            normalisation.training = False
+        # rl-zoo3: ENV_1/ENV.zip and ENV_1/ENV/vecnormalize.pkl.
+        for place in (path.parent, path.parent / path.parent.name.rpartition("_")[0]):
+            if (place / "vecnormalize.pkl").exists():
+                with (place / "vecnormalize.pkl").open("rb") as file:
+                    normalisation = pickle.load(file)
+                normalisation.training = False
+                break
     except FileNotFoundError as error:
         raise ValueError(f"no model at {path}") from error
     except StopIteration as error:

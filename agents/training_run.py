@@ -46,6 +46,8 @@ class TrainingRun:
     """Time spent, over all sessions."""
     versions: dict[str, str] = field(default_factory=dict)
     validation: list[dict[str, Any]] = field(default_factory=list)
+    exported: dict[str, Any] | None = None
+    """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
 
     @property
     def best(self) -> dict[str, Any] | None:

@@ -1,6 +1,7 @@
 """Training runs: what they refuse, that a resumed one equals one that never stopped, and what they export."""
 
 import os
+import shutil
 import signal
 
 import gymnasium
@@ -89,7 +90,7 @@ def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_control_c_leaves_a_checkpoint_to_resume_from(algorithm, tmp_path):
-    told = []
+    told, before = [], signal.getsignal(signal.SIGINT)
 
     def interrupt(steps):
         if not told:
@@ -99,7 +100,7 @@ def test_control_c_leaves_a_checkpoint_to_resume_from(algorithm, tmp_path):
     train(small_run(algorithm, 10_000), tmp_path, progress=interrupt)
     done = load_run(tmp_path).steps_done
     assert 0 < done < 2000
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
     train(resumed_run(tmp_path, small_run(algorithm, 2000)), tmp_path, resume=True)
     assert load_run(tmp_path).steps_done >= 2000
     assert len(load_run(tmp_path).validation) == 2
@@ -248,6 +249,17 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"cannot read .*run\.json"):
         resumed_run(tmp_path, run)
+
+
+def test_normalisation_is_found_where_rl_zoo3_puts_it(tmp_path):
+    train(small_run("ppo", 240), tmp_path)
+    best = tmp_path / "best"
+    folder = tmp_path / "filtergym-ManeuveringTarget-v0_1"
+    (folder / "filtergym-ManeuveringTarget-v0").mkdir(parents=True)
+    model = shutil.copy(best / "model.zip", folder / "filtergym-ManeuveringTarget-v0.zip")
+    shutil.copy(best / "vecnormalize.pkl", folder / "filtergym-ManeuveringTarget-v0")
+    statistics = [load_sb3_policy(path).normalisation.obs_rms.mean for path in (best / "model.zip", model)]
+    np.testing.assert_array_equal(*statistics)
 
 
 def test_files_that_are_no_policies(tmp_path):

@@ -412,6 +412,21 @@ def test_no_truth_at_any_distance(control):
 
 
 @pytest.mark.parametrize("control", TASK.controls)
+def test_what_is_shown_and_paid_does_not_depend_on_the_motion(control):
+    """Otherwise an agent learns the motion by heart and reads the errors of the INS off its increments."""
+    drawn, actions = numbers(make("random"), 4, 100, 5), random_actions(make("random", control), 4, 100, 5)
+    task = make("random", control)
+    at_rest, moving = (
+        states(make("random", control, reference_amplitude=a), drawn, lambda k, s: actions[k])
+        for a in (0.0, 1000.0)
+    )
+    for (seen, acted), (same, same_acted) in zip(at_rest, moving, strict=True):
+        # 1000 m in double precision, 100 steps, over a noise of centimetres.
+        np.testing.assert_allclose(task.observe(same), task.observe(seen), rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(task.cost(same_acted), task.cost(acted), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("control", TASK.controls)
 def test_lanes_at_different_times_do_not_disturb_each_other(control):
     lanes, late = 8, 37
     task = make("random", control)

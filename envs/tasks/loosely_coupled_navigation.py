@@ -283,10 +283,12 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
     A flat ``Box``; for each filter (one under gain, three otherwise) and axis, in this order: innovation over
     its standard deviation; signed logarithm of the innovation over the receiver's *reported* noise; short
     averages of the normalised innovation, of its square (as ``log(1 + x)``) and of its product with the one
-    before. Then the INS increment of each axis over ``sqrt(Ge step)``, the logarithm of the reported over the
-    nominal noise (the report may be wrong), whether there is a measurement, the last action (under mode and
-    weights: the weights in force), and the time t as ``t / (t + tau)``. A filter without a measurement has
-    the innovation zero, and its averages stand still.
+    before. Then the logarithm of the reported over the nominal noise (the report may be wrong), whether there
+    is a measurement, the last action (under mode and weights: the weights in force), and the time t as
+    ``t / (t + tau)``. A filter without a measurement has the innovation zero, and its averages stand still.
+
+    The increments of the INS are not shown: the reference motion is always the same, so whoever knows it by
+    heart could read the rate errors off them. All that is shown depends on the errors alone.
 
     ### Rewards
 
@@ -380,8 +382,6 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
             for of in filters
             for axis in suffixes
         ]
-        scale = "INS increment over sqrt(Ge step), Ge the reduced intensity"
-        found += [Field(f"ins_increment{axis}", "1", scale, "mean") for axis in suffixes]
         found.append(Field("reported_noise", "1", "log of the reported over the nominal standard deviation"))
         found.append(Field("available", "1", "1 with a measurement, 0 without", "mean"))
         if self.control == "gain":
@@ -600,7 +600,6 @@ class LooselyCoupledNavigation(Task[LooselyCoupledNavigationState]):
         return xp.concat(
             [
                 *(xp.reshape(block, rows) for block in blocks),
-                state.increment / math.sqrt(self.growth[1]),
                 xp.log(state.reported / math.sqrt(p.receiver_variance))[None],
                 state.available[None],
                 state.action,
