@@ -20,7 +20,12 @@ OPTIMAL = {
     "UavAutopilot-v0": ("paper-noise", "kalman", {}, slice(200, 550)),
     "RadarEsmTracking-v0": ("paper", "quasi-optimal", {"association_error": 1e-12}, slice(None)),
     "LooselyCoupledNavigation-v0": ("paper", "matched", {}, slice(None)),
-    "TightlyCoupledNavigation-v0": ("matched", "singer", {"horizon": 200, "decision_interval": 10}, slice(None)),
+    "TightlyCoupledNavigation-v0": (
+        "matched",
+        "singer",
+        {"horizon": 200, "decision_interval": 10},
+        slice(None),
+    ),
 }
 """Where a filter is provably optimal, and over which measurements (see the tests of each environment's baselines)."""
 
@@ -60,7 +65,9 @@ def test_shipped_agent_does_not_beat_what_is_optimal(file):
 def test_there_are_shipped_agents():
     ids = {id.removeprefix("filtergym/") for id in catalogue()}
     assert {file.parent.name for file in SHIPPED if file.stem == "bptt"} == ids
-    assert {file.parent.name for file in SHIPPED if file.stem == "ppo"} == ids - {"TightlyCoupledNavigation-v0"}
+    assert {file.parent.name for file in SHIPPED if file.stem == "ppo"} == ids - {
+        "TightlyCoupledNavigation-v0"
+    }
 
 
 def test_policy_of_another_environment_is_refused(tmp_path):
