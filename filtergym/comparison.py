@@ -128,7 +128,10 @@ def _role(id: str, name: str) -> str:
 
 def _two_lines(record: Record | None, scale: float) -> str:
     """Value above interval, so that columns stay narrow."""
-    return with_interval(record, scale).replace(" [", "<br>[")
+    # Percentages to a hundredth: what is smaller is rounding.
+    negligible = 0.005 if scale == 100.0 else 0.0
+    shown = with_interval(record, scale, negligible=negligible)
+    return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
 def comparison_markdown(comparison: Comparison, records: Sequence[Record], picture: str, command: str) -> str:

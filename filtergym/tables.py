@@ -9,13 +9,22 @@ from rich.table import Table
 from .baselines.reproduction import Grid
 
 
-def with_interval(record: Any, scale: float = 1.0, digits: int = 3) -> str:
-    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``."""
+def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
+    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
+
+    Args:
+        record: with ``value``, ``low`` and ``high``; or None.
+        scale: that all three are multiplied with.
+        digits: significant ones.
+        negligible: what is smaller, scaled, is shown as 0.
+    """
     if record is None or record.value is None:
         return "-"
 
     def text(value: float) -> str:
         value *= scale
+        if abs(value) < negligible:
+            return "0"
         return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:#.{digits}g}".rstrip(".")
 
     if record.low is None or record.low == record.high:

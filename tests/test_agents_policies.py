@@ -75,7 +75,7 @@ def test_policy_of_another_environment_is_refused(tmp_path):
     from safetensors import safe_open
     from safetensors.numpy import save_file
 
-    with safe_open(SHIPPED[0], framework="numpy") as file:
+    with safe_open(PRETRAINED / "ManeuveringTarget-v0" / "ppo.safetensors", framework="numpy") as file:
         header = dict(file.metadata())
         arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     save_file(arrays, tmp_path / "other.safetensors", header | {"environment": "filtergym/Other-v0"})
