@@ -32,11 +32,11 @@ def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: 
     return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
 
 
-def main_components(records: Sequence[Any], whole: str = "all") -> list[str]:
+def main_components(records: Sequence[Any]) -> list[str]:
     """Components that a table shows: groups such as "position" where there are any, else the first three."""
     first = records[0]
     names = [
-        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == whole
+        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
     ]
     return shown_components(names)
 
@@ -47,15 +47,14 @@ def shown_components(names: Sequence[str]) -> list[str]:
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
 
-def results_table(records: Sequence[Any], whole: str = "all") -> Table:
+def results_table(records: Sequence[Any]) -> Table:
     """Compare policies: errors over the whole run, cost against the paper's algorithm, score.
 
     Args:
         records: tidy records of one environment and scenario.
-        whole: the window that spans the run.
     """
     first = records[0]
-    shown = main_components(records, whole)
+    shown = main_components(records)
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     table = Table(
         title=f"{first.environment}, scenario {first.scenario} "
@@ -76,9 +75,9 @@ def results_table(records: Sequence[Any], whole: str = "all") -> Table:
             table.add_section()
             section = kind
         row = [name, control if kind == "policy" else f"({kind})"]
-        row += [with_interval(found.get((name, "rmse", component, whole))) for component in shown]
-        row.append(with_interval(found.get((name, "relative_cost_difference", "", whole)), 100.0))
-        score = found.get((name, "score", "", whole))
+        row += [with_interval(found.get((name, "rmse", component, "all"))) for component in shown]
+        row.append(with_interval(found.get((name, "relative_cost_difference", "", "all")), 100.0))
+        score = found.get((name, "score", "", "all"))
         row.append("no room" if score is not None and score.value is None else with_interval(score))
         table.add_row(*row)
     table.caption = (
