@@ -33,6 +33,14 @@ def _axes(rows: int = 1, width: float = 8.0, height: float = 3.6) -> Any:
     return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
 
 
+def _titled(figure: Any, title: str) -> Any:
+    """Return the figure with its title, and beside it the legend of its first axes."""
+    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
+    return figure
+
+
 def _logarithmic(axis: Any) -> None:
     """Label a logarithmic axis with plain numbers: decades; 2 and 5 within four; all digits within one."""
 
@@ -85,12 +93,7 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
         axis.margins(x=0.01)
     axes[-1].set_xlabel("measurement")
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
-    figure.suptitle(
-        f"{title}: {dataset.sizes['episode']} episodes, 95 % bands", fontsize=10, x=0.01, ha="left"
-    )
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, f"{title}: {dataset.sizes['episode']} episodes, 95 % bands")
 
 
 def draw_error_distribution(dataset: xarray.Dataset) -> Any:
@@ -119,10 +122,7 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
         axis.set_ylabel("share of measurements above")
         axis.grid(alpha=0.25, which="both", lw=0.4)
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
-    figure.suptitle(f"{title}: distribution of errors", fontsize=10, x=0.01, ha="left")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, f"{title}: distribution of errors")
 
 
 def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
@@ -146,12 +146,7 @@ def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
         axis.grid(alpha=0.25, lw=0.4)
         axis.margins(x=0.01)
     axes[-1].set_xlabel("measurement")
-    figure.suptitle(
-        "Mode probabilities: mean and 10-90 % range over episodes", fontsize=10, x=0.01, ha="left"
-    )
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, "Mode probabilities: mean and 10-90 % range over episodes")
 
 
 def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
@@ -173,12 +168,7 @@ def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
     axes[0].grid(alpha=0.25, lw=0.4)
     axes[0].margins(x=0.01)
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
-    figure.suptitle(
-        f"{title}: {dataset.sizes['episode']} episodes, 95 % bands", fontsize=10, x=0.01, ha="left"
-    )
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, f"{title}: {dataset.sizes['episode']} episodes, 95 % bands")
 
 
 def draw_learning_curves(
@@ -212,9 +202,7 @@ def draw_learning_curves(
     axis.set_xlabel("environment steps, millions")
     axis.set_ylabel(f"validation cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4)
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, title)
 
 
 def draw_differences(
@@ -273,9 +261,7 @@ def draw_differences(
     axis.set_ylim(len(differences) - 0.5, -0.5)
     axis.set_xlabel(f"cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4, axis="x")
-    figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    figure.legend(loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+    return _titled(figure, title)
 
 
 def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
