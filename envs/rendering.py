@@ -71,6 +71,13 @@ class Strip(NamedTuple):
     """Whether values hold for their measurement and jump to the next, as choices do."""
 
 
+def error_strip(title: str, component: str, limit: float) -> Strip:
+    """Panel of a component's error with its reported band, between plus and minus ``limit`` at first."""
+    return Strip(
+        title, {"error": f"error.{component}"}, (-limit, limit), band=f"sigma.{component}", guides=(0.0,)
+    )
+
+
 def grown(limits: tuple[float, float], low: float, high: float) -> tuple[float, float]:
     """Stretch limits about zero by the least factor 1, 2, 5, 10, ... that lets them hold low and high."""
     lowest, highest = limits
@@ -117,13 +124,7 @@ class Picture:
         """Error of every component with its reported band, and the action."""
         shown = self.task.components[:MOST_COMPONENTS]
         errors = [
-            Strip(
-                f"error of {component.name.replace('_', ' ')}, {component.unit}",
-                {"error": f"error.{component.name}"},
-                (-1.0, 1.0),
-                band=f"sigma.{component.name}",
-                guides=(0.0,),
-            )
+            error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in shown
         ]
         space = self.task.action_space

@@ -10,7 +10,19 @@ from typing import Any
 import numpy
 from matplotlib.figure import Figure
 
-from ..rendering import BLACK, BLUE, GREY, ORANGE, PALE, VERMILLION, History, Picture, Strip, grown
+from ..rendering import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    History,
+    Picture,
+    Strip,
+    error_strip,
+    grown,
+)
 from ..task import Task
 from ..tasks.loosely_coupled_navigation import LooselyCoupledNavigation, LooselyCoupledNavigationState
 
@@ -92,13 +104,7 @@ class LooselyCoupledNavigationPicture(Picture):
                 f"innovation{of} over predicted σ{suffix}", innovations, (-4.0, 4.0), guides=(-2.0, 0.0, 2.0)
             ),
             steered,
-            Strip(
-                f"position error{suffix}, m",
-                {"error": f"error.{component}"},
-                (-1.0, 1.0),
-                band=f"sigma.{component}",
-                guides=(0.0,),
-            ),
+            error_strip(f"position error{suffix}, m", component, 1.0),
         ]
 
     def shows_observation(self) -> bool:

@@ -6,7 +6,20 @@ from typing import Any
 import numpy
 from matplotlib.figure import Figure
 
-from ..rendering import BLACK, BLUE, CURVES, GREY, ORANGE, PALE, VERMILLION, History, Picture, Strip, grown
+from ..rendering import (
+    BLACK,
+    BLUE,
+    CURVES,
+    GREY,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    History,
+    Picture,
+    Strip,
+    error_strip,
+    grown,
+)
 from ..task import Task
 from ..tasks.radar_esm_tracking import RadarEsmTracking, State
 
@@ -77,12 +90,10 @@ class RadarEsmTrackingPicture(Picture):
         return [
             Strip("weights of the classes", weights, (-0.04, 1.04)),
             *(
-                Strip(
+                error_strip(
                     f"error of {component.name.replace('_', ' ')}, {component.unit}",
-                    {"error": f"error.{component.name}"},
-                    (-limits[component.name], limits[component.name]),
-                    band=f"sigma.{component.name}",
-                    guides=(0.0,),
+                    component.name,
+                    limits[component.name],
                 )
                 for component in self.task.components
             ),

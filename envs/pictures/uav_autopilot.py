@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from ..rendering import Picture, Strip
+from ..rendering import Picture, Strip, error_strip
 from ..task import Task
 from ..tasks.uav_autopilot import COORDINATES, MODES, State, UavAutopilot
 
@@ -70,13 +70,7 @@ class UavAutopilotPicture(Picture):
                 guides=(0.0,),
             ),
             Strip(f"{name}, {unit}", {"control": "control"}, (-2.0, 2.0), guides=(0.0,)),
-            Strip(
-                f"error of the {output.name} estimate, {output.unit}",
-                {"error": f"error.{output.name}"},
-                (-0.5, 0.5),
-                band=f"sigma.{output.name}",
-                guides=(0.0,),
-            ),
+            error_strip(f"error of the {output.name} estimate, {output.unit}", output.name, 0.5),
             Strip(
                 f"innovation of {self.sensor} over its σ; gaps are dropouts",
                 {"innovation": "innovation"},
