@@ -20,7 +20,7 @@ from . import policies
 from .policy import LOADERS, Baselines
 from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
-from .tuning import tuned_policy
+from .tuning import tuned_names, tuned_policy
 
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
@@ -77,10 +77,11 @@ def load_policy(id: str, name: str) -> Any:
         except (ImportError, AttributeError) as error:
             raise ValueError(f"cannot load policy {name!r}: {error}") from error
     for loader in LOADERS:
-        maker = loader(task_class(id).id, name)
+        maker = loader.load(task_class(id).id, name)
         if maker is not None:
             return maker
-    raise nearest("policy", name, known.names)
+    others = [other for loader in LOADERS for other in loader.names(task_class(id).id)]
+    raise nearest("policy", name, [*known.names, *tuned_names(id, known.tunable), *others])
 
 
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:

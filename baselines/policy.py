@@ -7,14 +7,21 @@ agent knows; it is never ranked with policies. A **bound** is computed.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy
 
 from ..envs.task import Array, Task
 
-PolicyLoader = Callable[[str, str], Any]
-"""From an environment's id and a name to what makes a policy for a task, or None for a name not its own."""
+
+class PolicyLoader(NamedTuple):
+    """Where policies come from that are not an environment's own."""
+
+    load: Callable[[str, str], Any]
+    """From an environment's id and a name to what makes a policy for a task; None for a name not its own."""
+    names: Callable[[str], list[str]]
+    """From an environment's id to the names that it has for it."""
+
 
 LOADERS: list[PolicyLoader] = []
 """Asked, in order, for a policy that is not among an environment's own; whoever has policies adds to it."""

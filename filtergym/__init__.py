@@ -6,7 +6,7 @@ Without an import of one's own: ``gymnasium.make("filtergym:filtergym/Maneuverin
 
 from typing import Any
 
-from .baselines.policy import LOADERS
+from .baselines.policy import LOADERS, PolicyLoader
 from .envs.catalogue import register
 from .envs.trajectory import Trajectory
 
@@ -23,4 +23,10 @@ def _learned_policy(id: str, name: str) -> Any:
     return learned_policy(id, name)
 
 
-LOADERS.append(_learned_policy)
+def _shipped_agents(id: str) -> list[str]:
+    from .agents.named_policies import shipped_agents
+
+    return shipped_agents(id)
+
+
+LOADERS.append(PolicyLoader(_learned_policy, _shipped_agents))
