@@ -33,6 +33,15 @@ def _axes(rows: int = 1, width: float = 8.0, height: float = 3.6) -> Any:
     return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
 
 
+def _draw_with_band(
+    axis: Any, dataset: xarray.Dataset, series: numpy.ndarray, label: str, style: Any
+) -> None:
+    """Line of the first of some series over time, and the 95 % band of the others, its resamples."""
+    low, high = numpy.percentile(series[1:], [2.5, 97.5], axis=0)
+    axis.plot(dataset["time"], series[0], label=label, **style)
+    axis.fill_between(dataset["time"], low, high, color=style["color"], alpha=0.18, lw=0)
+
+
 def _titled(figure: Any, title: str) -> Any:
     """Return the figure with its title, and beside it the legend of its first axes."""
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
@@ -83,9 +92,7 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
         for name, style in styles(names).items():
             run = dataset.sel(policy=name)
             rmse = numpy.sqrt(bootstrap.means(squared_errors(run, component, dataset.attrs["groups"])))
-            low, high = numpy.percentile(rmse[1:], [2.5, 97.5], axis=0)
-            axis.plot(dataset["time"], rmse[0], label=name, **style)
-            axis.fill_between(dataset["time"], low, high, color=style["color"], alpha=0.18, lw=0)
+            _draw_with_band(axis, dataset, rmse, name, style)
         axis.set_yscale("log")
         _logarithmic(axis.yaxis)
         axis.set_ylabel(f"RMSE of {component.replace('_', ' ')}, {units[component]}")
@@ -126,7 +133,8 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
 
 
 def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
-    """Mean and 10-90 % range over episodes of the mode probabilities of every policy that has them."""
+    """Mean over episodes of the mode probabilities of every policy that has them, with 95 % bands."""
+    bootstrap = Bootstrap(dataset.sizes["episode"], resamples=200)
     present = [
         name
         for name in dataset["policy"].values.tolist()
@@ -138,15 +146,13 @@ def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
         _shade_windows(axis, dataset)
         for mode, style in styles(modes).items():
             values = dataset["mode_probability"].sel(policy=name, mode=mode).values
-            low, high = numpy.percentile(values, [10, 90], axis=0)
-            axis.plot(dataset["time"], values.mean(axis=0), label=mode.replace("_", " "), **style)
-            axis.fill_between(dataset["time"], low, high, color=style["color"], alpha=0.15, lw=0)
+            _draw_with_band(axis, dataset, bootstrap.means(values), mode.replace("_", " "), style)
         axis.set_ylim(-0.02, 1.02)
         axis.set_ylabel(f"probability\n({name})")
         axis.grid(alpha=0.25, lw=0.4)
         axis.margins(x=0.01)
     axes[-1].set_xlabel("measurement")
-    return _titled(figure, "Mode probabilities: mean and 10-90 % range over episodes")
+    return _titled(figure, "Mode probabilities: mean over episodes, 95 % bands")
 
 
 def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
@@ -158,10 +164,7 @@ def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
         values = dataset["true_class_probability"].sel(policy=name).values
         if numpy.isnan(values).all():
             continue
-        means = bootstrap.means(values)
-        low, high = numpy.percentile(means[1:], [2.5, 97.5], axis=0)
-        axes[0].plot(dataset["time"], means[0], label=name, **style)
-        axes[0].fill_between(dataset["time"], low, high, color=style["color"], alpha=0.18, lw=0)
+        _draw_with_band(axes[0], dataset, bootstrap.means(values), name, style)
     axes[0].set_ylim(-0.02, 1.02)
     axes[0].set_ylabel("weight of the true class")
     axes[0].set_xlabel("measurement")
