@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := filtergym filters envs baselines agents tests benchmarks
+SOURCES := filtergym filters envs evaluation baselines agents tests benchmarks
 
 .PHONY: benchmark test check format docs clean
 

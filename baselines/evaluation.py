@@ -4,7 +4,6 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 """
 
 import importlib
-import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
@@ -12,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from ..envs.catalogue import find_scenario, make_task, nearest, task_class
+from ..envs.catalogue import catalogue, find_scenario, make_task, nearest, task_class
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
-from . import policies
 from .policy import LOADERS, Baselines
 from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
@@ -41,11 +39,9 @@ class TunedPolicy(NamedTuple):
 @cache
 def _all_baselines() -> dict[str, Baselines]:
     found = {}
-    for module in pkgutil.iter_modules(policies.__path__):
-        task_module = importlib.import_module(
-            f"{task_class.__module__.rsplit('.', 1)[0]}.tasks.{module.name}"
-        )
-        found[task_module.TASK.id] = importlib.import_module(f"{policies.__name__}.{module.name}").BASELINES
+    for id, cls in catalogue().items():
+        room = cls.__module__.split(".")[-2]
+        found[id] = importlib.import_module(f"{__package__}.{room}").BASELINES
     return found
 
 

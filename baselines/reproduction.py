@@ -1,6 +1,6 @@
 """What a reproduction of a paper consists of, and how it is found and saved.
 
-Every module in :mod:`.reproductions` is a paper; its name with hyphens is what the command line calls it. It
+Every environment's folder beside this file names its ``PAPER`` and holds a module ``reproduction``, which
 defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
 ``reproduce(progress, episodes=None) -> Reproduction``.
 """
@@ -15,7 +15,6 @@ from types import ModuleType
 from typing import Any, Literal
 
 from ..envs.catalogue import nearest
-from . import reproductions
 from .figures import save
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
@@ -58,8 +57,10 @@ class Reproduction:
 
 
 def papers() -> dict[str, str]:
-    """Return the module name of every paper that can be reproduced, by its name on the command line."""
-    return {m.name.replace("_", "-"): m.name for m in pkgutil.iter_modules(reproductions.__path__)}
+    """Return the folder of every paper that can be reproduced, by its name on the command line."""
+    package = importlib.import_module(__package__)
+    rooms = [m.name for m in pkgutil.iter_modules(package.__path__) if m.ispkg]
+    return {importlib.import_module(f"{__package__}.{room}").PAPER: room for room in rooms}
 
 
 def paper_module(name: str) -> ModuleType:
@@ -71,7 +72,7 @@ def paper_module(name: str) -> ModuleType:
     known = papers()
     if name not in known:
         raise nearest("paper", name, known)
-    return importlib.import_module(f"{reproductions.__name__}.{known[name]}")
+    return importlib.import_module(f"{__package__}.{known[name]}.reproduction")
 
 
 def episode_count(episodes: int | None, default: int) -> int:

@@ -149,7 +149,7 @@ def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
         ValueError: if the policy was never tuned.
     """
     name = _file_name(id)
-    shipped: Any = files(__package__).joinpath("tuned", name)
+    shipped: Any = files(__package__).joinpath(task_class(id).__module__.split(".")[-2], "tuned.json")
     for place in (FOLDER / name, shipped):
         if place.is_file():
             table = json.loads(place.read_text(encoding="utf-8"))

@@ -1,6 +1,6 @@
 """Which environments there are, and how a task is made from names and keywords.
 
-Every module in :mod:`.tasks` that defines ``TASK`` is an environment; nothing else needs to know about it.
+Every folder beside this file that defines ``TASK`` is an environment; nothing else needs to know about it.
 """
 
 import dataclasses
@@ -17,7 +17,6 @@ import gymnasium
 import numpy
 
 from . import parameters as check
-from . import tasks
 from .task import Scenario, Task
 from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
 
@@ -25,10 +24,13 @@ from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
 @functools.cache
 def catalogue() -> dict[str, type[Task]]:
     """Return every environment: Gymnasium id -> task class."""
-    modules = (
-        importlib.import_module(f"{tasks.__name__}.{m.name}") for m in pkgutil.iter_modules(tasks.__path__)
+    package = importlib.import_module(__package__)
+    rooms = (
+        importlib.import_module(f"{__package__}.{m.name}")
+        for m in pkgutil.iter_modules(package.__path__)
+        if m.ispkg
     )
-    return {module.TASK.id: module.TASK for module in modules}
+    return {room.TASK.id: room.TASK for room in rooms}
 
 
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:

@@ -1,9 +1,9 @@
 """Pictures of a running episode: what ``render_mode`` "rgb_array" and "human" show.
 
 An :class:`EpisodePicture` keeps the history of one episode and draws it into one figure, whose axes never
-move. What is drawn is said by a :class:`Picture`: a module of :mod:`.pictures` named like the task's own
-module and defining ``PICTURE``, or, where there is none, the base class, which can draw every task: errors
-with the band that the estimator reports, actions, observations.
+move. What is drawn is said by a :class:`Picture`: what :meth:`.task.Task.picture` returns, or, where that is
+None, the base class, which can draw every task: errors with the band that the estimator reports, actions,
+observations.
 
 Pictures show the truth, also that of the scans to come (the limits of the axes, marked manoeuvres). Nothing
 here is seen by an agent.
@@ -11,8 +11,6 @@ here is seen by an agent.
 This module imports matplotlib; the environment imports it only when a render mode is asked for.
 """
 
-import importlib
-import importlib.util
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -166,13 +164,8 @@ class Picture:
 
 
 def picture_of(task: Task) -> Picture:
-    """Return the picture made for a task, by the name of its module, or the general one."""
-    package = f"{__package__}.pictures"
-    name = f"{package}.{type(task).__module__.rpartition('.')[2]}"
-    importlib.import_module(package)
-    if importlib.util.find_spec(name) is None:
-        return Picture(task)
-    return importlib.import_module(name).PICTURE(task)
+    """Return the picture made for a task, or the general one."""
+    return task.picture() or Picture(task)
 
 
 class _StripPanel:

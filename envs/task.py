@@ -148,6 +148,10 @@ class Task(ABC, Generic[State]):
         self.xp = xp
         self.device = device
 
+    def picture(self) -> Any:
+        """Return the :class:`~.rendering.Picture` that draws an episode of this task; None for the general one."""
+        return None
+
     @classmethod
     def scenario_from_trajectory(cls, trajectory: Any, keywords: Mapping[str, Any]) -> Scenario:
         """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""

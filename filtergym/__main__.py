@@ -11,17 +11,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from . import comparison, training_seeds
 from .baselines.evaluation import baselines_of, evaluate
 from .baselines.figures import evaluation_figures, save
 from .baselines.metrics import Record, tidy_records
 from .baselines.reproduction import paper_module, papers, save_reproduction
 from .baselines.tuning import FOLDER, merged_table, table_path, tune
-from .benchmark import Cell, run_benchmark
 from .envs.catalogue import catalogue, find_scenario, nearest, parameter_names, task_class
+from .reports import comparison, training_seeds
+from .reports.benchmark import Cell, run_benchmark
+from .reports.room import MARKER, measure_room, room_markdown
+from .reports.tables import grid_table, results_table
 from .results import insert_between_markers, split_at_markers, writable_folder, write_records, write_text
-from .room import MARKER, measure_room, room_markdown
-from .tables import grid_table, results_table
 
 app = typer.Typer(
     help="Gymnasium environments for adaptive-filter benchmarking.",

@@ -6,7 +6,7 @@ import math
 import array_api_compat.torch as torch
 import numpy
 import pytest
-from filtergym.envs.tasks.radar_esm_tracking import RadarEsmTracking, RadarEsmTrackingParameters
+from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.filters import class_fusion, imm
 
 PARAMETERS = RadarEsmTrackingParameters()

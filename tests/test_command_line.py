@@ -86,7 +86,7 @@ def test_a_mistake_gets_one_clear_sentence(tmp_path, arguments, expected):
 
 
 def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
-    from filtergym import benchmark
+    from filtergym.reports import benchmark
 
     cells = [benchmark.Cell(ENV, scenario, 20, ("imm", "known-turn")) for scenario in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
@@ -111,7 +111,7 @@ def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
 
 
 def test_full_benchmark_compares_everything():
-    from filtergym import benchmark
+    from filtergym.reports import benchmark
 
     cells = benchmark.cells(True, [ENV, "filtergym/TightlyCoupledNavigation-v0"])
     own, dear = cells[0], cells[-1]
@@ -127,7 +127,7 @@ def test_full_benchmark_compares_everything():
 def test_comparison_shows_what_the_records_say(tmp_path):
     from filtergym.baselines import evaluate, tidy_records
 
-    from filtergym import comparison
+    from filtergym.reports import comparison
     from filtergym.results import write_records
 
     names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]

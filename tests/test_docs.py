@@ -15,7 +15,7 @@ HEADINGS = (
 
 
 def page(id: str) -> str:
-    module = catalogue()[id].__module__.rsplit(".", 1)[1]
+    module = catalogue()[id].__module__.split(".")[-2]
     return (DOCS / "environments" / f"{module}.md").read_text(encoding="utf-8")
 
 

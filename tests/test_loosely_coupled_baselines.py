@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from filtergym.baselines import evaluate, tidy_records
 from filtergym.baselines.evaluation import baselines_of, load_policy
-from filtergym.baselines.policies.loosely_coupled_navigation import recovery_times
-from filtergym.baselines.reproductions import kalman_bucy_ins_gnss as paper
+from filtergym.baselines.loosely_coupled_navigation import reproduction as paper
+from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
 from filtergym.baselines.rollout import run_policy, run_reference
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task

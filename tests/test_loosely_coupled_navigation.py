@@ -7,7 +7,7 @@ import array_api_compat.torch as xp_torch
 import numpy as np
 import pytest
 import torch
-from filtergym.envs.tasks.loosely_coupled_navigation import TASK, LooselyCoupledNavigationParameters
+from filtergym.envs.loosely_coupled_navigation.task import TASK, LooselyCoupledNavigationParameters
 from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
 
 PAPER = LooselyCoupledNavigationParameters()

@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.evaluation import evaluate
-from filtergym.baselines.policies.maneuvering_target import InteractingMultipleModel
+from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.trajectory import Trajectory, flown_legs
 from filtergym.filters import alpha_beta, imm

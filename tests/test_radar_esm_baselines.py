@@ -8,8 +8,8 @@ import pytest
 from filtergym.baselines import evaluate, tidy_records
 from filtergym.baselines.bootstrap import Bootstrap
 from filtergym.baselines.evaluation import baselines_of
-from filtergym.baselines.policies import radar_esm_tracking as baselines
-from filtergym.baselines.reproductions import radar_esm_class_fusion as reproduction
+from filtergym.baselines.radar_esm_tracking import policies as baselines
+from filtergym.baselines.radar_esm_tracking import reproduction as reproduction
 from filtergym.baselines.rollout import started_lanes
 from filtergym.envs.catalogue import make_task
 

@@ -6,7 +6,7 @@ import array_api_compat.torch as torch
 import numpy
 import pytest
 from filtergym.envs.controls import signed_exponential
-from filtergym.envs.tasks.radar_esm_tracking import TASK, State
+from filtergym.envs.radar_esm_tracking.task import TASK, State
 from filtergym.filters import class_fusion, imm
 
 SCENARIOS = tuple(TASK.scenarios)

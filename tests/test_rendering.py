@@ -11,7 +11,7 @@ import pytest
 from filtergym.baselines.animation import episode_frames, write_animation
 from filtergym.envs import rendering
 from filtergym.envs.environment import TaskEnv
-from filtergym.envs.pictures.maneuvering_target import ManeuveringTargetPicture, ellipse_axes
+from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
 
 import filtergym  # noqa: F401  # registers the environments
 
@@ -169,10 +169,10 @@ def test_limits_grow_on_a_ladder(limits, low, high, expected):
     assert rendering.grown(limits, low, high) == pytest.approx(expected, rel=1e-12)
 
 
-def test_picture_is_found_by_the_name_of_the_task_module():
+def test_task_without_a_picture_of_its_own_gets_the_general_one():
     task = TaskEnv(ID).task
     assert isinstance(rendering.picture_of(task), ManeuveringTargetPicture)
-    stranger = type("Stranger", (type(task),), {"__module__": "somewhere.else_entirely"})
+    stranger = type("Stranger", (type(task),), {"picture": lambda self: None})
     assert type(rendering.picture_of(stranger(task.parameters, "gain"))) is rendering.Picture
 
 

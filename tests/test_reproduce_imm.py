@@ -8,14 +8,19 @@ import numpy
 import pytest
 from filtergym.baselines.bootstrap import Bootstrap, Estimate
 from filtergym.baselines.evaluation import evaluate
-from filtergym.baselines.gain_schedules import (
+from filtergym.baselines.maneuvering_target import reproduction as paper
+from filtergym.baselines.maneuvering_target.gain_schedules import (
     best_schedule,
     maneuver_flight,
     mean_square_errors,
     ramp_schedule,
 )
-from filtergym.baselines.imm_readings import Reading, Recording, interacting_multiple_model, recorded
-from filtergym.baselines.reproductions import imm_alpha_beta as paper
+from filtergym.baselines.maneuvering_target.imm_readings import (
+    Reading,
+    Recording,
+    interacting_multiple_model,
+    recorded,
+)
 from filtergym.envs.catalogue import make_task
 
 ID = "filtergym/ManeuveringTarget-v0"

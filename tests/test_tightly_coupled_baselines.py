@@ -7,14 +7,14 @@ import pytest
 from filtergym.baselines import evaluate, tidy_records
 from filtergym.baselines.bootstrap import Bootstrap, Estimate
 from filtergym.baselines.evaluation import baselines_of
-from filtergym.baselines.policies import tightly_coupled_navigation as policies
 from filtergym.baselines.reproduction import save_reproduction
-from filtergym.baselines.reproductions import multi_hypothesis_ins_gnss as paper
 from filtergym.baselines.rollout import run_bound, run_policy
 from filtergym.baselines.seeds import episode_seeds
+from filtergym.baselines.tightly_coupled_navigation import policies as policies
+from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.tasks.tightly_coupled_navigation import HYPOTHESES, LINE, REST, SINGER
+from filtergym.envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER
 from filtergym.filters import extended_kalman, gnss_ins
 
 from filtergym.results import write_text

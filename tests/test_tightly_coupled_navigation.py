@@ -2,9 +2,9 @@
 
 import numpy
 import pytest
-from filtergym.envs.scenarios.tightly_coupled_navigation import SCENARIOS
-from filtergym.envs.tasks import tightly_coupled_navigation as navigation
-from filtergym.envs.tasks.tightly_coupled_navigation import Parameters, TightlyCoupledNavigation
+from filtergym.envs.tightly_coupled_navigation import task as navigation
+from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
+from filtergym.envs.tightly_coupled_navigation.task import Parameters, TightlyCoupledNavigation
 from filtergym.filters import extended_kalman, gnss_ins
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}

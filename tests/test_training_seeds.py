@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 
-from filtergym.training_seeds import compare, episode_means, load_runs, spread
+from filtergym.reports.training_seeds import compare, episode_means, load_runs, spread
 
 ENV = "filtergym/ManeuveringTarget-v0"
 

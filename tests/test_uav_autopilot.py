@@ -6,7 +6,7 @@ import numpy
 import pytest
 import torch
 from filtergym.envs.task import Scenario
-from filtergym.envs.tasks.uav_autopilot import COORDINATES, State, UavAutopilot, UavAutopilotParameters
+from filtergym.envs.uav_autopilot.task import COORDINATES, State, UavAutopilot, UavAutopilotParameters
 from filtergym.filters import gaussian, linear_systems
 
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])

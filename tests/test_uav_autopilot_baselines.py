@@ -10,8 +10,8 @@ import xarray
 from filtergym.baselines.bootstrap import Bootstrap
 from filtergym.baselines.evaluation import baselines_of, evaluate
 from filtergym.baselines.metrics import Record, tidy_records
-from filtergym.baselines.policies import uav_autopilot as module
-from filtergym.baselines.reproductions import uav_autopilot_kalman as paper
+from filtergym.baselines.uav_autopilot import policies as module
+from filtergym.baselines.uav_autopilot import reproduction as paper
 from filtergym.envs.catalogue import make_task
 from filtergym.filters import linear_systems
 

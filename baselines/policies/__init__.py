@@ -1,1 +1,0 @@
-"""One module for each environment: its policies, reference estimators and bounds."""

@@ -1,1 +1,0 @@
-"""One module for each paper: its experiments run again, and a verdict on each of its claims."""

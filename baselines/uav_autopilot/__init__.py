@@ -1,0 +1,8 @@
+"""What UavAutopilot is compared with, and the reproduction of its paper."""
+
+from .policies import BASELINES
+
+PAPER = "uav-autopilot-kalman"
+"""Name of the paper on the command line; :mod:`.reproduction` repeats its experiments."""
+
+__all__ = ["BASELINES", "PAPER"]

@@ -1,0 +1,265 @@
+"""Picture of ManeuveringTarget: the track, a close-up of the estimate, and strips of what the filter does."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse
+
+from ...filters import imm
+from ..rendering import (
+    BLACK,
+    BLUE,
+    FIGURE_SIZE,
+    GREEN,
+    ORANGE,
+    PALE,
+    VERMILLION,
+    History,
+    Picture,
+    Strip,
+    grown,
+)
+from ..task import Task
+from .task import AlphaBeta, Bank, ManeuveringTarget, State
+
+ELLIPSE_SIGMAS = 2.0
+"""Half axes of the covariance ellipse, standard deviations."""
+RECENT = 15
+"""Scans whose errors the close-up keeps."""
+CLOSE_UP_SIGMAS = 4.0
+"""Half width of the close-up at the start, in the largest measurement sigma of the flight."""
+TRACK = (0.06, 0.475, 0.43, 0.425)
+CLOSE_UP = (0.06, 0.075, 0.19, 0.19 * FIGURE_SIZE[0] / FIGURE_SIZE[1])
+"""Left, bottom, width, height of the panels as shares of the figure; the close-up is square."""
+
+
+def ellipse_axes(covariance: numpy.ndarray) -> tuple[float, float, float]:
+    """Standard deviations along the two principal axes, larger first, and the direction of the larger.
+
+    Args:
+        covariance: ``(2, 2)``.
+
+    Returns:
+        Two lengths in the unit of the covariance's root, and degrees anticlockwise from the first axis.
+    """
+    variances, directions = numpy.linalg.eigh(covariance)
+    small, large = numpy.sqrt(numpy.maximum(variances, 0.0))
+    return float(large), float(small), math.degrees(math.atan2(directions[1, 1], directions[0, 1]))
+
+
+class ManeuveringTargetPicture(Picture):
+    """Track, close-up, normalised innovation, gain or weights, position error."""
+
+    clock = "scan"
+    strips_left = 0.545
+    strip_columns = 1
+
+    task: ManeuveringTarget
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.flight = numpy.empty((2, 0))
+        self.maneuvers: list[tuple[float, float]] = []
+        self.largest_sigma = 1.0
+
+    # --- the history
+
+    def records(self, state: State) -> dict[str, float]:
+        """Positions in km, innovation, gain or weights, position error with its reported sigma."""
+        task, estimator = self.task, state.estimator
+        true, measured = state.position[:, 0], state.measurement[:, 0]
+        error = task.error(state)[:2, 0]
+        P = task.covariance(state)[:2, :2, 0]
+        values = {
+            "true_x": true[0] / 1e3,
+            "true_y": true[1] / 1e3,
+            "measured_x": measured[0] / 1e3,
+            "measured_y": measured[1] / 1e3,
+            "estimated_x": (true[0] + error[0]) / 1e3,
+            "estimated_y": (true[1] + error[1]) / 1e3,
+            "covariance_xx": P[0, 0] / 1e6,
+            "covariance_xy": P[0, 1] / 1e6,
+            "covariance_yy": P[1, 1] / 1e6,
+            "position_error": math.hypot(*error),
+            "position_sigma": math.sqrt(P[0, 0] + P[1, 1]),
+        }
+        if isinstance(estimator, AlphaBeta):
+            innovation = estimator.innovation[:, 0]
+            variance = estimator.innovation_variance[:, 0]
+            values["alpha"] = estimator.alpha[0]
+        else:
+            assert isinstance(estimator, Bank)
+            predicted = numpy.exp(estimator.log_predicted)
+            mean, S = imm.combine(estimator.innovation, estimator.innovation_covariance, predicted)
+            innovation, variance = mean[:, 0], numpy.diagonal(S[:, :, 0])
+            values |= {f"weight.{j}": weight for j, weight in enumerate(estimator.probabilities[:, 0])}
+        normalised = innovation / numpy.sqrt(variance)
+        return {**values, "innovation_x": normalised[0], "innovation_y": normalised[1]}
+
+    def begin(self, state: State) -> None:
+        """Fly the whole episode ahead, for limits that need not move; the truth does not depend on noise."""
+        task = self.task
+        still = numpy.zeros((task.noise.normals, state.position.shape[-1]))
+        positions, velocities, sigmas = [], [], []
+        for _ in range(task.horizon + 1):
+            positions.append(state.position[:, 0])
+            velocities.append(state.velocity[:, 0])
+            sigmas.append(numpy.sqrt(state.variance[:, 0].max()))
+            state = task.measure(state, still)
+        self.flight = numpy.stack(positions, axis=1) / 1e3
+        self.largest_sigma = max(sigmas) / 1e3
+        change = numpy.diff(numpy.stack(velocities, axis=1), axis=1)
+        scans = 2 + numpy.flatnonzero(numpy.hypot(*change) > 1e-6)
+        runs = numpy.split(scans, 1 + numpy.flatnonzero(numpy.diff(scans) > 1)) if len(scans) else []
+        self.maneuvers = [(run[0] - 0.5, run[-1] + 0.5) for run in runs]
+
+    # --- strips
+
+    def strips(self) -> Sequence[Strip]:
+        """Innovation, what is steered, error."""
+        if self.task.control == "gain":
+            steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
+        else:
+            gains = self.task.parameters.gains
+            named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}
+            steered = Strip("weights", named, (-0.04, 1.04))
+        return [
+            Strip(
+                "innovation over predicted σ",
+                {"x": "innovation_x", "y": "innovation_y"},
+                (-4.0, 4.0),
+                guides=(-2.0, 0.0, 2.0),
+            ),
+            steered,
+            Strip(
+                "position error, m",
+                {"estimate": "position_error", "reported σ": "position_sigma"},
+                (0.0, 500.0),
+            ),
+        ]
+
+    def shows_observation(self) -> bool:
+        """No: the strips say it in the filter's terms."""
+        return False
+
+    def shaded(self) -> Sequence[tuple[float, float]]:
+        """Scans of the manoeuvres."""
+        return self.maneuvers
+
+    # --- panels
+
+    def open(self, figure: Figure) -> None:
+        """Make the track, the close-up and one legend for both."""
+        track = self.track = figure.add_axes(TRACK)
+        close_up = self.close_up = figure.add_axes(CLOSE_UP)
+        for axes in (track, close_up):
+            axes.set_aspect("equal", adjustable="box")
+            axes.tick_params(labelsize=8)
+            axes.grid(color=PALE, linewidth=0.6)
+            axes.set_axisbelow(True)
+        track.set_title("track", loc="left", fontsize=9, pad=4)
+        track.set_xlabel("x, km", fontsize=9, labelpad=1)
+        track.set_ylabel("y, km", fontsize=9, labelpad=1)
+        close_up.set_title("close-up: errors at the last scan", loc="left", fontsize=9, pad=4)
+        close_up.set_xlabel("x minus true x, km", fontsize=9, labelpad=1)
+        close_up.set_ylabel("y minus true y, km", fontsize=9, labelpad=1)
+        cross: dict[str, Any] = {"linestyle": "", "marker": "x", "color": ORANGE}
+        dot: dict[str, Any] = {"linestyle": "", "marker": "o", "color": BLUE}
+        (self.true,) = track.plot([], [], color=BLACK, linewidth=1.2, zorder=2)
+        (self.measured,) = track.plot([], [], **cross, markersize=4, markeredgewidth=0.9, zorder=3)
+        (self.estimated,) = track.plot(
+            [], [], color=BLUE, marker="o", markersize=2.6, linewidth=1.0, zorder=4
+        )
+        (self.target,) = track.plot(
+            [], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=5
+        )
+        (self.arrived,) = track.plot(
+            [], [], linestyle="", marker="s", markersize=7, markerfacecolor="none", markeredgewidth=1.4,
+            color=VERMILLION, zorder=6,
+        )  # fmt: skip
+        (self.radar,) = track.plot(
+            [0.0], [0.0], linestyle="", marker="^", markersize=8, color=GREEN, zorder=5
+        )
+        self.ellipses = [
+            Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3) for _ in range(2)
+        ]
+        track.add_patch(self.ellipses[0])
+        close_up.add_patch(self.ellipses[1])
+        (self.past_measured,) = close_up.plot([], [], **cross, alpha=0.35, markersize=4, zorder=2)
+        (self.past_estimated,) = close_up.plot([], [], **dot, alpha=0.3, markersize=3, zorder=3)
+        (self.last_measured,) = close_up.plot([], [], **cross, markersize=8, markeredgewidth=1.8, zorder=4)
+        (self.last_estimated,) = close_up.plot([], [], **dot, markersize=6, zorder=5)
+        close_up.plot([0.0], [0.0], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, zorder=6)
+        ring = Line2D([], [], linestyle="", marker="o", markersize=10, markerfacecolor="none", color=BLUE)
+        ground = Line2D([], [], linestyle="", marker="s", markersize=10, color=PALE)
+        pale = Line2D([], [], linestyle="", marker="o", markersize=4, color=BLUE, alpha=0.3)
+        figure.legend(
+            [
+                self.true, self.target, self.last_measured, self.arrived, self.estimated, ring, pale,
+                self.radar, ground,
+            ],
+            [
+                "true path", "target now", "measurement", "next measurement,\nnot yet used", "estimate",
+                f"{ELLIPSE_SIGMAS:g}σ covariance", f"pale: {RECENT} scans before", "radar", "manoeuvre",
+            ],
+            loc="upper left",
+            bbox_to_anchor=(CLOSE_UP[0] + CLOSE_UP[2] + 0.012, CLOSE_UP[1] + CLOSE_UP[3] + 0.012),
+            fontsize=8, frameon=False, labelspacing=0.65,
+        )  # fmt: skip
+
+    def arrange(self) -> None:
+        """Limits that hold the flight of this episode, in the shape of the panel."""
+        low, high = self.flight.min(axis=1), self.flight.max(axis=1)
+        width, height = FIGURE_SIZE[0] * TRACK[2], FIGURE_SIZE[1] * TRACK[3]
+        middle, half = 0.5 * (low + high), 0.5 * (high - low) + CLOSE_UP_SIGMAS * self.largest_sigma
+        kilometres_per_inch = 2.0 * max(half[0] / width, half[1] / height) * 1.04
+        half = 0.5 * kilometres_per_inch * numpy.array([width, height])
+        self.track.set_xlim(middle[0] - half[0], middle[0] + half[0])
+        self.track.set_ylim(middle[1] - half[1], middle[1] + half[1])
+        self.reach = math.ceil(CLOSE_UP_SIGMAS * self.largest_sigma * 10.0) / 10.0
+        self._set_reach(self.reach)
+
+    def _set_reach(self, reach: float) -> None:
+        # Both axes together, so that the close-up stays square.
+        self.close_up.set_xlim(-reach, reach)
+        self.close_up.set_ylim(-reach, reach)
+
+    def draw(self, history: History, state: State) -> None:
+        """Move everything to where it is now."""
+        self.arrived.set_data(state.measurement[:1, 0] / 1e3, state.measurement[1:2, 0] / 1e3)
+        pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}
+        true, measured, estimated = pairs["true"], pairs["measured"], pairs["estimated"]
+        self.true.set_data(*true)
+        self.measured.set_data(*measured)
+        self.estimated.set_data(*estimated)
+        self.target.set_data(*true[:, -1:])
+        recent = slice(-RECENT - 1, -1)
+        self.past_measured.set_data(*(measured - true)[:, recent])
+        self.past_estimated.set_data(*(estimated - true)[:, recent])
+        self.last_measured.set_data(*(measured - true)[:, -1:])
+        self.last_estimated.set_data(*(estimated - true)[:, -1:])
+        for ellipse in self.ellipses:
+            ellipse.set_visible(true.shape[1] > 0)
+        if not true.shape[1]:
+            return
+        last = [history[f"covariance_{entry}"][-1] for entry in ("xx", "xy", "yy")]
+        large, small, direction = ellipse_axes(numpy.array([[last[0], last[1]], [last[1], last[2]]]))
+        error = (estimated - true)[:, -1]
+        for ellipse, centre in zip(self.ellipses, (estimated[:, -1], error), strict=True):
+            ellipse.set_center(tuple(centre))
+            ellipse.set_width(2.0 * ELLIPSE_SIGMAS * large)
+            ellipse.set_height(2.0 * ELLIPSE_SIGMAS * small)
+            ellipse.set_angle(direction)
+        self._set_reach(grown((0.0, self.reach), 0.0, float(numpy.abs(estimated - true).max()))[1])
+
+
+def _pair(history: Mapping[str, Any], name: str) -> numpy.ndarray:
+    empty = numpy.empty(0)
+    return numpy.stack([history.get(f"{name}_x", empty), history.get(f"{name}_y", empty)])
+
+
+PICTURE = ManeuveringTargetPicture

@@ -1,1 +1,0 @@
-"""What is drawn of an environment: one module for each, named like its task; see :mod:`..rendering`."""

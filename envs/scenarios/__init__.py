@@ -1,1 +1,0 @@
-"""One module for each environment: its immutable table of scenarios, ``SCENARIOS``."""

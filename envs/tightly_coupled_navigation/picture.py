@@ -1,0 +1,273 @@
+"""Picture of TightlyCoupledNavigation: course and motion, what is steered, innovations, errors."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy
+from matplotlib.figure import Figure
+
+from ...filters import gnss_ins
+from ..rendering import (
+    BLACK,
+    BLUE,
+    CURVES,
+    FIGURE_SIZE,
+    PALE,
+    History,
+    Picture,
+    Strip,
+    grown,
+)
+from ..task import Task
+from .task import (
+    GROUPS,
+    HYPOTHESES,
+    LINE,
+    REST,
+    SINGER,
+    State,
+    TightlyCoupledNavigation,
+)
+
+COURSE = (0.065, 0.53, 0.43, 0.37)
+MOTION = (0.125, 0.29, 0.37, 0.15)
+SENSORS = (0.125, 0.075, 0.37, 0.13)
+"""Left, bottom, width, height of the panels as shares of the figure."""
+FAULTS = ("two satellites out", "rates lost", "noisy rate", "accelerometers stuck")
+"""Rows of the panel of sensors."""
+ACCELERATION_LIMIT = 10.0
+"""Height of the panel of accelerations at the start, m/s^2."""
+MOTION_ROW = -1.0
+"""Where the true hypothesis is drawn below the faults."""
+LEAST_REACH = 30.0
+"""Half width of the course that is shown at least, m."""
+
+
+class TightlyCoupledNavigationPicture(Picture):
+    """Course, acceleration, sensor faults; weights or noise factors, innovations, errors."""
+
+    strips_left = 0.56
+    strip_columns = 1
+
+    task: TightlyCoupledNavigation
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.motions: list[list[tuple[float, float]]] = [[] for _ in HYPOTHESES]
+        self.faults: list[list[tuple[float, float]]] = [[] for _ in FAULTS]
+
+    # --- the history
+
+    def records(self, state: State) -> dict[str, float]:
+        """Positions in m, accelerations, weights, factors, innovations, errors."""
+        S, lane = self.task.satellites, 0
+        error = self.task.error(state)[:, lane]
+        P = numpy.diagonal(self.task.covariance(state)[:, :, lane])
+        truth, estimate = state.truth[:, lane], state.estimate[:, lane]
+        innovation = state.range_innovation[:, lane] / self.task.sensor_sigma[: 2 * S, 0]
+        innovation = numpy.where(state.available[: 2 * S, lane] > 0.0, innovation, 0.0)
+        if state.clock[lane] <= 1:
+            # The receiver clock is not known yet: hundreds of sigma that would hide all that follow.
+            innovation = numpy.full_like(innovation, numpy.nan)
+        values = {
+            "true_east": truth[0],
+            "true_north": truth[1],
+            "estimated_east": estimate[0],
+            "estimated_north": estimate[1],
+            "true_acceleration": float(numpy.linalg.norm(truth[gnss_ins.ACCELERATION])),
+            "estimated_acceleration": float(numpy.linalg.norm(estimate[gnss_ins.ACCELERATION])),
+            "position_error": float(numpy.linalg.norm(error[gnss_ins.POSITION])),
+            "position_sigma": float(numpy.sqrt(P[gnss_ins.POSITION].sum())),
+            "velocity_error": float(numpy.linalg.norm(error[gnss_ins.VELOCITY])),
+            "velocity_sigma": float(numpy.sqrt(P[gnss_ins.VELOCITY].sum())),
+            "range_innovation": float(numpy.abs(innovation[:S]).max()),
+            "rate_innovation": float(numpy.abs(innovation[S:]).max()),
+        }
+        values |= {f"weight.{i}": state.probabilities[i, lane] for i in range(len(HYPOTHESES))}
+        if self.task.control == "gain":
+            values |= {f"gain.{i}": state.last_action[i, lane] for i in range(len(GROUPS))}
+        return {name: float(value) for name, value in values.items()}
+
+    def begin(self, state: State) -> None:
+        """Look ahead when the user manoeuvres and when sensors fail: that does not depend on noise."""
+        task = self.task
+        still = numpy.zeros((task.noise.normals + task.noise.row_uniforms, state.clock.shape[-1]))
+        modes = []
+        flags: list[list[bool]] = [[] for _ in FAULTS]
+        S = task.satellites
+        for _ in range(task.horizon):
+            modes.append(int(state.mode[0]))
+            out = state.outage[:, 0]
+            k = float(state.clock[0])
+            happening = (
+                out[2] <= k <= out[3],
+                out[0] <= k <= out[1],
+                (state.noise_factor[S : 2 * S, 0] > 1.0).any(),
+                state.stuck[0] > 0.0,
+            )
+            for flag, now in zip(flags, happening, strict=True):
+                flag.append(bool(now))
+            # Only the truth and the sensors: the filters would take a hundred times as long.
+            clock = state.clock + 1
+            truth, mode, jump = task.move(state, clock.astype(float), still[:17])
+            state = task.sense(state._replace(clock=clock, truth=truth, mode=mode, jump=jump), still[17:])
+        self.motions = [_runs([mode == i for mode in modes]) for i in (REST, LINE, SINGER)]
+        self.faults = [_runs(flag) for flag in flags]
+
+    # --- strips
+
+    def strips(self) -> Sequence[Strip]:
+        """What is steered, innovations, errors."""
+        names = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
+        weights = {name: f"weight.{i}" for i, name in enumerate(names)}
+        steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
+        if self.task.control == "gain":
+            gains = {name: f"gain.{i}" for i, name in enumerate(GROUPS)}
+            steered.append(
+                Strip(
+                    "action",
+                    gains,
+                    (-1.05, 1.05),
+                    guides=(0.0,),
+                    steps=True,
+                )
+            )
+        return [
+            *steered,
+            Strip(
+                "largest innovation over sensor σ",
+                {"of a pseudorange": "range_innovation", "of a rate": "rate_innovation"},
+                (0.0, 10.0),
+            ),
+            Strip(
+                "position error, m", {"error": "position_error", "reported σ": "position_sigma"}, (0.0, 2.0)
+            ),
+            Strip(
+                "velocity error, m/s", {"error": "velocity_error", "reported σ": "velocity_sigma"}, (0.0, 0.5)
+            ),
+        ]
+
+    def shows_observation(self) -> bool:
+        """No: the strips say it in the filter's terms."""
+        return False
+
+    def shaded(self) -> Sequence[tuple[float, float]]:
+        """Steps on which the user manoeuvres."""
+        return self.motions[SINGER]
+
+    # --- panels
+
+    def open(self, figure: Figure) -> None:
+        """Make the three panels."""
+        course = self.course = figure.add_axes(COURSE)
+        motion = self.motion = figure.add_axes(MOTION)
+        sensors = self.sensors = figure.add_axes(SENSORS)
+        for axes in (course, motion, sensors):
+            axes.tick_params(labelsize=8)
+            axes.grid(color=PALE, linewidth=0.6)
+            axes.set_axisbelow(True)
+        legend: dict[str, Any] = {
+            "loc": "lower right", "fontsize": 8, "frameon": False, "borderpad": 0.0, "borderaxespad": 0.2,
+            "handlelength": 1.8, "columnspacing": 1.0, "handletextpad": 0.4, "bbox_to_anchor": (1.0, 1.005),
+        }  # fmt: skip
+        course.set_title("course from above", loc="left", fontsize=9, pad=4)
+        course.set_xlabel("east, m", fontsize=9, labelpad=1)
+        course.set_ylabel("north, m", fontsize=9, labelpad=1)
+        (self.true,) = course.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)
+        (self.estimated,) = course.plot(
+            [], [], color=BLUE, linewidth=1.2, linestyle="--", label="estimate", zorder=3
+        )
+        (self.user,) = course.plot(
+            [], [], color=BLACK, marker="+", markersize=11, markeredgewidth=1.6, linestyle="", zorder=5
+        )
+        (self.believed,) = course.plot([], [], color=BLUE, marker="o", markersize=5, linestyle="", zorder=4)
+        course.legend(ncols=2, **legend)
+
+        motion.set_title("size of the acceleration, m/s²", loc="left", fontsize=9, pad=4)
+        motion.set_xlim(0.5, self.task.horizon + 0.5)
+        (self.felt,) = motion.plot([], [], color=BLACK, linewidth=1.4, label="true", zorder=2)
+        (self.thought,) = motion.plot(
+            [], [], color=BLUE, linewidth=1.2, linestyle="--", label="estimate", zorder=3
+        )
+        motion.legend(ncols=2, **legend)
+
+        sensors.set_title(
+            "sensor faults; true motion in the colours of the weights", loc="left", fontsize=9, pad=4
+        )
+        sensors.set_xlim(0.5, self.task.horizon + 0.5)
+        sensors.set_ylim(-1.6, len(FAULTS) - 0.4)
+        sensors.set_yticks([MOTION_ROW, *range(len(FAULTS))], ["true motion", *FAULTS], fontsize=7)
+        sensors.set_xlabel(self.clock, fontsize=9, labelpad=1)
+        self.fault_lines = [
+            sensors.plot([], [], color=BLACK, linewidth=5.0, solid_capstyle="butt")[0] for _ in FAULTS
+        ]
+        # In the colours of their weights.
+        self.modes = [
+            sensors.plot([], [], color=color, linewidth=5.0, solid_capstyle="butt")[0]
+            for _, (color, _) in zip(HYPOTHESES, CURVES, strict=False)
+        ]
+        (self.now,) = sensors.plot([], [], color=BLACK, linewidth=0.8)
+
+    def arrange(self) -> None:
+        """Limits of the start; they grow with the flight, which is not known in advance."""
+        self._show_course(numpy.empty((2, 0)))
+        self.motion.set_ylim(0.0, ACCELERATION_LIMIT)
+
+    def _show_course(self, places: numpy.ndarray) -> None:
+        """Hold the places in the panel, at equal scales."""
+        sides = []
+        for values in places:
+            low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+            sides.append(grown((-LEAST_REACH, 0.0), 1.05 * low, 0.0)[0])
+            sides.append(grown((0.0, LEAST_REACH), 0.0, 1.05 * high)[1])
+        west, east, south, north = sides
+        metres_per_inch = max(
+            (east - west) / (FIGURE_SIZE[0] * COURSE[2]), (north - south) / (FIGURE_SIZE[1] * COURSE[3])
+        )
+        half = 0.5 * metres_per_inch * FIGURE_SIZE[0] * COURSE[2]
+        self.course.set_xlim(0.5 * (west + east) - half, 0.5 * (west + east) + half)
+        half = 0.5 * metres_per_inch * FIGURE_SIZE[1] * COURSE[3]
+        self.course.set_ylim(0.5 * (south + north) - half, 0.5 * (south + north) + half)
+
+    def draw(self, history: History, state: State) -> None:
+        """Move everything to where it is now."""
+        nothing = numpy.empty(0)
+        pairs = {}
+        for name in ("true", "estimated"):
+            pairs[name] = [history.get(f"{name}_{axis}", nothing) for axis in ("east", "north")]
+        self._show_course(numpy.concatenate([numpy.stack(pair) for pair in pairs.values()], axis=1))
+        self.true.set_data(*pairs["true"])
+        self.estimated.set_data(*pairs["estimated"])
+        self.user.set_data(*(values[-1:] for values in pairs["true"]))
+        self.believed.set_data(*(values[-1:] for values in pairs["estimated"]))
+        felt, thought = (history.get(f"{name}_acceleration", nothing) for name in ("true", "estimated"))
+        steps = numpy.arange(1, len(felt) + 1)
+        self.felt.set_data(steps, felt)
+        self.thought.set_data(steps, thought)
+        if len(felt):
+            self.motion.set_ylim(
+                *grown((0.0, ACCELERATION_LIMIT), 0.0, float(max(felt.max(), thought.max())))
+            )
+        for row, (line, runs) in enumerate(zip(self.fault_lines, self.faults, strict=True)):
+            line.set_data(*_segments(runs, row))
+        for line, runs in zip(self.modes, self.motions, strict=True):
+            line.set_data(*_segments(runs, MOTION_ROW))
+        self.now.set_data([len(felt) + 0.5] * 2, list(self.sensors.get_ylim()))
+
+
+def _runs(flags: Sequence[bool]) -> list[tuple[float, float]]:
+    """Stretches of steps, counted from 1, over which a flag holds: from and to, half a step beyond."""
+    steps = 1 + numpy.flatnonzero(flags)
+    if not len(steps):
+        return []
+    pieces = numpy.split(steps, 1 + numpy.flatnonzero(numpy.diff(steps) > 1))
+    return [(float(piece[0]) - 0.5, float(piece[-1]) + 0.5) for piece in pieces]
+
+
+def _segments(runs: Sequence[tuple[float, float]], row: float) -> tuple[list[float], list[float]]:
+    """Coordinates of one broken line along a row."""
+    x = [value for first, last in runs for value in (first, last, numpy.nan)]
+    return x, [row] * len(x)
+
+
+PICTURE = TightlyCoupledNavigationPicture

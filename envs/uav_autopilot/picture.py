@@ -1,0 +1,90 @@
+"""Picture of UavAutopilot: command and output, estimate and its error, control, innovation, noise levels, action."""
+
+import math
+from collections.abc import Sequence
+
+from ..rendering import Picture, Strip, error_strip
+from ..task import Task
+from .task import COORDINATES, MODES, State, UavAutopilot
+
+CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
+LEAST = 1.5
+"""Half of the smallest range of the output, in units of the output: a unit step and some noise."""
+
+
+class UavAutopilotPicture(Picture):
+    """What the autopilot does above, what the filter does below and what it cannot know."""
+
+    strip_columns = 2
+
+    task: UavAutopilot
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.shown = (
+            self.task.measured.index(self.task.output) if self.task.output in self.task.measured else 0
+        )
+        self.sensor = self.task.sensors[self.shown]
+
+    def records(self, state: State) -> dict[str, float]:
+        """Signals of the loop, NIS, and the levels of the noise."""
+        task, i = self.task, self.task.output
+        values = {
+            "command": state.command[0],
+            "output": state.truth[i, 0],
+            "estimate": state.estimate[i, 0],
+            "control": task.autopilot(state)[0],
+            # A line breaks off where there is no reading.
+            "innovation": state.innovation[self.shown, 0] if state.available[self.shown, 0] else math.nan,
+            "mean_nis": state.mean_nis[0],
+            "level": state.level[0],
+            "log10_scale": math.log10(state.scale[0]),
+        }
+        if task.control == "mode":
+            values["mode"] = float(state.action[:, 0].argmax())
+        return values | {f"sensor_level.{s}": state.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
+
+    def strips(self) -> Sequence[Strip]:
+        """Left column the loop, right column the filter."""
+        task = self.task
+        output = COORDINATES[task.parameters.plant][task.output]
+        name, unit = CONTROL[task.parameters.plant]
+        disturbance = "gusts" if task.parameters.plant == "U" else "control"
+        levels = {disturbance: "level", **{s: f"sensor_level.{s}" for s in task.sensors}}
+        if task.control == "gain":
+            reach = task.parameters.gain_decades
+            steered = Strip(
+                "action: log10 of the factor on the process noise",
+                {"action": "log10_scale"},
+                (-1.05 * reach, 1.05 * reach),
+                guides=(0.0,),
+            )
+        else:
+            legend = ", ".join(f"{i} {mode}" for i, mode in enumerate(MODES))
+            steered = Strip(f"action: mode ({legend})", {"mode": "mode"}, (-0.2, 2.2), steps=True)
+        return [
+            Strip(
+                f"{output.name}, {output.unit}",
+                {"output": "output", "command": "command"},
+                (-LEAST, LEAST),
+                guides=(0.0,),
+            ),
+            Strip(f"{name}, {unit}", {"control": "control"}, (-2.0, 2.0), guides=(0.0,)),
+            error_strip(f"error of the {output.name} estimate, {output.unit}", output.name, 0.5),
+            Strip(
+                f"innovation of {self.sensor} over its σ; gaps are dropouts",
+                {"innovation": "innovation"},
+                (-4.0, 4.0),
+                guides=(-2.0, 0.0, 2.0),
+            ),
+            Strip("NIS per reading, short average", {"NIS": "mean_nis"}, (0.0, 2.0), guides=(1.0,)),
+            Strip("hidden: noise over nominal", levels, (0.0, 2.2), guides=(1.0,), steps=True),
+            steered,
+        ]
+
+    def shows_observation(self) -> bool:
+        """Yes: it fills the eighth panel."""
+        return True
+
+
+PICTURE = UavAutopilotPicture

@@ -1,0 +1,1 @@
+"""Rollouts, metrics, intervals, seeds and figures: takes objects and knows no names."""

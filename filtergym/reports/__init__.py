@@ -1,0 +1,1 @@
+"""Reports over environments: benchmark, comparison, room for improvement, training seeds, and their tables."""

@@ -1,0 +1,151 @@
+"""The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..agents.named_policies import shipped_agents
+from ..baselines.evaluation import baselines_of
+from ..baselines.figures import draw_differences
+from ..baselines.metrics import Record
+from ..baselines.reproduction import Grid, markdown_table
+from ..envs.catalogue import task_class
+from .tables import with_interval
+
+DIFFERENCE = "relative_cost_difference"
+
+
+class Comparison(NamedTuple):
+    """What the page shows of one environment."""
+
+    environment: str
+    grids: list[Grid]
+    figure: Any
+
+
+def read_benchmark(path: Path) -> dict[str, list[Record]]:
+    """Read the records of a benchmark, by environment.
+
+    Raises:
+        ValueError: if the file is not one.
+    """
+    try:
+        records = [Record(**values) for values in json.loads(path.read_text(encoding="utf-8"))]
+    except (OSError, ValueError, TypeError) as error:
+        raise ValueError(f"cannot read the records of a benchmark in {path}: {error}") from error
+    found: dict[str, list[Record]] = {}
+    for record in records:
+        found.setdefault(record.environment, []).append(record)
+    return found
+
+
+def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
+    """Names that the page shows, of those in the records.
+
+    The tuned policies (the paper's first, the best constant action last), learned agents, and the reference
+    whose score is 1. The other untuned ones stand in the records.
+    """
+    known = baselines_of(id)
+    adaptive = [name for name in known.tunable if name not in (known.score_paper, known.best_constant)]
+    tuned = [f"{name}-tuned" for name in (known.score_paper, *adaptive, known.best_constant)]
+    present = {record.policy for record in records}
+    return [
+        name for name in (*known.compared, *tuned, *shipped_agents(id), known.score_bound) if name in present
+    ]
+
+
+def compare_environment(records: Sequence[Record]) -> Comparison:
+    """Tables of one environment: cost against the paper's algorithm, and the physical error.
+
+    Raises:
+        ValueError: if the paper's algorithm is not among the records.
+    """
+    cls = task_class(records[0].environment)
+    known = baselines_of(cls.id)
+    paper, columns = known.score_paper, compared_policies(cls.id, records)
+    if paper not in {record.policy for record in records}:
+        raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
+    found = {(r.scenario, r.policy, r.metric, r.component): r for r in records if r.window == "all"}
+    sizes = {record.scenario: record.episodes for record in records}
+    metric, component = known.physical
+    unit = next(r.unit for r in records if (r.metric, r.component) == known.physical)
+
+    def rows(metric: str, component: str, names: Sequence[str], scale: float = 1.0) -> list[list[str]]:
+        return [
+            [
+                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
+                *(_two_lines(found.get((scenario, name, metric, component)), scale) for name in names),
+            ]
+            for scenario in sizes
+        ]
+
+    shown = [
+        *columns,
+        *(name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found),
+    ]
+    heads = {name: f"`{name}`{_role(cls.id, name)}" for name in (paper, *shown)}
+    quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
+    grids = [
+        Grid(
+            f"Cost against `{paper}`, %",
+            ["scenario", *(heads[name] for name in columns)],
+            rows(DIFFERENCE, "", columns, 100.0),
+        ),
+        Grid(
+            f"{quantity}, {unit}",
+            ["scenario", *(heads[name] for name in (paper, *shown))],
+            rows(metric, component, (paper, *shown)),
+        ),
+    ]
+    differences: dict[str, dict[str, tuple[float, ...]]] = {}
+    for scenario in sizes:
+        row = differences.setdefault(
+            scenario + ("\n(training)" if cls.scenarios[scenario].training else ""), {}
+        )
+        for name in columns:
+            record = found.get((scenario, name, DIFFERENCE, ""))
+            interval = () if record is None else (record.value, record.low, record.high)
+            percent = tuple(100.0 * x for x in interval if x is not None)
+            if len(percent) == 3:
+                row[name] = percent
+    figure = draw_differences(differences, columns, shipped_agents(cls.id), cls.id, paper)
+    return Comparison(cls.id, grids, figure)
+
+
+def _role(id: str, name: str) -> str:
+    known = baselines_of(id)
+    if name == known.score_paper:
+        return " (paper)"
+    return (
+        " (learned)"
+        if name in shipped_agents(id)
+        else ""
+        if known.kind(name) == "policy"
+        else f" ({known.kind(name)})"
+    )
+
+
+def _two_lines(record: Record | None, scale: float) -> str:
+    """Value above interval, so that columns stay narrow."""
+    # Percentages to a hundredth: what is smaller is rounding.
+    negligible = 0.005 if scale == 100.0 else 0.0
+    shown = with_interval(record, scale, negligible=negligible)
+    return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
+
+
+def comparison_markdown(comparison: Comparison, records: Sequence[Record], picture: str, command: str) -> str:
+    """Tables and picture of one environment, with the command that made the records."""
+    first = records[0]
+    episodes = sorted({record.episodes for record in records})
+    count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
+    lines: list[str] = []
+    for grid in comparison.grids:
+        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
+    lines += [
+        f"![Cost against the paper's algorithm in every scenario, {comparison.environment}]({picture})",
+        "",
+        f"{first.split.capitalize()} split, {count} episodes a scenario, 95 % intervals over episodes. "
+        f"Made by `{command}`.",
+    ]
+    return "\n".join(lines)

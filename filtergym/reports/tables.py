@@ -1,0 +1,103 @@
+"""Tables of results for the terminal."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from ..baselines.reproduction import Grid
+
+
+def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
+    """Value and interval in as many digits as make sense: ``67.0 [66.6, 67.4]``.
+
+    Args:
+        record: with ``value``, ``low`` and ``high``; or None.
+        scale: that all three are multiplied with.
+        digits: significant ones.
+        negligible: what is smaller, scaled, is shown as 0.
+    """
+    if record is None or record.value is None:
+        return "-"
+
+    def text(value: float) -> str:
+        value *= scale
+        if abs(value) < negligible:
+            return "0"
+        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:#.{digits}g}".rstrip(".")
+
+    if record.low is None or record.low == record.high:
+        return f"{record.value * scale:.{digits}g}"
+    return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
+
+
+def main_components(records: Sequence[Any]) -> list[str]:
+    """Components that a table shows: groups such as "position" where there are any, else the first three."""
+    first = records[0]
+    names = [
+        r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
+    ]
+    return shown_components(names)
+
+
+def shown_components(names: Sequence[str]) -> list[str]:
+    """Of components and groups of them: the groups where there are any, else the first three."""
+    # One namesake is no group: "range" is not made of "range_rate".
+    return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
+
+
+def results_table(records: Sequence[Any]) -> Table:
+    """Compare policies: errors over the whole run, cost against the paper's algorithm, score.
+
+    Args:
+        records: tidy records of one environment and scenario.
+    """
+    first = records[0]
+    shown = main_components(records)
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+    table = Table(
+        title=f"{first.environment}, scenario {first.scenario} "
+        f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)",
+        title_justify="left",
+    )
+    table.add_column("policy", no_wrap=True)
+    table.add_column("control")
+    for component in shown:
+        table.add_column(f"RMSE {component.replace('_', ' ')}, {units[component]}", justify="right")
+    table.add_column("cost vs paper, %", justify="right")
+    table.add_column("score", justify="right")
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    names = list(dict.fromkeys((r.policy, r.kind, r.control) for r in records))
+    section = "policy"
+    for name, kind, control in names:
+        if kind != section:
+            table.add_section()
+            section = kind
+        row = [name, control if kind == "policy" else f"({kind})"]
+        row += [with_interval(found.get((name, "rmse", component, "all"))) for component in shown]
+        row.append(with_interval(found.get((name, "relative_cost_difference", "", "all")), 100.0))
+        score = found.get((name, "score", "", "all"))
+        row.append("no room" if score is not None and score.value is None else with_interval(score))
+        table.add_row(*row)
+    table.caption = (
+        "score: 0 = the paper's algorithm, 1 = the reference that it is measured against.\n"
+        "References and bounds know what no policy can."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def grid_table(grid: Grid) -> Table:
+    """Return a table of text for the terminal: numbers to the right, without the marks of Markdown."""
+
+    def plain(cell: str) -> str:
+        return escape(cell.replace("`", "").replace("<br>", "\n"))
+
+    table = Table(title=plain(grid.title), title_justify="left")
+    for i, name in enumerate(grid.header):
+        words = any(row[i].startswith("`") for row in grid.rows)
+        table.add_column(plain(name), justify="left" if words else "right")
+    for row in grid.rows:
+        table.add_row(*map(plain, row))
+    return table
