@@ -17,11 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..envs.environment import TaskVectorEnv
-from ..envs.lanes import Lanes
 from .residual import check_residual
-
-_OF_THE_TASK = ("task", "paper")
-"""What of the lanes is made anew from names and keywords instead of being kept in a snapshot."""
 
 
 def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) -> "TaskVecEnv":
@@ -141,12 +137,12 @@ class TaskVecEnv(VecEnv):
     # --- whole state, for checkpoints
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything that later steps depend on: states, noise, generators, running returns.
+        """Return everything that later steps depend on: lanes, running returns, the memory of a policy.
 
-        Arrays are shared with the environment, so pickle it before the next step.
+        The latter are shared with this object, so pickle it before the next step.
         """
-        lanes = {k: v for k, v in vars(self.env.lanes).items() if k not in _OF_THE_TASK}
         policy = self._policy_memory, self._shown, self._start
+        lanes = self.env.lanes.snapshot()
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -155,12 +151,7 @@ class TaskVecEnv(VecEnv):
         Raises:
             ValueError: if the number of environments differs.
         """
-        if snapshot["lanes"]["count"] != self.num_envs:
-            raise ValueError(
-                f"the snapshot holds {snapshot['lanes']['count']} environments, not {self.num_envs}"
-            )
-        lanes: Lanes = self.env.lanes
-        vars(lanes).update(snapshot["lanes"])
+        self.env.lanes.restore(snapshot["lanes"])
         self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
         self._policy_memory, self._shown, self._start = snapshot["policy"]
 

@@ -11,7 +11,6 @@ import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy
@@ -21,7 +20,6 @@ from stable_baselines3.common.logger import Logger, make_output_format
 from ..baselines.seeds import episode_seeds
 from ..envs.catalogue import make_task
 from ..envs.environment import TaskVectorEnv
-from ..envs.lanes import Lanes
 from .learned_policy import LearnedPolicy, write_arrays
 from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
 
@@ -68,20 +66,6 @@ class RecurrentPolicy(torch.nn.Module):
         return {name: tensor.detach().numpy().copy() for name, tensor in named.items()}
 
 
-def detached(values: Any) -> Any:
-    """Cut the gradient of nested tuples of tensors."""
-    if isinstance(values, tuple):
-        parts = [detached(part) for part in values]
-        return type(values)(*parts) if hasattr(values, "_fields") else tuple(parts)
-    return values.detach() if isinstance(values, torch.Tensor) else values
-
-
-def cut_gradient(lanes: Lanes) -> None:
-    """Let later steps of the lanes not differentiate through what has happened so far."""
-    lanes.state, lanes.paper_state = detached(lanes.state), detached(lanes.paper_state)
-    lanes._interval_mean = detached(lanes._interval_mean)
-
-
 def descend_episodes(
     env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int, descend: Callable[[], None]
 ) -> float:
@@ -111,7 +95,7 @@ def descend_episodes(
             total += float(pending.detach())
             descend()
             pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
-            cut_gradient(env.lanes)
+            env.lanes.detach()
     return total / env.last_decision
 
 

@@ -1,8 +1,8 @@
 """What a policy, a reference estimator and a bound are.
 
 A **policy** sees observations and returns actions; learned or classical, it answers Stable-Baselines3's
-call. A **reference estimator** runs on an episode's data, never through actions, and may be told what no
-agent knows; it is never ranked with policies. A **bound** is computed.
+call. A **reference** estimates from the measurements, never through actions, and may be told what no
+competitor knows; it is never ranked with policies. A **bound** is computed.
 """
 
 from collections.abc import Callable, Mapping
@@ -99,19 +99,27 @@ class RandomPolicy(Policy):
         return generator.uniform(space.low, space.high, (len(observation), *space.shape)), generator
 
 
-class ReferenceEstimator(Protocol):
-    """An estimator that runs on the episode's data and may know what no agent does."""
+class Reference(Protocol):
+    """An estimator that runs on the episode's measurements and may know what no competitor does.
+
+    It starts where everyone starts. In a closed loop it flies a truth of its own, on the same noise.
+    """
 
     knows: ClassVar[str]
     """What it is told, in words; printed wherever it is reported."""
 
     def __init__(self, task: Task) -> None: ...
 
-    def start(self, state: Any) -> Any:
-        """Memory at the start of an episode, from the task's state after its first measurement."""
+    def start(self, initial: Any, truth: Any) -> Any:
+        """Memory at the start of the track.
 
-    def update(self, state: Any, memory: Any) -> tuple[Any, Any]:
-        """State after step 4 with the estimate in place, and the memory, from the state after step 2."""
+        Args:
+            initial: what everyone is told of it.
+            truth: at that time.
+        """
+
+    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Array, Any]:
+        """Estimate after a measurement: mean ``(C, N)``, covariance ``(C, C, N)``, and the memory."""
 
 
 class Bound(Protocol):
@@ -121,10 +129,10 @@ class Bound(Protocol):
 
     def __init__(self, task: Task) -> None: ...
 
-    def start(self, state: Any) -> Any:
-        """Memory at the start of an episode, from the task's state after its first measurement."""
+    def start(self, initial: Any, truth: Any) -> Any:
+        """Memory at the start of the track; arguments as of :meth:`Reference.start`."""
 
-    def update(self, state: Any, memory: Any) -> tuple[Array, Any]:
+    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Any]:
         """Bound of the mean square of ``task.components``, ``(C, N)``, and the memory."""
 
 

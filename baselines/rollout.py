@@ -7,15 +7,22 @@ import numpy
 
 from ..envs.environment import checked_action
 from ..envs.lanes import Lanes
-from ..envs.task import Array, Task
+from ..envs.observation import Array
+from ..envs.task import Episode, Outside, Task
 
 Progress = Callable[[int], None]
 """Told the number of measurements just done."""
 
 
-def started_lanes(task: Task, seeds: Sequence[int]) -> Lanes:
-    """Return one episode for each seed, side by side, with its first measurement made."""
-    lanes = Lanes(task, len(seeds))
+def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+    """Return one episode for each seed, side by side, with its first measurement made.
+
+    Args:
+        task: the estimation problem.
+        seeds: of the episodes.
+        begun: told of the episodes at the start of the track.
+    """
+    lanes = Lanes(task, len(seeds), begun=begun)
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
@@ -52,17 +59,26 @@ def run_policy(
 def run_reference(
     task: Task, reference: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
 ) -> None:
-    """Run a reference estimator in place of actions; arguments as in :func:`run_policy`."""
-    lanes = started_lanes(task, seeds)
-    memory = reference.start(lanes.state)
+    """Run a reference in place of actions; arguments as in :func:`run_policy`.
 
-    def update(state: Any) -> Any:
+    The task that ``record`` is told of is ``task.estimated_outside()``.
+    """
+    task = task.estimated_outside()
+    memory: Any = None
+
+    def begun(episode: Episode) -> None:
         nonlocal memory
-        state, memory = reference.update(state, memory)
-        return state
+        memory = reference.start(episode.measurement, episode.truth)
 
+    def update(episode: Episode) -> Episode:
+        nonlocal memory
+        mean, covariance, memory = reference.update(episode.measurement, episode.truth, memory)
+        feedback = task.feedback(mean, episode.measurement)
+        return episode._replace(bank=Outside(mean, covariance, feedback))
+
+    lanes = started_lanes(task, seeds, begun)
     for _ in range(lanes.decisions_per_episode):
-        lanes.step(update, lambda state, _: record(state))
+        lanes.step(update, lambda episode, _: record(episode))
         tick(lanes.count * task.decision_interval)
 
 
@@ -70,15 +86,20 @@ def run_bound(
     task: Task, bound: Any, seeds: Sequence[int], record: Callable[[Array], None], tick: Progress
 ) -> None:
     """Compute a bound along the episodes; ``record`` gets its mean squares, ``(C, N)``."""
-    lanes = started_lanes(task, seeds)
-    memory = bound.start(lanes.state)
+    memory: Any = None
+
+    def begun(episode: Episode) -> None:
+        nonlocal memory
+        memory = bound.start(episode.measurement, episode.truth)
+
+    lanes = started_lanes(task, seeds, begun)
     neutral = lanes.widened(numpy.zeros((lanes.count, *(task.action_space.shape or ()))))
 
-    def update(state: Any) -> Any:
+    def update(episode: Episode) -> Episode:
         nonlocal memory
-        mean_square, memory = bound.update(state, memory)
+        mean_square, memory = bound.update(episode.measurement, episode.truth, memory)
         record(mean_square)
-        return task.act(state, neutral)
+        return task.act(episode, neutral)
 
     for _ in range(lanes.decisions_per_episode):
         lanes.step(update)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from .catalogue import nearest
-from .task import Array
+from .observation import Array
 
 BACKENDS = ("numpy", "torch")
 

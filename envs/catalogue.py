@@ -16,7 +16,6 @@ from typing import Any
 import gymnasium
 import numpy
 
-from . import parameters as check
 from .task import Scenario, Task
 from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
 
@@ -105,14 +104,7 @@ def make_task(
     for name in keywords:
         if name not in known:
             raise nearest("parameter", name, known)
-    values = {name: check.frozen(value) for name, value in {**chosen.parameters, **keywords}.items()}
-    parameters = cls.Parameters(**values)
-    check.integer("decision_interval", parameters.decision_interval, at_least=1)
-    if parameters.horizon % parameters.decision_interval:
-        raise ValueError(
-            f"horizon must be a multiple of decision_interval, got {parameters.horizon} and "
-            f"{parameters.decision_interval}"
-        )
+    parameters = cls.Parameters(**{**chosen.parameters, **keywords})
     return cls(parameters, control, xp, device)
 
 

@@ -1,14 +1,13 @@
-"""What an action means to a bank of filters: mode, weights, evidence; and how observations are compressed."""
+"""What an action means to a bank of filters: mode, weights, evidence."""
 
 from types import ModuleType
-from typing import Any
 
 import gymnasium
 import numpy
 
 from ..filters import imm
-
-Array = Any
+from ..filters.ordered_sums import ordered_sum
+from .observation import Array
 
 
 def bank_action_space(control: str, count: int) -> gymnasium.Space:
@@ -46,20 +45,8 @@ def bank_probabilities(
         return xp.astype(hypotheses[:, None] == action[None], log_likelihood.dtype)
     if control == "weights":
         weights = xp.clip(action, 0.0, 1.0)
-        total = weights[0]
-        for j in range(1, weights.shape[0]):
-            total = total + weights[j]
+        total = ordered_sum(weights)
         positive = total > 0.0
         uniform = 1.0 / weights.shape[0]
         return xp.where(positive, weights / xp.where(positive, total, 1.0), uniform)
     return imm.mode_posterior(log_predicted, log_likelihood + evidence_scale * xp.clip(action, -1.0, 1.0))
-
-
-def signed_logarithm(value: Array, xp: ModuleType) -> Array:
-    """Compress large values invertibly: ``sign(x) log(1 + |x|)``, close to x near zero."""
-    return xp.sign(value) * xp.log1p(xp.abs(value))
-
-
-def signed_exponential(value: Array, xp: ModuleType) -> Array:
-    """Inverse of :func:`signed_logarithm`."""
-    return xp.sign(value) * xp.expm1(xp.abs(value))

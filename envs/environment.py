@@ -12,8 +12,9 @@ from gymnasium.vector.utils import batch_space
 from .backend import array_backend, host_array, is_tensor, tensor_on
 from .catalogue import find_scenario, make_task, nearest
 from .lanes import Lanes
+from .observation import Array, Field
 from .reward import REWARDS, paper_task, reward
-from .task import Array, Field, Task
+from .task import Task
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:

@@ -17,12 +17,14 @@ environment with the same seed bit for bit.
 current slot on, so that every step reads one contiguous slice, whatever the lanes' own times are.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy
 
-from .task import Array, Task
+from .observation import Array
+from .task import Episode, Task
 
 LANE_MULTIPLE = 8
 LONGEST_BLOCK = 256
@@ -45,6 +47,22 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     return merged
 
 
+def _mapped(function: Callable[[Array], Array], part: Any) -> Any:
+    """Return nested tuples of arrays with a function applied to every array."""
+    if part is None:
+        return None
+    if isinstance(part, tuple):
+        parts = [_mapped(function, item) for item in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+    return function(part)
+
+
+_REPLACED = ("state", "paper_state", "_interval_mean", "_clock")
+"""Attributes of lanes that a step replaces."""
+_REWRITTEN = ("generators", "decisions", "_ring", "_started", "_children")
+"""Attributes that it changes in place."""
+
+
 class Lanes:
     """``count`` episodes of a task side by side.
 
@@ -52,18 +70,26 @@ class Lanes:
         task: the estimation problem; its namespace decides where arrays live.
         count: number of lanes.
         paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
+        begun: told of new episodes at the start of the track, before their first measurement.
 
     Attributes:
-        state: the task's state after the last measurement, lanes padded to a multiple of eight.
+        state: the episodes after the last measurement, lanes padded to a multiple of eight.
         paper_state: the same of ``paper``.
         decisions: actions taken in each lane's current episode, ``(count,)``.
     """
 
-    def __init__(self, task: Task, count: int, paper: Task | None = None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        count: int,
+        paper: Task | None = None,
+        begun: Callable[[Episode], None] | None = None,
+    ) -> None:
         self.task = task
         self.count = count
         self.width = -(-count // LANE_MULTIPLE) * LANE_MULTIPLE
         self.paper = paper
+        self._begun = begun
         self.paper_state: Any = None
         if paper is not None:
             self._paper_action = self._constant_action(paper)
@@ -161,7 +187,10 @@ class Lanes:
         # The padding lanes fly an average episode without noise.
         scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
         first_row = self._padded(rows[0], 0.0)
-        state = self.task.measure(self.task.begin(scenario, start), first_row)
+        episode = self.task.begin(scenario, start)
+        if self._begun is not None:
+            self._begun(episode)
+        state = self.task.measure(episode, first_row)
         paper_state = self.paper and self.paper.measure(self.paper.begin(scenario, start), first_row)
         if everyone:
             self.state, self.paper_state = state, paper_state
@@ -215,6 +244,33 @@ class Lanes:
         self.state = self.task.measure(posterior, row)
         if self.paper is not None:
             self.paper_state = self.paper.measure(paper_posterior, row)
+
+    # --- for whoever steps them in an unusual way
+
+    def detach(self) -> None:
+        """Cut the gradient: what follows no longer remembers how it came about (torch only)."""
+        self.state, self.paper_state, self._interval_mean = (
+            _mapped(lambda tensor: tensor.detach(), part)
+            for part in (self.state, self.paper_state, self._interval_mean)
+        )
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
+        kept = copy.deepcopy({name: getattr(self, name) for name in _REWRITTEN})
+        return {"count": self.count, **kept, **{name: getattr(self, name) for name in _REPLACED}}
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go on from a snapshot of lanes of the same task.
+
+        Raises:
+            ValueError: if their number differs.
+        """
+        if snapshot["count"] != self.count:
+            raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
+        for name in _REWRITTEN:
+            setattr(self, name, copy.deepcopy(snapshot[name]))
+        for name in _REPLACED:
+            setattr(self, name, snapshot[name])
 
     @property
     def finished(self) -> numpy.ndarray:

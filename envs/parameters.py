@@ -1,76 +1,178 @@
-"""Checks of task parameters: each raises ``ValueError`` with the name, the value and what was expected."""
+"""Parameters of tasks: limits stand beside the fields they hold for, and one checker reads them.
 
+    @dataclass(frozen=True)
+    class ParametersOfMine(TaskParameters):
+        range_sigma: float = parameter(100.0, above=0.0)
+        \"\"\"Standard deviation of the range, m (paper).\"\"\"
+
+The type of a field says what a value must be (number, whole number, boolean, word, tuples of them, None);
+:func:`parameter` says what else must hold. Every refusal is a ``ValueError`` with the name, the value and what
+was expected.
+"""
+
+import dataclasses
 import math
+import types
+import typing
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
+
+import numpy
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What must hold for a value beside its type; for each number where the value is a sequence."""
+
+    above: float | None = None
+    at_least: float | None = None
+    below: float | None = None
+    at_most: float | None = None
+    choices: tuple[str, ...] = ()
+    ascending: bool = False
+    """Of a pair: the first must not be larger than the second."""
+    stochastic: bool = False
+    """Of a row of numbers: they are probabilities that sum to one."""
+
+
+def parameter(default: Any, **limits: Any) -> Any:
+    """Declare a field of a parameters' dataclass with its default and its :class:`Limits`."""
+    return dataclasses.field(default=default, metadata={"limits": Limits(**limits)})
+
+
+@dataclasses.dataclass(frozen=True)
+class TaskParameters:
+    """What every task has. Subclasses may give other defaults, and check in :meth:`check` what one field's limits
+    cannot say.
+    """
+
+    horizon: int = parameter(100, at_least=1)
+    """Measurements acted on in one episode."""
+    decision_interval: int = parameter(1, at_least=1)
+    """Measurements for which one action holds."""
+
+    def __post_init__(self) -> None:
+        """Check every field.
+
+        Raises:
+            ValueError: with the name of the field, its value and what was expected.
+        """
+        for name, (hint, limits) in declared(type(self)).items():
+            value = frozen(getattr(self, name))
+            object.__setattr__(self, name, value)
+            check(name, value, hint, limits)
+        if self.horizon % self.decision_interval:
+            raise ValueError(
+                f"horizon must be a multiple of decision_interval, got {self.horizon} and "
+                f"{self.decision_interval}"
+            )
+        self.check()
+
+    def check(self) -> None:
+        """Check what concerns several fields together."""
+
+
+@cache
+def declared(cls: type) -> dict[str, tuple[Any, Limits]]:
+    """Type and limits of every field of a parameters' dataclass."""
+    hints = typing.get_type_hints(cls)
+    return {f.name: (hints[f.name], f.metadata.get("limits", Limits())) for f in dataclasses.fields(cls)}
 
 
 def frozen(value: Any) -> Any:
-    """Turn lists into tuples, all the way down, so that parameters from JSON equal those from Python."""
+    """Turn lists and arrays into tuples, all the way down, so that parameters from JSON equal those from Python."""
+    if isinstance(value, numpy.ndarray | numpy.generic):
+        value = value.tolist()
     return tuple(frozen(item) for item in value) if isinstance(value, list | tuple) else value
 
 
-def number(
-    name: str,
-    value: Any,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
-) -> None:
-    """Check a finite number against its limits."""
-    limits = [
-        (f"above {above}", above is None or (isinstance(value, int | float) and value > above)),
-        (f"at least {at_least}", at_least is None or (isinstance(value, int | float) and value >= at_least)),
-        (f"below {below}", below is None or (isinstance(value, int | float) and value < below)),
-        (f"at most {at_most}", at_most is None or (isinstance(value, int | float) and value <= at_most)),
-    ]
-    stated = [
-        text
-        for (text, _), limit in zip(limits, (above, at_least, below, at_most), strict=True)
-        if limit is not None
-    ]
+def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
+    """Check a value against the type and the limits that were declared for it.
+
+    Raises:
+        ValueError: with the name, the value and what was expected.
+    """
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        if value is None:
+            return
+        (hint,) = (other for other in typing.get_args(hint) if other is not types.NoneType)
+    if typing.get_origin(hint) is tuple:
+        _sequence(name, value, typing.get_args(hint), limits)
+    elif hint is bool:
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} must be True or False, got {value!r}")
+    elif hint is int:
+        _integer(name, value, limits)
+    elif hint is float:
+        _number(name, value, limits)
+    elif hint is str:
+        _word(name, value, limits)
+    else:
+        raise TypeError(f"{name} is declared as {hint}, which has no check")
+
+
+def _stated(limits: Limits) -> str:
+    words = {"above": "above", "at_least": "at least", "below": "below", "at_most": "at most"}
+    parts = [f"{words[f]} {getattr(limits, f)}" for f in words if getattr(limits, f) is not None]
+    return " and ".join(parts)
+
+
+def _within(value: float, limits: Limits) -> bool:
+    return (
+        (limits.above is None or value > limits.above)
+        and (limits.at_least is None or value >= limits.at_least)
+        and (limits.below is None or value < limits.below)
+        and (limits.at_most is None or value <= limits.at_most)
+    )
+
+
+def _number(name: str, value: Any, limits: Limits) -> None:
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if not is_number or not all(holds for _, holds in limits):
-        expected = " ".join(["a finite number", " and ".join(stated)]).strip()
-        raise ValueError(f"{name} must be {expected}, got {value!r}")
+    if not is_number or not _within(value, limits):
+        raise ValueError(f"{name} must be {f'a finite number {_stated(limits)}'.strip()}, got {value!r}")
 
 
-def integer(name: str, value: Any, *, at_least: int) -> None:
-    """Check an integer against its lower limit."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < at_least:
-        raise ValueError(f"{name} must be an integer of at least {at_least}, got {value!r}")
+def _integer(name: str, value: Any, limits: Limits) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or not _within(value, limits):
+        stated = f" of {_stated(limits)}" if _stated(limits) else ""
+        raise ValueError(f"{name} must be an integer{stated}, got {value!r}")
 
 
-def numbers(name: str, values: Any, count: int | None = None, **limits: Any) -> None:
-    """Check a sequence of numbers, its length, and each of them against the limits of :func:`number`."""
-    if not isinstance(values, Sequence) or isinstance(values, str) or (count and len(values) != count):
-        expected = f"{count} numbers" if count else "a sequence of numbers"
-        raise ValueError(f"{name} must be {expected}, got {values!r}")
-    for i, value in enumerate(values):
-        number(f"{name}[{i}]", value, **limits)
+def _word(name: str, value: Any, limits: Limits) -> None:
+    if limits.choices and value not in limits.choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, limits.choices))}, got {value!r}")
+    if not isinstance(value, str):
+        raise ValueError(f"{name} must be a word, got {value!r}")
 
 
-def interval(name: str, values: Any, **limits: Any) -> None:
-    """Check a pair of numbers in ascending order."""
-    numbers(name, values, 2, **limits)
-    if values[0] > values[1]:
-        raise ValueError(f"{name} must be in ascending order, got {values!r}")
+_KINDS = {float: "numbers", int: "integers", str: "words"}
 
 
-def choice(name: str, value: Any, allowed: Sequence[str]) -> None:
-    """Check that a word is one of those allowed."""
-    if value not in allowed:
-        raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}")
+def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: Limits) -> None:
+    count = None if of[-1] is Ellipsis else len(of)
+    if not isinstance(value, Sequence) or isinstance(value, str) or (count and len(value) != count):
+        kind = _KINDS.get(of[0], "rows")
+        raise ValueError(
+            f"{name} must be {f'{count} {kind}' if count else f'a sequence of {kind}'}, got {value!r}"
+        )
+    for i, item in enumerate(value):
+        check(f"{name}[{i}]", item, of[0] if count is None else of[i], limits)
+    if limits.ascending and of[0] in (int, float) and value[0] > value[1]:
+        raise ValueError(f"{name} must be in ascending order, got {value!r}")
+    if limits.stochastic and of[0] is float and abs(sum(value) - 1.0) > 1e-9:
+        raise ValueError(f"{name} must sum to 1, got {value!r} with sum {sum(value):.12g}")
 
 
-def stochastic_matrix(name: str, rows: Any, size: int, columns: int | None = None) -> None:
-    """Check a matrix of probabilities whose rows sum to one (row = from, column = to)."""
-    columns = columns or size
-    if not isinstance(rows, Sequence) or len(rows) != size:
+def sized(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
+    """Check the length of a sequence that depends on other parameters."""
+    if len(value) != count:
+        raise ValueError(f"{name} must be {count} {what}, got {value!r}")
+
+
+def square_matrix(name: str, rows: Sequence[Sequence[float]], size: int) -> None:
+    """Check the shape of a matrix of transition probabilities that depends on other parameters."""
+    if len(rows) != size:
         raise ValueError(f"{name} must have {size} rows (row = from, column = to), got {rows!r}")
     for i, row in enumerate(rows):
-        numbers(f"{name}[{i}]", row, columns, at_least=0.0, at_most=1.0)
-        if abs(sum(row) - 1.0) > 1e-9:
-            raise ValueError(f"{name}[{i}] must sum to 1, got {row!r} with sum {sum(row):.12g}")
+        sized(f"{name}[{i}]", row, size)

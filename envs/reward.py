@@ -9,7 +9,8 @@ positive where the agent does better than the paper.
 from typing import Any
 
 from ..filters.gaussian import log_density
-from .task import Array, Task, huber
+from .observation import Array
+from .task import Task, huber
 
 REWARDS = ("cost", "log-likelihood", "relative")
 

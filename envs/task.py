@@ -4,55 +4,48 @@ A *task* is one estimation problem, written once for N independent episodes side
 task with N = 1, the vector environment is the task with N, an evaluation is the task with N = Monte Carlo
 runs. A task knows nothing of Gymnasium and owns no random generator: numbers come in, states come out.
 
+It is made of two halves, and the :class:`Measurement <Episode>` is the only door between them:
+
+* the :class:`World` draws the episode, moves the truth and says what the sensors say;
+* a :class:`Bank`, one for each control, predicts, shows, is steered, and estimates. It never receives the
+  truth, nor anything else that the world keeps.
+
 The clock of every task:
 
-====  ==============================================================  ======================
- 1    the filter bank predicts to the next measurement time           :meth:`Task.measure`
- 2    the measurement arrives; innovations and likelihoods follow     :meth:`Task.measure`
- 3    the agent is shown them                                         :meth:`Task.observe`
- 4    the agent's action is applied to *that same* measurement        :meth:`Task.act`
- 5    the estimate is compared with the truth                         :meth:`Task.cost`
-====  ==============================================================  ======================
+====  ==============================================================  =========================
+ 1    the truth moves on; the sensors say where it seems to be        :meth:`World.advance`
+ 2    the filters predict to that time; innovations and likelihoods   :meth:`Bank.predict`
+ 3    the agent is shown them                                         :meth:`Bank.observe`
+ 4    the agent's action is applied to *that same* measurement        :meth:`Bank.act`
+ 5    the estimate is compared with the truth                         :meth:`World.cost`
+====  ==============================================================  =========================
 
-``begin`` makes the state at the start of the track, as if step 4 had just happened. A reset is ``begin``, 1,
-2, 3; an environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation
-shows a real measurement that is not acted on.
+``begin`` makes the episode at the start of the track, as if step 4 had just happened: :meth:`World.begin`
+says what everyone is told of the start, :meth:`Bank.start` takes it. A reset is ``begin``, 1, 2, 3; an
+environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
+real measurement that is not acted on.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
-torch). A state is a NamedTuple of arrays ``(..., N)`` and is never changed in place.
+torch). Truth, measurement and the bank's state are NamedTuples of arrays ``(..., N)`` and are never changed
+in place.
 
-In a closed loop the truth follows from the estimate: the control is computed from the state's estimate when
-the next measurement is made. A reference estimator that replaces the estimate then flies a truth of its own,
-on the same noise.
-
-**No truth at any distance:** nothing that ``observe`` returns, and nothing that it is computed from, may
-depend on the truth except through the measurements.
+A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Bank.feedback`
+returns is given to the next :meth:`World.advance`. An estimator that stands in for the bank then flies a truth
+of its own, on the same noise.
 """
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar, Generic, Literal, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import gymnasium
 import numpy
 
-Array = Any
-"""A NumPy array or a torch tensor."""
-
-
-class Field(NamedTuple):
-    """One component of the observation."""
-
-    name: str
-    unit: str
-    """Unit of the value as shown; "1" for a pure number."""
-    description: str
-    """What it is and how it is scaled."""
-    over_interval: Literal["last", "mean"] = "last"
-    """How the component is shown when one action holds for several measurements: the value at the last
-    one, or the mean over all of them."""
+from .draws import Draws
+from .observation import Array, Block, Blocks, Field, Quantity, Reader
 
 
 class Component(NamedTuple):
@@ -97,34 +90,230 @@ class PaperPolicy(NamedTuple):
     action: tuple[float, ...]
 
 
+class Initial(NamedTuple):
+    """What everyone is told of the start of the track; a task may use a NamedTuple with more fields."""
+
+    mean: Array
+    """In the units of the task's components, ``(C, N)``."""
+    covariance: Array
+    """``(C, C, N)``."""
+
+
+TaskT = TypeVar("TaskT", bound="Task")
+Truth = TypeVar("Truth")
+Measurement = TypeVar("Measurement")
 State = TypeVar("State")
 
 
-class Task(ABC, Generic[State]):
+class Episode(NamedTuple):
+    """N episodes at one moment: all that the engine keeps between steps."""
+
+    truth: Any
+    """What is; the world's NamedTuple."""
+    measurement: Any
+    """What the sensors say; between ``begin`` and the first measurement what is told of the start."""
+    bank: Any
+    """The state of what estimates."""
+
+
+class World(ABC, Generic[TaskT, Truth, Measurement]):
+    """What is, and what the sensors say.
+
+    Args:
+        task: whose world it is, with the constants that both halves share.
+
+    Attributes:
+        initial_normals: standard normal numbers of the track's start.
+        normals: standard normal numbers of each measurement.
+        row_uniforms: uniform numbers of each measurement.
+    """
+
+    initial_normals: int
+    normals: int
+    row_uniforms: int = 0
+
+    def __init__(self, task: TaskT) -> None:
+        self.task = task
+        self.parameters = task.parameters
+        self.xp = task.xp
+
+    @abstractmethod
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
+        """Truth at the start of the track, and what everyone is told of it.
+
+        Args:
+            draws: what fixes the scenario of each episode.
+            normals: ``(initial_normals, N)``, the errors of the track's start.
+
+        Returns:
+            The truth, and an :class:`Initial` or a NamedTuple that has its fields.
+        """
+
+    @abstractmethod
+    def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
+        """Step 1: the truth moves on and the sensors answer.
+
+        Args:
+            truth: at the measurement before.
+            noise: ``(normals + row_uniforms, N)``.
+            feedback: of a closed loop, what :meth:`Bank.feedback` returned; else None.
+        """
+
+    @abstractmethod
+    def state(self, truth: Truth) -> Array:
+        """True values of the task's components, ``(C, N)``."""
+
+    @abstractmethod
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Step 5: what an estimate costs, uncapped, ``(N,)``.
+
+        A squared error in units of the sensor's nominal variance, or, where the estimate drives a control
+        loop, the quadratic cost of the loop in a fixed unit.
+
+        Args:
+            truth: at the measurement that the estimate is for.
+            mean: of the estimate, ``(C, N)``.
+        """
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
+        return {}
+
+
+class Bank(ABC, Generic[TaskT, Measurement, State]):
+    """What is steered: the filters under one control.
+
+    Args:
+        task: whose bank it is, with the constants that both halves share.
+    """
+
+    def __init__(self, task: TaskT) -> None:
+        self.task = task
+        self.parameters = task.parameters
+        self.xp = task.xp
+
+    @property
+    @abstractmethod
+    def action_space(self) -> gymnasium.Space:
+        """What the action may be."""
+
+    @property
+    @abstractmethod
+    def blocks(self) -> Sequence[Block]:
+        """What the agent is shown, of this state and the measurement, in order."""
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """What else a policy can read from an observation."""
+        return ()
+
+    @abstractmethod
+    def start(self, initial: Any) -> State:
+        """State at the start of the track."""
+
+    @abstractmethod
+    def predict(self, state: State, measurement: Measurement) -> State:
+        """Step 2: predict to the time of a measurement and compare with it."""
+
+    @abstractmethod
+    def act(self, state: State, measurement: Measurement, action: Array) -> State:
+        """Step 4: apply the action to the measurement.
+
+        Args:
+            state: after :meth:`predict`.
+            measurement: the same.
+            action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
+        """
+
+    @abstractmethod
+    def mean(self, state: State) -> Array:
+        """Estimate of the task's components, after :meth:`act`, ``(C, N)``."""
+
+    @abstractmethod
+    def covariance(self, state: State) -> Array:
+        """Covariance that the estimator reports for it, ``(C, C, N)``."""
+
+    def feedback(self, state: State) -> Any:
+        """Report what a closed loop gives back to the world; None in an open loop."""
+        return None
+
+    def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
+        """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
+        ``mode_probability``.
+        """
+        return {}
+
+
+class Outside(NamedTuple):
+    """An estimate that was made elsewhere."""
+
+    mean: Array
+    """``(C, N)``."""
+    covariance: Array
+    """``(C, C, N)``."""
+    feedback: Any = None
+    """What it gives back to the world in a closed loop."""
+
+
+class OutsideBank(Bank["Task", Any, Outside]):
+    """In place of a bank, where somebody else estimates: it only hands on what they say."""
+
+    action_space = gymnasium.spaces.Discrete(1)
+    blocks = ()
+
+    def start(self, initial: Any) -> Outside:
+        """Report what everyone is told."""
+        return Outside(initial.mean, initial.covariance, self.task.feedback(initial.mean, initial))
+
+    def predict(self, state: Outside, measurement: Any) -> Outside:
+        """Nothing is predicted here."""
+        return state
+
+    def act(self, state: Outside, measurement: Any, action: Array) -> Outside:
+        """Nothing is steered here."""
+        return state
+
+    def mean(self, state: Outside) -> Array:
+        """Estimate as it was said."""
+        return state.mean
+
+    def covariance(self, state: Outside) -> Array:
+        """Covariance as it was said."""
+        return state.covariance
+
+    def feedback(self, state: Outside) -> Any:
+        """Arrow back as it follows from the estimate."""
+        return state.feedback
+
+
+class Task(ABC):
     """One estimation problem for N independent episodes; see the module's description.
 
-    Subclasses declare the class attributes below, set the instance attributes in ``__init__`` and write the
-    six methods. Their class docstring is the environment's documentation.
+    Subclasses declare the class attributes below and compute in :meth:`set_up` the constants that world and
+    banks share. Their class docstring is the environment's documentation.
     """
 
     id: ClassVar[str]
     """Gymnasium id, with version."""
     paper_source: ClassVar[str]
     """Reference of the paper."""
-    controls: ClassVar[tuple[str, ...]]
-    """What the action can steer; the first is the default."""
     Parameters: ClassVar[type]
     """Frozen dataclass of every constant; its fields are keywords of ``gym.make``."""
+    World: ClassVar[type[World]]
+    banks: ClassVar[Mapping[str, type[Bank]]]
+    """What the action can steer, and the bank that it steers; the first is the default."""
+    controls: ClassVar[tuple[str, ...]]
+    """Names of ``banks``."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
-    """What :meth:`error` returns. This and the four attributes below may be set for each instance."""
+    """What is estimated. This and the four attributes below may be set for each instance."""
     groups: Mapping[str, tuple[str, ...]] = {}
     """Names for several components taken together, such as ``position``: the root of their summed squares."""
     modes: tuple[str, ...] = ()
-    """Names of the hypotheses of the bank; their probabilities are recorded when a state reports them."""
+    """Names of the hypotheses of the bank; their probabilities are recorded when a bank reports them."""
     cost_description: ClassVar[str]
-    """What :meth:`cost` is and its unit, in words."""
+    """What the cost is and its unit, in words."""
     huber_bound: float
     """Root of the cost beyond which the reward is linear; see :func:`huber`."""
     paper_policy: PaperPolicy
@@ -139,14 +328,35 @@ class Task(ABC, Generic[State]):
     fields: tuple[Field, ...]
     action_space: gymnasium.Space
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if hasattr(cls, "banks"):
+            cls.controls = tuple(cls.banks)
+
     def __init__(self, parameters: Any, control: str, xp: ModuleType = numpy, device: Any = None) -> None:
-        """Keep what every task has; subclasses add their own constants, noise layout, fields and space."""
         self.parameters = parameters
         self.control = control
         self.horizon = parameters.horizon
         self.decision_interval = parameters.decision_interval
         self.xp = xp
         self.device = device
+        self.set_up()
+        self.world = self.World(self)
+        self.bank = self.banks[control](self)
+        self.noise = self._noise_layout()
+        self._blocks = Blocks(self.bank.blocks, self.bank.quantities, xp)
+        self.fields = self._blocks.fields
+        self.action_space = self.bank.action_space
+
+    def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
+        """Compute the constants that world and banks share."""
+
+    def _noise_layout(self) -> NoiseLayout:
+        world = self.world
+        average = 0.5 + self.xp.zeros((1, 8), dtype=self.xp.float64, device=self.device)
+        draws = Draws.counting(average, self.xp)
+        world.begin(draws, self.xp.concat([0.0 * average] * world.initial_normals))
+        return NoiseLayout(draws.used, world.initial_normals, world.normals, world.row_uniforms)
 
     def picture(self) -> Any:
         """Return the :class:`~.rendering.Picture` that draws an episode of this task; None for the general one."""
@@ -157,67 +367,83 @@ class Task(ABC, Generic[State]):
         """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""
         raise ValueError(f"{cls.id} does not take a trajectory as scenario")
 
+    def feedback(self, mean: Array, measurement: Any) -> Any:
+        """Report what an estimate that was made outside the bank gives back to the world; None in an open loop.
+
+        Args:
+            mean: of the estimate, ``(C, N)``.
+            measurement: that it has taken in, or what was told of the start.
+        """
+        return None
+
     def constant(self, values: Any) -> Array:
         """Turn numbers into a float64 array of the task's namespace and device."""
         return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
 
     def columns(self, names: Sequence[str]) -> list[int]:
         """Positions of named fields in the observation."""
-        positions = {f.name: i for i, f in enumerate(self.fields)}
-        return [positions[name] for name in names]
+        return self._blocks.columns(names)
 
-    @abstractmethod
-    def begin(self, uniforms: Array, normals: Array) -> State:
-        """State at the start of the track.
+    def reader(self, name: str) -> Reader:
+        """Return what reads a block or quantity of the observation by its name, uncompressed.
+
+        Raises:
+            ValueError: for a name that is neither.
+        """
+        return self._blocks.reader(name)
+
+    def estimated_outside(self) -> "Task":
+        """Return this task with an :class:`OutsideBank` in place of its bank."""
+        other = copy.copy(self)
+        other.bank = OutsideBank(self)
+        return other
+
+    # --- what the engine calls
+
+    def begin(self, uniforms: Array, normals: Array) -> Episode:
+        """Episode at the start of the track.
 
         Args:
-            uniforms: ``(noise.uniforms, N)``, what fixes the scenario of each episode.
-            normals: ``(noise.initial_normals, N)``, the errors of the track's start.
+            uniforms: ``(noise.uniforms, N)``.
+            normals: ``(noise.initial_normals, N)``.
         """
+        truth, initial = self.world.begin(Draws(uniforms, self.xp), normals)
+        return Episode(truth, initial, self.bank.start(initial))
 
-    @abstractmethod
-    def measure(self, state: State, noise: Array) -> State:
-        """Steps 1 and 2: truth moves on, filters predict, the measurement arrives.
+    def measure(self, episode: Episode, noise: Array) -> Episode:
+        """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        feedback = self.bank.feedback(episode.bank)
+        truth, measurement = self.world.advance(episode.truth, noise, feedback)
+        return Episode(truth, measurement, self.bank.predict(episode.bank, measurement))
 
-        Args:
-            state: after :meth:`begin` or :meth:`act`.
-            noise: ``(noise.normals + noise.row_uniforms, N)``.
-        """
-
-    @abstractmethod
-    def observe(self, state: State) -> Array:
+    def observe(self, episode: Episode) -> Array:
         """Step 3: what the agent is shown, ``(len(fields), N)``."""
+        return self._blocks.observe(episode.bank, episode.measurement)
 
-    @abstractmethod
-    def act(self, state: State, action: Array) -> State:
-        """Step 4: apply the action to the measurement of ``state``.
+    def act(self, episode: Episode, action: Array) -> Episode:
+        """Step 4; the action as :meth:`Bank.act` takes it."""
+        return episode._replace(bank=self.bank.act(episode.bank, episode.measurement, action))
 
-        Args:
-            state: after :meth:`measure`.
-            action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
-        """
+    def mean(self, episode: Episode) -> Array:
+        """Estimate, ``(len(components), N)``, in the units of ``components``."""
+        return self.bank.mean(episode.bank)
 
-    @abstractmethod
-    def cost(self, state: State) -> Array:
-        """Step 5: what the estimate costs, uncapped, ``(N,)``.
+    def cost(self, episode: Episode) -> Array:
+        """Step 5: what the estimate costs, uncapped, ``(N,)``."""
+        return self.world.cost(episode.truth, self.bank.mean(episode.bank))
 
-        A squared error in units of the sensor's nominal variance, or, where the estimate drives a control
-        loop, the quadratic cost of the loop in a fixed unit.
-        """
-
-    @abstractmethod
-    def error(self, state: State) -> Array:
+    def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
+        return self.bank.mean(episode.bank) - self.world.state(episode.truth)
 
-    @abstractmethod
-    def covariance(self, state: State) -> Array:
+    def covariance(self, episode: Episode) -> Array:
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
+        return self.bank.covariance(episode.bank)
 
-    def records(self, state: State) -> dict[str, Array]:
-        """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
-        ``mode_probability``.
-        """
-        return {}
+    def records(self, episode: Episode) -> dict[str, Array]:
+        """What else an evaluation keeps of each measurement."""
+        own = self.bank.records(episode.bank, episode.measurement)
+        return {**own, **self.world.records(episode.truth)}
 
 
 def huber(cost: Array, bound: float, xp: ModuleType) -> Array:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy
 
-from ...envs.maneuvering_target.task import ManeuveringTargetParameters
+from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
 from ...filters import alpha_beta, polar
 
 

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy
 
 from ...envs.catalogue import make_task
+from ...envs.task import Episode, Initial
 from ...filters import alpha_beta, imm, kalman
 from ...filters.gaussian import log_density
 from ..rollout import started_lanes
@@ -45,26 +46,29 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
         **keywords: parameters of the task.
     """
     task: Any = make_task("filtergym/ManeuveringTarget-v0", "gain", scenario, **keywords)
-    lanes = started_lanes(task, episode_seeds("test", seed, episodes))
-    # The filter has just predicted to the first scan; taking that step back gives the start.
-    predicted = lanes.state.estimator
-    start = numpy.concatenate([predicted.position - task.T * predicted.velocity, predicted.velocity])
-    start_variance = 0.5 * task.T**2 * predicted.covariance.velocity
+    starts: list[Initial] = []
+    lanes = started_lanes(
+        task, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
+    )
     action = lanes.widened(numpy.zeros((episodes, 1)))
     measurement, variance, truth = [], [], []
+
+    def act(episode: Episode) -> Episode:
+        measurement.append(episode.measurement.position[:, :episodes])
+        variance.append(episode.measurement.variance[:, :episodes])
+        truth.append(task.world.state(episode.truth)[:, :episodes])
+        return task.act(episode, action)
+
     for _ in range(lanes.decisions_per_episode):
-        state = lanes.state
-        measurement.append(state.measurement[:, :episodes])
-        variance.append(state.variance[:, :episodes])
-        truth.append(numpy.concatenate([state.position, state.velocity])[:, :episodes])
-        lanes.step(lambda state: task.act(state, action))
+        lanes.step(act)
+    (initial,) = starts
     return Recording(
-        start[:, :episodes],
-        start_variance[:, :episodes],
+        initial.mean[:, :episodes],
+        numpy.stack([initial.covariance[i, i, :episodes] for i in range(2)]),
         numpy.stack(measurement),
         numpy.stack(variance),
         numpy.stack(truth),
-        task.T,
+        task.parameters.sampling_interval,
     )
 
 

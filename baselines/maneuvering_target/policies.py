@@ -1,19 +1,20 @@
-"""Policies, reference estimators and the bound of ManeuveringTarget.
+"""Policies of ManeuveringTarget, and the table of all it is compared with.
 
 Equation numbers and readings are those of the task's paper (Bakulev, Sychev, Nguyen).
 """
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy
 
-from ...envs.controls import signed_exponential
-from ...envs.maneuvering_target.task import ManeuveringTarget, Outside, State
-from ...envs.task import Array, Task
-from ...filters import bounds, imm, kalman, polar
+from ...envs.maneuvering_target.banks import GainBank
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.task import Task
+from ...filters import imm
 from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from .references import KalmanInteractingMultipleModel, KnownInputBound, KnownTurn
 
 
 class InteractingMultipleModel(Policy):
@@ -23,13 +24,12 @@ class InteractingMultipleModel(Policy):
 
     def __init__(self, task: ManeuveringTarget) -> None:
         super().__init__(task)
-        self.log_likelihood = task.columns([f"log_likelihood_{m + 1}" for m in range(len(task.modes))])
-        self.log_predicted = task.columns([f"log_predicted_{m + 1}" for m in range(len(task.modes))])
+        self.log_likelihood = task.reader("log_likelihood")
+        self.log_predicted = task.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Posterior mode probabilities, ``(N, M)``."""
-        log_likelihood = signed_exponential(observation[:, self.log_likelihood], numpy)
-        log_predicted = signed_exponential(observation[:, self.log_predicted], numpy)
+        log_predicted, log_likelihood = self.log_predicted(observation), self.log_likelihood(observation)
         return imm.mode_posterior(log_predicted.T, log_likelihood.T).T
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
@@ -62,6 +62,12 @@ class ZeroEvidence(ConstantPolicy):
         self.action = task.paper_policy.action
 
 
+def gain_bank(task: Task) -> GainBank:
+    """Bank of a task under control ``gain``."""
+    assert isinstance(task.bank, GainBank)
+    return task.bank
+
+
 class FixedGain(ConstantPolicy):
     """One alpha-beta filter of constant gain ``alpha``."""
 
@@ -69,7 +75,7 @@ class FixedGain(ConstantPolicy):
 
     def __init__(self, task: ManeuveringTarget, alpha: float) -> None:
         super().__init__(task)
-        self.action = (task.action_for_alpha(alpha),)
+        self.action = (gain_bank(task).action_for_alpha(alpha),)
 
 
 class FixedLow(FixedGain):
@@ -112,165 +118,22 @@ class AdaptiveGain(Policy):
         self.threshold = -2.0 * math.log(false_alarm_probability)
         self.ramp_scans = ramp_scans
         self.low, self.high = min(task.parameters.gains), max(task.parameters.gains)
-        self.squared = task.columns(["log_squared_innovation"])[0]
+        self.squared = task.reader("log_squared_innovation")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Go down the ramp, or start it again at an alarm."""
         step = numpy.where(start, 0, 0 if state is None else state + 1)
-        alarm = numpy.expm1(observation[:, self.squared]) > self.threshold
+        alarm = self.squared(observation)[:, 0] > self.threshold
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)
         step = numpy.where(alarm & may & ~start, 0, step)
         alpha = self.high - (self.high - self.low) * numpy.minimum(step, self.ramp_scans) / self.ramp_scans
-        assert isinstance(self.task, ManeuveringTarget)
-        return self.task.action_for_alpha(alpha)[:, None], step
+        return gain_bank(self.task).action_for_alpha(alpha)[:, None], step
 
 
 class RearmingAdaptiveGain(AdaptiveGain):
     """The same with an alarm during the ramp starting it again: an equally ordinary detector."""
 
     rearm = True
-
-
-class _Track(NamedTuple):
-    mean: Array
-    covariance: Array
-
-
-def _started(task: ManeuveringTarget, state: State) -> _Track:
-    """Estimate that a filter of this task starts from, before the first measurement's update.
-
-    The task's own estimator has just predicted to the first scan; taking that step back gives the start.
-    """
-    mean, covariance = _before_first_scan(task, state)
-    return _Track(mean, covariance)
-
-
-def _before_first_scan(task: ManeuveringTarget, state: State) -> tuple[Array, Array]:
-    estimator: Any = state.estimator
-    if hasattr(estimator, "velocity"):
-        position, velocity = estimator.position, estimator.velocity
-        covariance = task.covariance(state)
-    else:
-        position, velocity = estimator.mean[:2, 0], estimator.mean[2:, 0]
-        covariance = estimator.covariance[:, :, 0]
-    xp = task.xp
-    back, _ = kalman.white_acceleration(-task.T, 0.0, axes=2)
-    F = task.constant(back)[:, :, None]
-    mean = xp.concat([position - task.T * velocity, velocity])
-    return mean, bounds.predicted_bound(covariance, F)
-
-
-class _KalmanReference:
-    """Shared start of the Kalman references: matrices of the constant-velocity model in x and y."""
-
-    def __init__(self, task: ManeuveringTarget) -> None:
-        self.task = task
-        F, Q = kalman.white_acceleration(task.T, 1.0, axes=2)
-        self.F, self.unit_Q = task.constant(F), task.constant(Q)
-        self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-        self.identity = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
-
-    def noise(self, state: State) -> Array:
-        """Covariance of the measurement, evaluated at the measured position, ``(2, 2, N)``."""
-        return self.identity * state.variance
-
-
-class KnownTurn(_KalmanReference):
-    """A Kalman filter that is told in which scans the target manoeuvres, not how.
-
-    Inside a manoeuvre its acceleration noise is as large as the manoeuvre's acceleration, elsewhere zero.
-    """
-
-    knows = "the scans of every manoeuvre and the size of its acceleration"
-
-    def start(self, state: State) -> _Track:
-        """Start where the task's filters start."""
-        return _started(self.task, state)
-
-    def acceleration_sigma(self, state: State) -> Array:
-        """Size per axis of the acceleration in this scan, zero on straight flight, ``(N,)``."""
-        xp, task = self.task.xp, self.task
-        if state.maneuvers is None:
-            rate = task.table[2:, 1:] - task.table[2:, :-1]
-            row = xp.clip(xp.astype(state.scan, xp.int64) - 1, None, rate.shape[1] - 1)
-            change = rate[:, row] / task.T
-            return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
-        m = state.maneuvers
-        total = 0.0 * state.scan
-        for slot in range(task.slots):
-            active = xp.astype((state.scan >= m.first[slot]) & (state.scan <= m.last[slot]), total.dtype)
-            speed2 = state.velocity[0] ** 2 + state.velocity[1] ** 2
-            turn2 = (m.velocity_along[slot] ** 2 + m.velocity_across[slot] ** 2) * speed2 / task.T**2
-            thrust2 = m.acceleration[0, slot] ** 2 + m.acceleration[1, slot] ** 2
-            total = total + active * 0.5 * (thrust2 + turn2)
-        return xp.sqrt(total)
-
-    def update(self, state: State, memory: _Track) -> tuple[State, _Track]:
-        """Predict with the noise of this scan and update with its measurement."""
-        Q = self.unit_Q[:, :, None] * self.acceleration_sigma(state) ** 2
-        mean, covariance = kalman.predict(memory.mean, memory.covariance, self.F, Q)
-        result = kalman.update(mean, covariance, state.measurement, self.H, self.noise(state))
-        track = _Track(result.mean, result.covariance)
-        return state._replace(estimator=Outside(*track)), track
-
-
-class KalmanBank(NamedTuple):
-    """Memory of the IMM over Kalman filters."""
-
-    mean: Array
-    covariance: Array
-    probabilities: Array
-
-
-class KalmanInteractingMultipleModel(_KalmanReference):
-    """The usual IMM over two Kalman filters: no manoeuvre, and white acceleration of 2.775 m/s^2."""
-
-    knows = "nothing hidden, but its filters are outside what the action can steer"
-    sigmas: ClassVar[tuple[float, float]] = (0.0, 2.775)
-
-    def start(self, state: State) -> KalmanBank:
-        """Start both filters where the task's filters start."""
-        task, xp = self.task, self.task.xp
-        track = _started(task, state)
-        half = 0.5 + 0.0 * track.mean[:2]
-        return KalmanBank(xp.stack([track.mean] * 2, axis=1), xp.stack([track.covariance] * 2, axis=2), half)
-
-    def update(self, state: State, memory: KalmanBank) -> tuple[State, KalmanBank]:
-        """One IMM cycle."""
-        task, xp = self.task, self.task.xp
-        transition = task.constant([[0.9, 0.1], [0.1, 0.9]])
-        prediction = imm.predict_mode_probabilities(transition, memory.probabilities)
-        mean, covariance = imm.mix(memory.mean, memory.covariance, prediction.mixing)
-        results = []
-        for j, sigma in enumerate(self.sigmas):
-            predicted = kalman.predict(mean[:, j], covariance[:, :, j], self.F, sigma**2 * self.unit_Q)
-            results.append(kalman.update(*predicted, state.measurement, self.H, self.noise(state)))
-        log_likelihood = xp.stack([r.log_likelihood for r in results])
-        probabilities = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
-        bank = KalmanBank(
-            xp.stack([r.mean for r in results], axis=1),
-            xp.stack([r.covariance for r in results], axis=2),
-            probabilities,
-        )
-        return state._replace(estimator=Outside(*imm.combine(*bank))), bank
-
-
-class KnownInputBound(_KalmanReference):
-    """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
-
-    knows = "the acceleration in every scan"
-
-    def start(self, state: State) -> Array:
-        """Covariance of the start."""
-        return _before_first_scan(self.task, state)[1]
-
-    def update(self, state: State, memory: Array) -> tuple[Array, Array]:
-        """Bound after this scan: the diagonal of the covariance recursion at the true position."""
-        task, p = self.task, self.task.parameters
-        P = bounds.predicted_bound(memory, self.F[:, :, None])
-        variance = polar.cartesian_variances(state.position, p.range_sigma, task.bearing_sigma)
-        P = bounds.posterior_cramer_rao_bound(P, self.H, self.identity * variance)
-        return task.xp.stack([P[i, i] for i in range(4)]), P
 
 
 def _gains(values: Mapping[str, float]) -> tuple[float, float]:

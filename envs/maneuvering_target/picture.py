@@ -23,8 +23,9 @@ from ..rendering import (
     Strip,
     grown,
 )
-from ..task import Task
-from .task import AlphaBeta, Bank, ManeuveringTarget, State
+from ..task import Episode, Task
+from .banks import AlphaBeta, Filters
+from .task import ManeuveringTarget
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the covariance ellipse, standard deviations."""
@@ -68,10 +69,10 @@ class ManeuveringTargetPicture(Picture):
 
     # --- the history
 
-    def records(self, state: State) -> dict[str, float]:
+    def records(self, state: Episode) -> dict[str, float]:
         """Positions in km, innovation, gain or weights, position error with its reported sigma."""
-        task, estimator = self.task, state.estimator
-        true, measured = state.position[:, 0], state.measurement[:, 0]
+        task, estimator = self.task, state.bank
+        true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         error = task.error(state)[:2, 0]
         P = task.covariance(state)[:2, :2, 0]
         values = {
@@ -92,7 +93,7 @@ class ManeuveringTargetPicture(Picture):
             variance = estimator.innovation_variance[:, 0]
             values["alpha"] = estimator.alpha[0]
         else:
-            assert isinstance(estimator, Bank)
+            assert isinstance(estimator, Filters)
             predicted = numpy.exp(estimator.log_predicted)
             mean, S = imm.combine(estimator.innovation, estimator.innovation_covariance, predicted)
             innovation, variance = mean[:, 0], numpy.diagonal(S[:, :, 0])
@@ -100,16 +101,16 @@ class ManeuveringTargetPicture(Picture):
         normalised = innovation / numpy.sqrt(variance)
         return {**values, "innovation_x": normalised[0], "innovation_y": normalised[1]}
 
-    def begin(self, state: State) -> None:
+    def begin(self, state: Episode) -> None:
         """Fly the whole episode ahead, for limits that need not move; the truth does not depend on noise."""
-        task = self.task
-        still = numpy.zeros((task.noise.normals, state.position.shape[-1]))
+        world, truth, measurement = self.task.world, state.truth, state.measurement
+        still = numpy.zeros((world.normals, truth.position.shape[-1]))
         positions, velocities, sigmas = [], [], []
-        for _ in range(task.horizon + 1):
-            positions.append(state.position[:, 0])
-            velocities.append(state.velocity[:, 0])
-            sigmas.append(numpy.sqrt(state.variance[:, 0].max()))
-            state = task.measure(state, still)
+        for _ in range(self.task.horizon + 1):
+            positions.append(truth.position[:, 0])
+            velocities.append(truth.velocity[:, 0])
+            sigmas.append(numpy.sqrt(measurement.variance[:, 0].max()))
+            truth, measurement = world.advance(truth, still, None)
         self.flight = numpy.stack(positions, axis=1) / 1e3
         self.largest_sigma = max(sigmas) / 1e3
         change = numpy.diff(numpy.stack(velocities, axis=1), axis=1)
@@ -228,9 +229,9 @@ class ManeuveringTargetPicture(Picture):
         self.close_up.set_xlim(-reach, reach)
         self.close_up.set_ylim(-reach, reach)
 
-    def draw(self, history: History, state: State) -> None:
+    def draw(self, history: History, state: Episode) -> None:
         """Move everything to where it is now."""
-        self.arrived.set_data(state.measurement[:1, 0] / 1e3, state.measurement[1:2, 0] / 1e3)
+        self.arrived.set_data(*(state.measurement.position[:, :1] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}
         true, measured, estimated = pairs["true"], pairs["measured"], pairs["estimated"]
         self.true.set_data(*true)

@@ -1,0 +1,101 @@
+"""The uniform numbers that fix an episode, handed out by name and distribution.
+
+A world asks for what it needs in a fixed order, and how many numbers that takes is counted by asking once
+without any (:meth:`Draws.counting`). What was drawn is kept under its name: an episode's levels, times and
+kinds are its context.
+"""
+
+import math
+from collections.abc import Sequence
+from types import ModuleType
+
+from .observation import Array
+
+
+class Draws:
+    """Uniform numbers on [0, 1) in order.
+
+    Every method takes the name of what is drawn and, with ``count``, draws ``(count, N)`` of it in place of
+    ``(N,)``.
+
+    Args:
+        uniforms: ``(rows, N)``.
+        xp: array namespace.
+
+    Attributes:
+        drawn: what was drawn, by name.
+    """
+
+    def __init__(self, uniforms: Array, xp: ModuleType) -> None:
+        self.xp = xp
+        self.used = 0
+        self.drawn: dict[str, Array] = {}
+        self._uniforms = uniforms
+        self._average: Array = None
+
+    @classmethod
+    def counting(cls, average: Array, xp: ModuleType) -> "Draws":
+        """Draws that always give one half and count in ``used`` what is asked for.
+
+        Args:
+            average: ``(1, N)``, all one half.
+            xp: array namespace.
+        """
+        draws = cls(average, xp)
+        draws._average = average
+        return draws
+
+    def _rows(self, count: int | None) -> Array:
+        first = self.used
+        self.used += 1 if count is None else count
+        if self._average is not None:
+            return (
+                self._average[0] if count is None else self.xp.concat([self._average] * max(count, 1))[:count]
+            )
+        return self._uniforms[first] if count is None else self._uniforms[first : self.used]
+
+    def _kept(self, name: str, values: Array) -> Array:
+        if name in self.drawn:
+            raise ValueError(f"{name!r} is drawn twice")
+        self.drawn[name] = values
+        return values
+
+    def unit(self, name: str, count: int | None = None) -> Array:
+        """Uniform on [0, 1)."""
+        return self._kept(name, self._rows(count))
+
+    def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
+        """Uniform between two limits."""
+        low, high = limits
+        return self._kept(name, low + (high - low) * self._rows(count))
+
+    def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
+        """Between two positive limits, with a uniform logarithm."""
+        low, high = limits
+        return self._kept(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
+
+    def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
+        """Whole number from the first to the last, all equally probable, as a float."""
+        first, last = limits
+        return self._kept(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
+
+    def event(self, name: str, probability: float, count: int | None = None) -> Array:
+        """Boolean, true with a probability."""
+        return self._kept(name, self._rows(count) < probability)
+
+    def category(self, name: str, thresholds: Sequence[Array]) -> Array:
+        """Index drawn by the inverse of a cumulative distribution, ``(N,)`` of integers.
+
+        Args:
+            name: of what is drawn.
+            thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
+        """
+        return self._kept(name, category(self._rows(None), thresholds, self.xp))
+
+
+def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Array:
+    """Index of the interval between cumulative ``thresholds`` that a uniform number falls into, ``(N,)``."""
+    index = xp.zeros_like(uniform, dtype=xp.int64)
+    for threshold in thresholds:
+        index = index + xp.astype(uniform >= threshold, xp.int64)
+    return index

@@ -1,0 +1,83 @@
+"""Every constant of ManeuveringTarget, with its limits."""
+
+from dataclasses import dataclass
+
+from ..parameters import TaskParameters, parameter, sized, square_matrix
+
+
+@dataclass(frozen=True)
+class ManeuveringTargetParameters(TaskParameters):
+    """Every constant of the task; each is a keyword of ``gym.make``."""
+
+    sampling_interval: float = parameter(6.0, above=0.0)
+    """Scan period T, s (paper)."""
+    horizon: int = parameter(100, at_least=1)
+    """Scans acted on in one episode (paper: the axis of its figure 5)."""
+    range_sigma: float = parameter(100.0, above=0.0)
+    """Standard deviation of the range, m (paper)."""
+    bearing_sigma: float = parameter(0.25, above=0.0, below=90.0)
+    """Standard deviation of the azimuth, degrees (paper)."""
+    polar_measurements: bool = False
+    """False: independent errors along x and y with variances (22), (23) (paper). True: errors of range and
+    azimuth, converted to x and y."""
+    gains: tuple[float, ...] = parameter((0.3, 0.7), above=0.0, below=1.0)
+    """Position gains alpha of the bank's filters (paper)."""
+    transition: tuple[tuple[float, ...], ...] = parameter(
+        ((0.9, 0.1), (0.1, 0.9)), at_least=0.0, at_most=1.0, stochastic=True
+    )
+    """Mode transition probabilities, row = from, column = to (paper)."""
+    initial_probabilities: tuple[float, ...] = parameter(
+        (0.5, 0.5), at_least=0.0, at_most=1.0, stochastic=True
+    )
+    """Mode probabilities at the start (paper)."""
+    alpha_range: tuple[float, float] = parameter((0.05, 0.95), above=0.0, below=1.0, ascending=True)
+    """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best
+    schedule that knows the manoeuvre, which uses 0.07 to 0.88)."""
+    evidence_scale: float = parameter(4.0, above=0.0)
+    """Nats that an evidence of one adds to a mode's log-posterior (ours)."""
+    averaging_measurements: float = parameter(5.0, at_least=1.0)
+    """Time constant of the exponential averages in the observation, scans (ours)."""
+    flight: str = parameter("random", choices=("maneuver", "random", "legs", "track"))
+    """"maneuver": one manoeuvre at stated scans (paper). "random": drawn for each episode. "legs": straight
+    legs and exact turns. "track": a table of states."""
+    initial_position: tuple[float, float] = (-10000.0, 5000.0)
+    """x and y at the start, m, of flights "maneuver" and "legs" (paper)."""
+    initial_velocity: tuple[float, float] = (100.0, 0.0)
+    """m/s (paper)."""
+    acceleration: tuple[float, float] = (-2.775, -2.775)
+    """Acceleration during the manoeuvre of flight "maneuver", m/s^2 (paper)."""
+    maneuver_steps: tuple[int, int] = parameter((50, 55), at_least=1, ascending=True)
+    """First and last scan that carry it. Reading: x(k) = F x(k-1) + B w(k) with w at k = 50 to 55, six
+    steps, because five would not turn the velocity by 90 degrees."""
+    legs: tuple[tuple[float, float], ...] = ()
+    """Duration (s) and turn rate (deg/s) of each leg of flight "legs"."""
+    track: tuple[tuple[float, ...], ...] = ()
+    """Rows x, y, vx, vy, each with horizon + 2 values one scan apart, of flight "track"."""
+    start_range: tuple[float, float] = parameter((5e3, 60e3), above=0.0, ascending=True)
+    """Limits of the range at the start of a random flight, m (ours)."""
+    speed: tuple[float, float] = parameter((60.0, 300.0), above=0.0, ascending=True)
+    """Limits of the speed at its start, m/s (ours)."""
+    maneuver_count: tuple[int, int] = parameter((0, 3), at_least=0, ascending=True)
+    """Limits of the number of its manoeuvres (ours)."""
+    maneuver_duration: tuple[int, int] = parameter((3, 12), at_least=1, ascending=True)
+    """Limits of their duration, scans (ours)."""
+    maneuver_acceleration: tuple[float, float] = parameter((0.5, 6.0), at_least=0.0, ascending=True)
+    """Limits of their acceleration, m/s^2 (ours)."""
+
+    def check(self) -> None:
+        """Check what concerns several fields together."""
+        modes = len(self.gains)
+        if modes < 2:
+            raise ValueError(f"gains must name at least two filters, got {self.gains!r}")
+        square_matrix("transition", self.transition, modes)
+        sized("initial_probabilities", self.initial_probabilities, modes)
+        for i, leg in enumerate(self.legs):
+            if leg[0] <= 0.0:
+                raise ValueError(f"legs[{i}][0] must be a duration above 0 s, got {leg[0]!r}")
+        if self.flight == "legs" and not self.legs:
+            raise ValueError('flight "legs" needs at least one leg (duration in s, turn rate in deg/s)')
+        if self.flight == "track":
+            if len(self.track) != 4:
+                raise ValueError(f"track must have the four rows x, y, vx, vy, got {len(self.track)} rows")
+            for row, name in zip(self.track, ("x", "y", "vx", "vy"), strict=True):
+                sized(f"track {name}", row, self.horizon + 2)

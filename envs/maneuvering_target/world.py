@@ -1,0 +1,224 @@
+"""The flight of ManeuveringTarget, and the radar that measures it; equations in ``filters/polar.py``."""
+
+import math
+from typing import NamedTuple
+
+from ...filters import polar
+from ...filters.ordered_sums import ordered_sum
+from ..draws import Draws
+from ..observation import Array
+from ..task import Initial, Task, World
+from ..trajectory import flown_legs
+from .parameters import ManeuveringTargetParameters
+
+
+class Maneuvers(NamedTuple):
+    """Manoeuvres of a flight: what each adds in every scan from its first to its last."""
+
+    first: Array
+    """Scan number, ``(manoeuvres, N)``."""
+    last: Array
+    """Scan number, included, ``(manoeuvres, N)``."""
+    effect: Array
+    """``(6, manoeuvres, N)``: the four of a turn and the two of thrust, as the properties below name them; one
+    array, because the truth picks from all of them in every scan."""
+
+    @property
+    def velocity_along(self) -> Array:
+        """Velocity added per velocity: cos(theta) - 1 of a turn by theta, ``(manoeuvres, N)``."""
+        return self.effect[0]
+
+    @property
+    def velocity_across(self) -> Array:
+        """Velocity added per velocity turned by +90 degrees: sin(theta)."""
+        return self.effect[1]
+
+    @property
+    def position_along(self) -> Array:
+        """Displacement added per velocity, s."""
+        return self.effect[2]
+
+    @property
+    def position_across(self) -> Array:
+        """Displacement added per turned velocity, s."""
+        return self.effect[3]
+
+    @property
+    def acceleration(self) -> Array:
+        """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+        return self.effect[4:]
+
+
+class Truth(NamedTuple):
+    """The aircraft."""
+
+    scan: Array
+    """Number of the current scan, ``(N,)``."""
+    position: Array
+    """m, ``(2, N)``."""
+    velocity: Array
+    """m/s, ``(2, N)``."""
+    maneuvers: Maneuvers | None
+    """None where the flight is a table."""
+
+
+class Measurement(NamedTuple):
+    """What the radar says; every scan has a measurement."""
+
+    scan: Array
+    """Scans since the start of the track, ``(N,)``; one scan is ``sampling_interval`` seconds."""
+    position: Array
+    """x and y, m, ``(2, N)``."""
+    variance: Array
+    """Variances of their errors, evaluated at the measured position, m^2, ``(2, N)``. Reading: those at the true
+    position would show it."""
+
+
+class RadarWorld(World[Task, Truth, Measurement]):
+    """An aircraft and a surveillance radar at the origin."""
+
+    parameters: ManeuveringTargetParameters
+    initial_normals = 4
+    normals = 2
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        p = self.parameters
+        self.bearing_sigma = math.radians(p.bearing_sigma)
+        self.slots = {"maneuver": 1, "random": p.maneuver_count[1], "legs": 0, "track": 0}[p.flight]
+        """Manoeuvres that a flight may have."""
+        self.table: Array = None
+        """Rows x, y, vx, vy of a flight that is a table, ``(4, horizon + 2)``."""
+        if p.flight == "legs":
+            self.table = task.constant(
+                flown_legs(p.initial_position, p.initial_velocity, p.legs, p.sampling_interval, p.horizon + 2)
+            )
+        elif p.flight == "track":
+            self.table = task.constant(p.track)
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
+        """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""
+        xp, p, constant = self.xp, self.parameters, self.task.constant
+        ones = xp.ones_like(normals[0])
+        if p.flight == "random":
+            position, velocity, maneuvers = self._random_flight(draws)
+        elif self.table is not None:
+            position = self.table[:2, 0, None] * ones
+            velocity = self.table[2:, 0, None] * ones
+            maneuvers = None
+        else:
+            position = constant(p.initial_position)[:, None] * ones
+            velocity = constant(p.initial_velocity)[:, None] * ones
+            once = ones[None]
+            first, last = p.maneuver_steps
+            effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
+            maneuvers = Maneuvers(first * once, last * once, effect)
+        sigma = xp.sqrt(polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma))
+        start = position + sigma * normals[:2]
+        start_velocity = velocity + (math.sqrt(2.0) / p.sampling_interval) * sigma * normals[2:]
+        # The start is a measurement too: its variance is evaluated where it puts the target.
+        variance = polar.cartesian_variances(start, p.range_sigma, self.bearing_sigma)
+        diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
+        identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
+        truth = Truth(0.0 * ones, position, velocity, maneuvers)
+        return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
+
+    def _random_flight(self, draws: Draws) -> tuple[Array, Array, Maneuvers]:
+        """Draw a start and manoeuvres that do not overlap, each drawn as thrust or coordinated turn."""
+        xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
+        circle = (0.0, 2.0 * math.pi)
+        start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", circle)
+        speed, course = draws.uniform("speed", p.speed), draws.uniform("course", circle)
+        position = start_range * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
+        velocity = speed * xp.stack([xp.cos(course), xp.sin(course)])
+        flown = xp.arange(self.slots, device=self.task.device)[:, None] < draws.integer(
+            "maneuver_count", p.maneuver_count
+        )
+        duration = xp.where(flown, draws.integer("duration", p.maneuver_duration, self.slots), 0.0)
+        # Sorted starts within the time that the manoeuvres leave free, each moved on by those before it.
+        order = xp.sort(xp.where(flown, draws.unit("order", self.slots), 2.0), axis=0)
+        acceleration = draws.uniform("acceleration", p.maneuver_acceleration, self.slots)
+        direction = draws.uniform("direction", circle, self.slots)
+        coordinated = draws.event("coordinated", 0.5, self.slots)
+        if not self.slots:
+            empty = 0.0 * duration
+            return position, velocity, Maneuvers(empty, empty, xp.stack([empty] * 6))
+        free = xp.clip(p.horizon - ordered_sum(duration), 1.0, None)
+        before = 0.0 * free
+        columns: list[tuple[Array, ...]] = []
+        now = velocity
+        for m in range(self.slots):
+            first = xp.where(flown[m], 1.0 + before + xp.floor(order[m] * free), p.horizon + 10.0)
+            before = before + duration[m]
+            pace = xp.clip(xp.sqrt(now[0] ** 2 + now[1] ** 2), 30.0, None)
+            side = xp.where(direction[m] < math.pi, 1.0, -1.0)
+            theta = xp.where(coordinated[m], side * acceleration[m] * (T / pace), 0.0)
+            turning = xp.abs(theta) > 1e-9
+            divisor = xp.where(turning, theta, 1.0)
+            thrust = xp.where(coordinated[m], 0.0, acceleration[m])
+            vector = thrust * xp.stack([xp.cos(direction[m]), xp.sin(direction[m])])
+            effect = [
+                xp.cos(theta) - 1.0,
+                xp.sin(theta),
+                xp.where(turning, T * (xp.sin(theta) / divisor - 1.0), 0.0),
+                xp.where(turning, T * (1.0 - xp.cos(theta)) / divisor, 0.0),
+                vector[0],
+                vector[1],
+            ]
+            columns.append((first, first + duration[m] - 1.0, xp.stack(effect)))
+            total = theta * duration[m]
+            cosine, sine = xp.cos(total), xp.sin(total)
+            turned = xp.stack([cosine * now[0] - sine * now[1], sine * now[0] + cosine * now[1]])
+            now = turned + (T * duration[m]) * vector
+        return (
+            position,
+            velocity,
+            Maneuvers(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))),
+        )
+
+    def _flown(self, truth: Truth, scan: Array) -> tuple[Array, Array]:
+        """Position and velocity at the next scan."""
+        xp, T, m = self.xp, self.parameters.sampling_interval, truth.maneuvers
+        if m is None:
+            last = int(self.table.shape[1]) - 1
+            row = xp.clip(xp.astype(scan, xp.int64), None, last)
+            return self.table[:2, row], self.table[2:, row]
+        position, velocity = truth.position + T * truth.velocity, truth.velocity
+        if not self.slots:
+            return position, velocity
+        active = xp.astype((scan >= m.first) & (scan <= m.last), position.dtype)
+        # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
+        effects = active * m.effect
+        effect = ordered_sum(effects[:, slot] for slot in range(self.slots))
+        acceleration = effect[4:]
+        position = position + (0.5 * T**2) * acceleration
+        velocity = velocity + T * acceleration
+        if self.parameters.flight == "random":
+            across = xp.stack([-truth.velocity[1], truth.velocity[0]])
+            position = position + (effect[2] * truth.velocity + effect[3] * across)
+            velocity = velocity + (effect[0] * truth.velocity + effect[1] * across)
+        return position, velocity
+
+    def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
+        """Fly one scan and measure."""
+        xp, p = self.xp, self.parameters
+        scan = truth.scan + 1.0
+        position, velocity = self._flown(truth, scan)
+        if p.polar_measurements:
+            radius = xp.sqrt(position[0] ** 2 + position[1] ** 2) + p.range_sigma * noise[0]
+            azimuth = xp.atan2(position[1], position[0]) + self.bearing_sigma * noise[1]
+            measured = radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
+        else:
+            true_variance = polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma)
+            measured = position + xp.sqrt(true_variance) * noise
+        variance = polar.cartesian_variances(measured, p.range_sigma, self.bearing_sigma)
+        return Truth(scan, position, velocity, truth.maneuvers), Measurement(scan, measured, variance)
+
+    def state(self, truth: Truth) -> Array:
+        """Position and velocity, ``(4, N)``."""
+        return self.xp.concat([truth.position, truth.velocity])
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Squared position error over the squared range sigma."""
+        scaled = (mean[:2] - truth.position) * (1.0 / self.parameters.range_sigma)
+        return scaled[0] * scaled[0] + scaled[1] * scaled[1]

@@ -1,0 +1,195 @@
+"""What an agent is shown, written once: a list of blocks gives fields, observation and decoding.
+
+A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
+:class:`Compression` that says how it is shown. The base class of the banks derives the observation from the
+list, and a :class:`Reader` for whoever wants a quantity back: policies never undo a compression by hand.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any, Literal, NamedTuple
+
+import numpy
+
+Array = Any
+
+
+class Field(NamedTuple):
+    """One component of the observation."""
+
+    name: str
+    unit: str
+    """Unit of the value as shown; "1" for a pure number."""
+    description: str
+    """What it is and how it is scaled."""
+    over_interval: Literal["last", "mean"] = "last"
+    """How the component is shown when one action holds for several measurements: the value at the last
+    one, or the mean over all of them."""
+
+
+class Compression(NamedTuple):
+    """How a value is shown, and how it is read back."""
+
+    text: str
+    """Put in front of the description of a block."""
+    forward: Callable[[Array, ModuleType], Array] | None
+    """From the value to what is shown; None where it is shown as it is."""
+    inverse: Callable[[numpy.ndarray], numpy.ndarray] | None
+    """From what is shown to the value; None where they are the same."""
+
+
+def signed_logarithm(value: Array, xp: ModuleType) -> Array:
+    """Compress large values invertibly: ``sign(x) log(1 + |x|)``, close to x near zero."""
+    return xp.sign(value) * xp.log1p(xp.abs(value))
+
+
+def signed_exponential(value: Array, xp: ModuleType) -> Array:
+    """Inverse of :func:`signed_logarithm`."""
+    return xp.sign(value) * xp.expm1(xp.abs(value))
+
+
+PLAIN = Compression("", None, None)
+SIGNED_LOG = Compression(
+    "sign(x) log(1 + |x|) of ", signed_logarithm, lambda shown: signed_exponential(shown, numpy)
+)
+KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1)
+"""The block's function returns log(1 + x) already, because the filters keep that; reading gives x."""
+LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1)
+KEPT_AS_LOG = Compression("log of ", None, numpy.exp)
+"""The block's function returns the logarithm already; reading gives the value."""
+
+
+def scaled(factor: float, offset: float = 0.0) -> Compression:
+    """``factor (x - offset)``, where the unit of the field says what is left to say."""
+    return Compression("", lambda value, xp: factor * (value - offset), lambda shown: shown / factor + offset)
+
+
+class Block(NamedTuple):
+    """One quantity of the observation."""
+
+    name: str
+    value: Callable[[Any, Any], Array]
+    """From the bank's state and the measurement to ``(parts, N)``, or ``(..., N)`` with the parts in the order
+    of their rows, or ``(N,)`` where there is only one."""
+    text: str
+    """What it is."""
+    parts: Sequence[str] = ()
+    """Endings that tell its components apart: the fields are ``name_part``. None: one field, ``name``."""
+    shown: Compression = PLAIN
+    unit: str = "1"
+    """Unit of what is shown."""
+    over_interval: Literal["last", "mean"] = "last"
+
+
+class Quantity(NamedTuple):
+    """What can be computed from an observation, such as an innovation in metres."""
+
+    name: str
+    unit: str
+    text: str
+    value: Callable[[Callable[[str], numpy.ndarray]], numpy.ndarray]
+    """From a function that reads blocks and other quantities by name to ``(N, parts)``."""
+
+
+Reader = Callable[[numpy.ndarray], numpy.ndarray]
+"""From observations ``(N, fields)`` to the values of one block or quantity, ``(N, parts)``."""
+
+
+class Blocks:
+    """An observation made of blocks.
+
+    Args:
+        blocks: in the order of the observation.
+        quantities: what else can be read from it.
+        xp: array namespace.
+
+    Raises:
+        ValueError: if two fields, or two blocks or quantities, have the same name.
+    """
+
+    def __init__(self, blocks: Sequence[Block], quantities: Sequence[Quantity], xp: ModuleType) -> None:
+        self.blocks = tuple(blocks)
+        self.quantities = {quantity.name: quantity for quantity in quantities}
+        self.xp = xp
+        self.fields: tuple[Field, ...] = tuple(
+            Field(name, block.unit, block.shown.text + block.text, block.over_interval)
+            for block in self.blocks
+            for name in _field_names(block)
+        )
+        names = [field.name for field in self.fields]
+        known = [*(block.name for block in self.blocks), *self.quantities]
+        for table in (names, known):
+            if len(set(table)) != len(table):
+                raise ValueError(f"names of an observation must differ, got {table}")
+        # One call of a compression for all blocks that share it: calls cost more than numbers.
+        shared: dict[int, list[int]] = {}
+        for i, block in enumerate(self.blocks):
+            if block.shown.forward is not None:
+                shared.setdefault(id(block.shown.forward), []).append(i)
+        self._shared = [
+            (
+                self.blocks[members[0]].shown.forward,
+                members,
+                [len(_field_names(self.blocks[i])) for i in members],
+            )
+            for members in shared.values()
+        ]
+        self._values = [block.value for block in self.blocks]
+
+    def observe(self, state: Any, measurement: Any) -> Array:
+        """What is shown, ``(fields, N)``."""
+        xp = self.xp
+        values = []
+        for function in self._values:
+            value = function(state, measurement)
+            if value.ndim != 2:
+                value = value[None] if value.ndim == 1 else xp.reshape(value, (-1, value.shape[-1]))
+            values.append(value)
+        for forward, members, widths in self._shared:
+            if len(members) == 1:
+                values[members[0]] = forward(values[members[0]], xp)
+                continue
+            together = forward(xp.concat([values[i] for i in members]), xp)
+            first = 0
+            for i, width in zip(members, widths, strict=True):
+                values[i] = together[first : first + width]
+                first += width
+        return xp.concat(values)
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Positions of named fields."""
+        positions = {field.name: i for i, field in enumerate(self.fields)}
+        return [positions[name] for name in names]
+
+    @functools.cached_property
+    def _slices(self) -> dict[str, slice]:
+        slices, first = {}, 0
+        for block in self.blocks:
+            width = len(_field_names(block))
+            slices[block.name] = slice(first, first + width)
+            first += width
+        return slices
+
+    def reader(self, name: str) -> Reader:
+        """Return what reads a block, uncompressed, or a quantity from observations.
+
+        Raises:
+            ValueError: for a name that is neither.
+        """
+        if name in self._slices:
+            part, inverse = self._slices[name], {b.name: b.shown.inverse for b in self.blocks}[name]
+            if inverse is None:
+                return lambda observation: observation[:, part]
+            return lambda observation: inverse(observation[:, part])
+        if name in self.quantities:
+            value = self.quantities[name].value
+            return lambda observation: value(lambda other: self.reader(other)(observation))
+        raise ValueError(
+            f"unknown quantity {name!r} of the observation: choose from "
+            f"{', '.join([*self._slices, *self.quantities])}"
+        )
+
+
+def _field_names(block: Block) -> list[str]:
+    return [f"{block.name}_{part}" for part in block.parts] if block.parts else [block.name]
