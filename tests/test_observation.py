@@ -1,0 +1,96 @@
+"""Observations made of blocks: what is shown, and what is read back."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.observation import (
+    KEPT_AS_LOG1P,
+    LOG1P,
+    SIGNED_LOG,
+    Block,
+    Blocks,
+    Quantity,
+    scaled,
+)
+
+BLOCKS = (
+    Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
+    Block("b", lambda state, measurement: state.b + measurement, "one number"),
+    Block("c", lambda state, _: state.c, "kept as a logarithm", shown=KEPT_AS_LOG1P),
+    Block("d", lambda state, _: state.d, "four numbers in two axes", ("1x", "1y", "2x", "2y"), SIGNED_LOG),
+    Block("e", lambda state, _: state.e, "scaled", shown=scaled(0.1, 45.0), unit="10 dB"),
+    Block("f", lambda state, _: state.f, "a square", shown=LOG1P),
+)
+QUANTITIES = (
+    Quantity("sum", "m", "a and b", lambda read: read("a") + read("b")),
+    Quantity("twice", "m", "of the sum", lambda read: 2.0 * read("sum")),
+)
+
+
+@pytest.fixture
+def state():
+    rng = np.random.default_rng(0)
+    return SimpleNamespace(
+        a=1e3 * rng.normal(size=(2, 8)),
+        b=rng.normal(size=8),
+        c=np.log1p(np.arange(8.0)),
+        d=rng.normal(size=(2, 2, 8)),
+        e=np.arange(40.0, 48.0),
+        f=np.arange(8.0) ** 2,
+    )
+
+
+def test_blocks_give_fields_and_observation(state):
+    blocks = Blocks(BLOCKS, QUANTITIES, np)
+    names = [field.name for field in blocks.fields]
+    assert names == ["a_x", "a_y", "b", "c", "d_1x", "d_1y", "d_2x", "d_2y", "e", "f"]
+    assert blocks.fields[0].description == "sign(x) log(1 + |x|) of two numbers"
+    assert blocks.fields[8].unit == "10 dB"
+    signed = np.sign(state.a) * np.log1p(abs(state.a))
+    deep = state.d.reshape(4, 8)
+    expected = np.concatenate(
+        [
+            signed,
+            (state.b + 0.5)[None],
+            state.c[None],
+            np.sign(deep) * np.log1p(abs(deep)),
+            0.1 * (state.e - 45.0)[None],
+            np.log1p(state.f)[None],
+        ]
+    )
+    np.testing.assert_array_equal(blocks.observe(state, 0.5), expected)
+    assert blocks.columns(["d_1y", "a_x"]) == [5, 0]
+
+
+def test_readers_undo_what_the_observation_does(state):
+    blocks = Blocks(BLOCKS, QUANTITIES, np)
+    observation = blocks.observe(state, 0.5).T
+    for name, value in (("a", state.a.T), ("c", np.arange(8.0)[:, None]), ("e", state.e[:, None])):
+        # Logarithm and exponential round once each.
+        np.testing.assert_allclose(blocks.reader(name)(observation), value, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(blocks.reader("d")(observation), state.d.reshape(4, 8).T, rtol=1e-13)
+    total = state.a.T + (state.b + 0.5)[:, None]
+    np.testing.assert_allclose(blocks.reader("twice")(observation), 2.0 * total, rtol=1e-13)
+
+
+def test_unknown_names_and_names_said_twice():
+    blocks = Blocks(BLOCKS, QUANTITIES, np)
+    with pytest.raises(ValueError, match="unknown quantity 'g' of the observation: choose from a, b"):
+        blocks.reader("g")
+    with pytest.raises(ValueError, match="names of an observation must differ"):
+        Blocks((*BLOCKS, BLOCKS[0]), (), np)
+
+
+def test_innovation_in_metres_is_the_measured_minus_the_predicted_position():
+    task = make_task("filtergym/ManeuveringTarget-v0", "gain", "random")
+    rng = np.random.default_rng(5)
+    episode = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+    for _ in range(20):
+        episode = task.measure(episode, rng.normal(size=(2, 8)))
+        read = task.reader("innovation_in_metres")(task.observe(episode).T)
+        expected = (episode.measurement.position - episode.bank.predicted).T
+        # The share 1 - R/S that it is read from cancels digits when S is little larger than R.
+        np.testing.assert_allclose(read, expected, rtol=1e-12, atol=1e-9)
+        episode = task.act(episode, np.zeros((1, 8)))
