@@ -39,7 +39,6 @@ CALLS = [
     (alpha_beta.predict_covariance, (P2, 6.0)),
     (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.variance_reduction, (ALPHA, BETA)),
-    (alpha_beta.acceleration_lag, (ALPHA, BETA, 6.0, Z2)),
     (
         alpha_beta.propagate_error,
         (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),

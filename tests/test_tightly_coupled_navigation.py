@@ -5,7 +5,8 @@ import pytest
 from filtergym.envs.tightly_coupled_navigation import task as navigation
 from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
 from filtergym.envs.tightly_coupled_navigation.task import Parameters, TightlyCoupledNavigation
-from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.filters import gnss_ins
+from naive import dense
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
 
@@ -63,7 +64,7 @@ def naive_bank(task, state, posterior):
         mean, P = F @ mean, F @ P @ F.T + task.process_noise[:, :, i, 0]
         position, velocity = task.satellites_now(state)
         expected, rows = gnss_ins.observe(mean[:, None], position, velocity, state.ins_angles, p.gravity)
-        H = extended_kalman.dense(rows, mean[:, None])[..., 0]
+        H = dense(rows, mean[:, None])[..., 0]
         nu = (state.measurement - expected)[:, 0]
         R = numpy.diag(task.sensor_variance)
         S = H @ P @ H.T + R
