@@ -293,8 +293,7 @@ def test_fewer_than_four_satellites_still_correct_what_they_see():
     assert (variance > numpy.einsum("i...,ij...,j...->...", lost, full.covariance, lost)).all()
 
 
-def test_torch_gives_what_numpy_gives():
-    torch = pytest.importorskip("torch")
+def test_torch_gives_what_numpy_gives(torch):
     state, P, residual, _ = random_update(2)
     ins = numpy.full((3, 1, 1), 0.3)
     position, velocity = satellites.local_orbits(SLOTS, numpy.zeros(1), *SITE)

@@ -306,24 +306,18 @@ def test_random_course_has_every_leg_and_bounded_strength():
     assert lengths.max() <= 300
 
 
-def test_torch_rolls_out_as_numpy_does():
-    torch = pytest.importorskip("torch")
-    import array_api_compat.torch as xp
-
+def test_torch_rolls_out_as_numpy_does(torch):
     for control, scenario in (("evidence", "urban"), ("gain", "random"), ("evidence", "paper")):
         a = list(drive(make(scenario, control), 8, 14, 15))
-        b = list(drive(make(scenario, control, xp), 8, 14, 15, kind=torch.asarray))
+        b = list(drive(make(scenario, control, torch), 8, 14, 15, kind=torch.asarray))
         for (_, _, seen, state), (_, _, also, other) in zip(a, b, strict=True):
             # Elementary functions differ in the last place; the bank multiplies that.
             numpy.testing.assert_allclose(also.numpy(), seen, rtol=1e-6, atol=1e-6)
             numpy.testing.assert_allclose(other.estimate.numpy(), state.estimate, rtol=1e-7, atol=1e-7)
 
 
-def test_gradient_from_cost_to_action():
-    torch = pytest.importorskip("torch")
-    import array_api_compat.torch as xp
-
-    task = make("random", "gain", xp)
+def test_gradient_from_cost_to_action(torch):
+    task = make("random", "gain", torch)
 
     def loss(action):
         total = 0.0
