@@ -103,11 +103,6 @@ def variance_reduction(alpha: Array, beta: Array) -> VarianceReduction:
     )
 
 
-def acceleration_lag(alpha: Array, beta: Array, T: float, acceleration: Array) -> Array:
-    """Steady position error after the update under constant acceleration, ``a T^2 (1 - alpha) / beta``, m."""
-    return acceleration * T**2 * (1.0 - alpha) / beta
-
-
 class ErrorMoments(NamedTuple):
     """Mean and covariance of the error "truth minus estimate" of one coordinate."""
 

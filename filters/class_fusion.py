@@ -38,6 +38,7 @@ import numpy
 from . import imm
 from .array_namespace import Array, namespace
 from .gaussian import log_density
+from .ordered_sums import ordered_sum
 from .small_matrices import apply, cholesky, product, solve_lower, transpose
 
 # --- the general recursion
@@ -211,9 +212,7 @@ def update_channels(
     predicted = apply(Phi[..., None], mean)
     innovation = z[:, None] - apply(H[..., None, None], predicted)
     whitened = apply(whitening, innovation)
-    squared = whitened[0] * whitened[0]
-    for i in range(1, whitened.shape[0]):
-        squared = squared + whitened[i] * whitened[i]
+    squared = ordered_sum(whitened * whitened)
     return ChannelUpdate(predicted + apply(gain, innovation), whitened, log_normaliser - 0.5 * squared)
 
 
@@ -292,10 +291,7 @@ def fixed_type_log_likelihood(counts: Array, log_confusion: Array, log_compositi
     joint = log_composition[..., None] + evidence[None]
     largest = xp.max(joint, axis=1)
     terms = xp.exp(joint - largest[:, None])
-    total = terms[:, 0]
-    for j in range(1, terms.shape[1]):
-        total = total + terms[:, j]
-    return largest + xp.log(total)
+    return largest + xp.log(ordered_sum(terms[:, j] for j in range(terms.shape[1])))
 
 
 def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float) -> float:

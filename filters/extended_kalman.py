@@ -1,19 +1,16 @@
-r"""Three forms of the measurement update of an extended Kalman filter, equal to rounding.
+r"""The measurement update of an extended Kalman filter, one scalar observation after the other.
 
-With the prediction x', P', the residual nu = y - S(x'), the Jacobian H = dS/dx at x' and noise covariance R:
+With the prediction x', P', the residual nu = y - S(x') and the rows h of the Jacobian dS/dx at x', for every
+observation j with variance r_j:
 
-    gain form         K = P' H^T (H P' H^T + R)^-1
-                      x = x' + K nu,   P = (I - K H) P' (I - K H)^T + K R K^T            (Joseph)
-    information form  P = (P'^-1 + H^T R^-1 H)^-1,   x = x' + P H^T R^-1 nu              (step 6)
-    one by one        for every scalar observation j with variance r_j:
-                      s = h P h^T + r_j,  g = P h^T / sqrt(s),  nu' = nu_j - h (x - x')
-                      x += g nu' / sqrt(s),  P -= g g^T
+    s = h P h^T + r_j,  g = P h^T / sqrt(s),  nu' = nu_j - h (x - x')
+    x += g nu' / sqrt(s),  P -= g g^T
 
-The step numbers are those of Moroz's paper on an adaptive multi-hypothesis measurer. The third form needs R
-diagonal; it inverts nothing, keeps P exactly symmetric, uses the zeros of h, leaves out what is not
-available, and its terms nu'^2 / s are independent contributions to the normalised innovation squared, in the
-order in which the observations are taken. For 17 states and 14 observations it takes as long as one
-stacked product of 31 x 31 matrices.
+This is step 6 of Moroz's paper on an adaptive multi-hypothesis measurer, ``P = (P'^-1 + H^T R^-1 H)^-1``,
+``x = x' + P H^T R^-1 nu``, for a diagonal R. It inverts nothing, keeps P exactly symmetric, uses the zeros of
+h, leaves out what is not available, and its terms nu'^2 / s are independent contributions to the normalised
+innovation squared, in the order in which the observations are taken. For 17 states and 14 observations it
+takes as long as one stacked product of 31 x 31 matrices.
 
 Reading: steps 5 and 6 of the paper write the Jacobian once through the picked parameters v = c x and once
 directly; one Jacobian with respect to the state is used.
@@ -49,73 +46,6 @@ class Correction(NamedTuple):
     squared_residuals: tuple[Array, ...]
     """Of every observation, its normalised residual squared given those before it, zero where it is not
     available; m arrays ``(...)``. Their sum is the normalised innovation squared."""
-
-
-def _leading(stack: Array) -> Array:
-    """Move the two last axes of a stack of matrices to the front."""
-    return namespace(stack).moveaxis(stack, (-2, -1), (0, 1))
-
-
-def _trailing(matrix: Array) -> Array:
-    """Move the two leading axes to the end, where stacked products take them."""
-    return namespace(matrix).moveaxis(matrix, (0, 1), (-2, -1))
-
-
-def _column(vector: Array) -> Array:
-    return namespace(vector).moveaxis(vector, 0, -1)[..., None]
-
-
-def dense(rows: Sequence[JacobianRow], like: Array) -> Array:
-    """Full matrix ``(m, n, ...)`` of a Jacobian given by its non-zero parts.
-
-    Args:
-        rows: m rows.
-        like: a state ``(n, ...)``, for size and kind.
-    """
-    xp = namespace(like)
-    zero = xp.zeros_like(like[0])
-    matrix = []
-    for columns, values in rows:
-        row = [zero] * like.shape[0]
-        for column, value in zip(columns, values, strict=True):
-            row[column] = zero + value
-        matrix.append(xp.stack(row))
-    return xp.stack(matrix)
-
-
-def update_gain_form(
-    mean: Array, covariance: Array, residual: Array, H: Array, R: Array
-) -> tuple[Array, Array]:
-    """Mean and covariance after a measurement, by the Kalman gain and Joseph's form.
-
-    Args:
-        mean: predicted, ``(n, ...)``.
-        covariance: predicted, ``(n, n, ...)``.
-        residual: ``(m, ...)``.
-        H: Jacobian, ``(m, n, ...)``.
-        R: covariance of the noise, ``(m, m, ...)``.
-    """
-    xp = namespace(mean)
-    P, H, R, nu = _trailing(covariance), _trailing(H), _trailing(R), _column(residual)
-    HP = H @ P
-    K = xp.linalg.solve(HP @ H.mT + R, HP).mT
-    rest = xp.eye(mean.shape[0], dtype=mean.dtype, device=mean.device) - K @ H
-    joseph = rest @ P @ rest.mT + K @ R @ K.mT
-    return mean + xp.moveaxis((K @ nu)[..., 0], -1, 0), _leading(joseph)
-
-
-def update_information_form(
-    mean: Array, covariance: Array, residual: Array, H: Array, R: Array
-) -> tuple[Array, Array]:
-    """Mean and covariance after a measurement, step 6 of the paper; arguments of :func:`update_gain_form`.
-
-    The predicted covariance must be invertible.
-    """
-    xp = namespace(mean)
-    P, H, R, nu = _trailing(covariance), _trailing(H), _trailing(R), _column(residual)
-    weighted = xp.linalg.solve(R, H).mT
-    posterior = xp.linalg.inv(xp.linalg.inv(P) + weighted @ H)
-    return mean + xp.moveaxis((posterior @ (weighted @ nu))[..., 0], -1, 0), _leading(posterior)
 
 
 def update_one_by_one(

@@ -3,6 +3,7 @@
 import math
 
 from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
 from .small_matrices import cholesky, solve_lower
 
 
@@ -23,10 +24,9 @@ def log_density(residual: Array, covariance: Array) -> tuple[Array, Array]:
     xp = namespace(residual)
     factor = cholesky(covariance)
     whitened = solve_lower(factor, residual)
-    squared_distance = whitened[0] ** 2
+    squared_distance = ordered_sum(component**2 for component in whitened)
     determinant_root = factor[0][0]
     for i in range(1, len(whitened)):
-        squared_distance = squared_distance + whitened[i] ** 2
         determinant_root = determinant_root * factor[i][i]
     constant = len(whitened) * math.log(2 * math.pi)
     return -0.5 * (squared_distance + constant) - xp.log(determinant_root), squared_distance

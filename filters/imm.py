@@ -15,6 +15,7 @@ Reading: (10), (12)-(14) are damaged; the sums run over the first index of ``p_i
 from typing import NamedTuple
 
 from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum, weighted_sum
 from .small_matrices import outer
 
 
@@ -40,9 +41,7 @@ def predict_mode_probabilities(transition: Array, probabilities: Array) -> ModeP
     if transition.ndim == 2:
         transition = transition[:, :, None]
     joint = transition * probabilities[:, None]
-    predicted = joint[0]
-    for i in range(1, joint.shape[0]):
-        predicted = predicted + joint[i]
+    predicted = ordered_sum(joint)
     reachable = predicted > 0.0
     stay = xp.eye(joint.shape[0], dtype=joint.dtype, device=joint.device)[:, :, None]
     mixing = xp.where(reachable, joint / xp.where(reachable, predicted, 1.0), stay)
@@ -74,16 +73,13 @@ def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Arra
     Returns:
         ``(n, ...)`` and ``(n, n, ...)``, trailing axes broadcast; the covariance holds the spread of the means.
     """
-    count = weights.shape[0]
-    centre = weights[0] * mean[:, 0]
-    for i in range(1, count):
-        centre = centre + weights[i] * mean[:, i]
-    total = None
-    for i in range(count):
-        difference = mean[:, i] - centre
-        term = weights[i] * (covariance[:, :, i] + outer(difference, difference))
-        total = term if total is None else total + term
-    return centre, total
+    centre = weighted_sum(weights, mean)
+    differences = (mean[:, i] - centre for i in range(weights.shape[0]))
+    spread = ordered_sum(
+        weights[i] * (covariance[:, :, i] + outer(difference, difference))
+        for i, difference in enumerate(differences)
+    )
+    return centre, spread
 
 
 def log_probabilities(probabilities: Array) -> Array:
@@ -95,10 +91,7 @@ def normalised_exponential(logarithms: Array) -> Array:
     """Probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
     xp = namespace(logarithms)
     scaled = xp.exp(logarithms - xp.max(logarithms, axis=0))
-    total = scaled[0]
-    for j in range(1, scaled.shape[0]):
-        total = total + scaled[j]
-    return scaled / total
+    return scaled / ordered_sum(scaled)
 
 
 def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:

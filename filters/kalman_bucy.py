@@ -15,9 +15,9 @@ Reading: (3) is printed without U, which would bias the estimate by ``-U / (K - 
 Reading: (4) is damaged; ``Q^-1`` is the only exponent that makes (5) the Riccati equation.
 Reading: the paper refers to an equation (7) that does not exist; (6) is meant.
 
-Where (5) and (6) settle is computed by :func:`~filtergym.filters.linear_systems.steady_kalman_bucy` and
-:func:`~filtergym.filters.linear_systems.continuous_stationary_covariance`. A random constant has no steady
-filter: its variance falls for ever, like 1/t, and its gain goes to zero; use the time-varying (5).
+Where (5) settles is computed by :func:`~filtergym.filters.linear_systems.steady_kalman_bucy`. A random
+constant has no steady filter: its variance falls for ever, like 1/t, and its gain goes to zero; use the
+time-varying (5).
 
 Everything here is design, computed once for one model: plain NumPy and SciPy, no batch axis.
 """

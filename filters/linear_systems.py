@@ -254,21 +254,16 @@ def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: Arra
     return SteadyFilter(gain, P, P, numpy.linalg.eigvals(A - gain @ H))
 
 
-def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix, continuous: bool) -> None:
+def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the weight of the control must be positive definite, got {R.tolist()}")
-    fixed = unobserved_modes(F.T, B.T, continuous)
+    fixed = unobserved_modes(F.T, B.T)
     if fixed:
         raise ValueError(
             f"the control cannot stabilise the plant: the modes with eigenvalues {_list(fixed)} do not decay "
             "and the control does not reach them"
         )
-    limit = 0.0 if continuous else 1.0
-    ignored = [
-        value
-        for value in unobserved_modes(F, noise_factor(weight).T, continuous)
-        if abs((value.real if continuous else abs(value)) - limit) < 1e-6
-    ]
+    ignored = [value for value in unobserved_modes(F, noise_factor(weight).T) if abs(abs(value) - 1.0) < 1e-6]
     if ignored:
         raise ValueError(
             f"the weights ignore the integrating modes with eigenvalues {_list(ignored)}: the Riccati "
@@ -290,18 +285,9 @@ def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Mat
     """
     from scipy.linalg import solve_discrete_are
 
-    _check_regulator(F, B, weight, control_weight, continuous=False)
+    _check_regulator(F, B, weight, control_weight)
     S = solve_discrete_are(F, B, weight, control_weight)
     return numpy.linalg.solve(control_weight + B.T @ S @ B, B.T @ S @ F)
-
-
-def continuous_regulator(A: Matrix, B: Matrix, weight: Matrix, control_weight: Matrix) -> Matrix:
-    """Feedback gain L that minimises the integral of ``x^T W x + u^T R u`` (continuous LQR), see (2)."""
-    from scipy.linalg import solve_continuous_are
-
-    _check_regulator(A, B, weight, control_weight, continuous=True)
-    S = solve_continuous_are(A, B, weight, control_weight)
-    return numpy.linalg.solve(control_weight, B.T @ S)
 
 
 def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
@@ -316,24 +302,6 @@ def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:
     if radius >= 1.0:
         raise ValueError(f"only a stable loop has stationary variances, got spectral radius {radius:.6g}")
     X = solve_discrete_lyapunov(F, Q)
-    return 0.5 * (X + X.T)
-
-
-def continuous_stationary_covariance(A: ArrayLike, intensity: ArrayLike) -> Matrix:
-    """Covariance of ``dx/dt = A x + w``: the Lyapunov equation ``A X + X A^T + W = 0``.
-
-    Raises:
-        ValueError: if A is not asymptotically stable.
-    """
-    from scipy.linalg import solve_continuous_lyapunov
-
-    A = square_matrix("A", A)
-    intensity = intensity_matrix("intensity", intensity, len(A))
-    growth = float(numpy.max(numpy.linalg.eigvals(A).real))
-    # A double pole at zero may be computed on either side of it.
-    if growth > -1e-12 * max(1.0, float(numpy.abs(A).max())):
-        raise ValueError(f"only a stable loop has stationary variances, got a pole at {growth:.6g} 1/s")
-    X = solve_continuous_lyapunov(A, -intensity)
     return 0.5 * (X + X.T)
 
 

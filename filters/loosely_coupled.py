@@ -98,41 +98,21 @@ def update_variance(P: Array, R: Array, gain: Array) -> Array:
     return rest * rest * P + gain * gain * R
 
 
-def attenuated_mean_square(
-    K: float,
-    drift: float,
-    coloured: float,
-    correlation_time: float,
-    white_intensity: float,
-    receiver_intensity: float,
+def best_constant_gain(
+    drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
 ) -> float:
-    """Settled mean square error of the continuous plain scheme with gain K, m^2.
+    """Gain K, 1/s, of the least settled mean square error: a bound for any tuning of the plain scheme.
 
-    From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta``:
-    ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``; the first term is what is left of
-    the constant.
+    From (6) for ``d Delta/dt = -K Delta + beta + eta + xi - K zeta`` the settled mean square error is
+    ``(sigma_b / K)^2 + sigma^2 / (K (K + 1/tau)) + (G + K^2 N) / (2 K)``, m^2; the first term is what is left
+    of the constant. It is convex in K, so one root of its derivative is the minimum.
 
     Args:
-        K: gain, 1/s.
         drift: standard deviation of the constant rate error, m/s.
         coloured: stationary standard deviation of the coloured rate error, m/s.
         correlation_time: of the coloured rate error, s.
         white_intensity: G, m^2/s.
         receiver_intensity: N, m^2 s.
-    """
-    return (
-        (drift / K) ** 2
-        + coloured**2 / (K * (K + 1.0 / correlation_time))
-        + (white_intensity + K * K * receiver_intensity) / (2.0 * K)
-    )
-
-
-def best_constant_gain(
-    drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
-) -> float:
-    """Gain K, 1/s, that minimises :func:`attenuated_mean_square`: a bound for any tuning of the plain scheme.
-
-    The mean square error is convex in K, so one root of its derivative is the minimum.
 
     Raises:
         ValueError: the INS has no error, so that the best gain is zero.

@@ -20,7 +20,6 @@ Plain NumPy: ephemerides are constants of an experiment, tabulated once.
 """
 
 from collections.abc import Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy
@@ -135,27 +134,3 @@ def dilution_of_precision(unit_vectors: Array) -> DilutionOfPrecision:
     return DilutionOfPrecision(
         float(numpy.sqrt(variances.sum())), float(numpy.sqrt(variances[:3].sum())), east, north, up, time
     )
-
-
-def smallest_gdop(local: Array, count: int, elevation_mask: float) -> tuple[int, ...]:
-    """Which ``count`` satellites above the mask give the smallest geometric dilution of precision.
-
-    Args:
-        local: positions of the constellation at one epoch, ``(3, S)``, m.
-        count: how many to choose, at least four.
-        elevation_mask: lowest elevation, rad.
-
-    Returns:
-        Positions in the list, ascending.
-
-    Raises:
-        ValueError: too few satellites are in view.
-    """
-    visible = numpy.flatnonzero(look_angles(local)[1] > elevation_mask)
-    if len(visible) < count:
-        raise ValueError(f"{count} satellites wanted, {len(visible)} are above the elevation mask")
-    unit = local / numpy.sqrt((local**2).sum(axis=0))
-    chosen = min(
-        combinations(visible, count), key=lambda c: dilution_of_precision(unit[:, list(c)]).geometric
-    )
-    return tuple(int(i) for i in chosen)

@@ -4,6 +4,8 @@ A test that asks for ``env_id`` runs once for every environment; one that asks f
 every control of every environment. A new environment is covered without an edit.
 """
 
+import importlib
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -45,6 +47,16 @@ def _one(space, rng):
     if isinstance(space, gym.spaces.Discrete):
         return rng.integers(space.n)
     return rng.uniform(space.low, space.high).astype(space.dtype)
+
+
+@pytest.fixture
+def torch():
+    """Torch with the functions of the array API standard; tests that ask for it are skipped without it.
+
+    Files of which every test needs a library say ``pytest.importorskip`` at their head.
+    """
+    pytest.importorskip("torch")
+    return importlib.import_module("array_api_compat.torch")
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import itertools
 import math
 
-import array_api_compat.torch as torch
 import numpy
 import pytest
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
@@ -132,7 +131,7 @@ def test_whitened_innovations_square_to_the_nis():
     assert w[0] == pytest.approx(Delta[0] / math.sqrt(Theta[0, 0]), rel=1e-12)
 
 
-def test_torch_agrees_with_numpy():
+def test_torch_agrees_with_numpy(torch):
     arrays = bank(numpy.random.default_rng(3), 8)
     expected = class_fusion.advance(*arrays, MODELS, ASYMMETRIC)
     tensors = [torch.asarray(a, dtype=torch.float64) for a in arrays]

@@ -3,10 +3,8 @@
 import math
 from collections import deque
 
-import array_api_compat.torch as xp_torch
 import numpy as np
 import pytest
-import torch
 from filtergym.envs.loosely_coupled_navigation.task import TASK, LooselyCoupledNavigationParameters
 from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
 
@@ -125,12 +123,19 @@ def augmented_nees(state):
     return np.einsum("ni,ni->n", error, np.linalg.solve(P, error[..., None])[..., 0]) / 3
 
 
+def attenuated_mean_square(K, drift, coloured, correlation_time, white_intensity, receiver_intensity):
+    """Settled mean square error of the continuous plain scheme with gain K, m^2, term by term."""
+    constant = (drift / K) ** 2
+    colour = coloured**2 / (K * (K + 1.0 / correlation_time))
+    return constant + colour + (white_intensity + K * K * receiver_intensity) / (2.0 * K)
+
+
 def test_best_constant_gain():
     model = (0.6, 0.4, 1.0, 0.04, 0.02)
     K = loosely_coupled.best_constant_gain(*model)
     assert pytest.approx(4.73, abs=5e-3) == K
     assert pytest.approx(0.447, abs=5e-4) == K * K * 0.02
-    cost = loosely_coupled.attenuated_mean_square
+    cost = attenuated_mean_square
     assert cost(K, *model) < min(cost(1.001 * K, *model), cost(0.999 * K, *model))
     with pytest.raises(ValueError, match="perfect INS"):
         loosely_coupled.best_constant_gain(0, 0, 1, 0, 0.02)
@@ -141,9 +146,7 @@ def test_attenuation_follows_from_the_moments(K):
     A, BGBt, P0 = loosely_coupled.error_model(0.6, 0.4, 0.7, 0.04)
     A[0, 0], BGBt[0, 0] = -K, 0.04 + K * K * 0.02
     found = kalman_bucy.moments(A, np.zeros(3), BGBt, np.zeros(3), P0, [30.0]).covariance[0, 0, 0]
-    assert loosely_coupled.attenuated_mean_square(K, 0.6, 0.4, 0.7, 0.04, 0.02) == pytest.approx(
-        found, rel=1e-9
-    )
+    assert attenuated_mean_square(K, 0.6, 0.4, 0.7, 0.04, 0.02) == pytest.approx(found, rel=1e-9)
 
 
 def test_the_plain_scheme_attenuates_a_constant_and_the_augmented_one_removes_it():
@@ -449,11 +452,11 @@ def test_lanes_at_different_times_do_not_disturb_each_other(control):
 
 
 @pytest.mark.parametrize("control", TASK.controls)
-def test_torch_equals_numpy(control):
+def test_torch_equals_numpy(torch, control):
     lanes, steps = 8, 60
     keywords = {"axes": 2, "outage_probability": 1.0, "outage_start": (0.1, 0.3), "jamming_probability": 1.0}
     keywords |= {"spoofing_probability": 1.0, "change_start": (0.1, 0.4)}
-    task, twin = make("random", control, **keywords), make("random", control, xp_torch, **keywords)
+    task, twin = make("random", control, **keywords), make("random", control, torch, **keywords)
     drawn, actions = numbers(task, lanes, steps, 1), random_actions(task, lanes, steps, 1)
     copies = (*(torch.from_numpy(x) for x in drawn[:2]), [torch.from_numpy(x) for x in drawn[2]])
     run = states(task, drawn, lambda k, s: actions[k])
@@ -470,9 +473,9 @@ def test_torch_equals_numpy(control):
 
 
 @pytest.mark.parametrize("control", ["gain", "weights"])
-def test_the_cost_is_differentiable_in_the_actions(control):
+def test_the_cost_is_differentiable_in_the_actions(torch, control):
     lanes, steps = 2, 12
-    task, twin = make("random", control), make("random", control, xp_torch)
+    task, twin = make("random", control), make("random", control, torch)
     drawn = numbers(task, lanes, steps, 1)
     actions = np.random.default_rng(0).uniform(0.1, 0.9, (steps, task.action_space.shape[0], lanes))
 
@@ -524,27 +527,21 @@ def test_parameters_from_json_and_duration():
 
 @pytest.mark.parametrize("library", ["numpy", "torch"])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_augmented_covariance_against_matrices(library, seed):
+def test_the_augmented_covariance_against_matrices(request, library, seed):
+    xp = np if library == "numpy" else request.getfixturevalue(library)
     rng = np.random.default_rng(seed)
     s = loosely_coupled.sampling(0.7, 0.05)
     Phi, Qd = linear_systems.van_loan(*loosely_coupled.error_model(0, 1.3, 0.7, 0.2)[:2], 0.05)
     root = rng.normal(size=(3, 3))
     P = root @ root.T
     entries = [P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2]]
-    lift = (
-        (lambda x: np.full(2, x))
-        if library == "numpy"
-        else (lambda x: torch.full((2,), x, dtype=torch.float64))
+    packed = loosely_coupled.AugmentedCovariance(
+        *(xp.full((2,), float(x), dtype=xp.float64) for x in entries)
     )
-    packed = loosely_coupled.AugmentedCovariance(*map(lift, entries))
     coloured, white = (1.3 * s.coloured) ** 2, 0.2 * 0.05 + 1.3**2 * s.residual
     predicted = loosely_coupled.predict_augmented(packed, s, coloured, white)
-    available = (
-        lift(1.0) * np.array([1.0, 0.0])
-        if library == "numpy"
-        else torch.tensor([1.0, 0.0], dtype=torch.float64)
-    )
-    gain, updated = loosely_coupled.update_augmented(predicted, lift(0.8), available)
+    R, available = xp.full((2,), 0.8, dtype=xp.float64), xp.asarray([1.0, 0.0], dtype=xp.float64)
+    gain, updated = loosely_coupled.update_augmented(predicted, R, available)
     naive = Phi @ P @ Phi.T + Qd
     K = naive[:, 0] / (naive[0, 0] + 0.8)
     rest = np.eye(3) - np.outer(K, [1, 0, 0])

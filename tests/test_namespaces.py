@@ -4,7 +4,7 @@ import inspect
 
 import numpy as np
 import pytest
-from filtergym.filters import alpha_beta, bounds, gaussian, imm, kalman, polar, small_matrices
+from filtergym.filters import alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices
 
 torch = pytest.importorskip("torch")
 
@@ -39,7 +39,6 @@ CALLS = [
     (alpha_beta.predict_covariance, (P2, 6.0)),
     (alpha_beta.update_covariance, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.variance_reduction, (ALPHA, BETA)),
-    (alpha_beta.acceleration_lag, (ALPHA, BETA, 6.0, Z2)),
     (
         alpha_beta.propagate_error,
         (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),
@@ -58,6 +57,8 @@ CALLS = [
     (imm.mode_posterior, (np.log(MU), -1e5 + MEANS[0])),
     (kalman.predict, (X4, P4, F4, Q4, X4)),
     (kalman.update, (X4, P4, Z2, H24, R2)),
+    (ordered_sums.ordered_sum, (MU,)),
+    (ordered_sums.weighted_sum, (MU, COVARIANCES)),
     (polar.cartesian_variances, (1e4 * Z2, 100.0, 0.004)),
     (small_matrices.product, (P4, P4)),
     (small_matrices.apply, (P4, X4)),
@@ -112,7 +113,9 @@ def test_gradients_pass_through_every_function():
         assert all(torch.isfinite(gradient).all() for gradient in gradients), function.__name__
 
 
-@pytest.mark.parametrize("module", [alpha_beta, bounds, gaussian, imm, kalman, polar, small_matrices])
+@pytest.mark.parametrize(
+    "module", [alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices]
+)
 def test_no_function_is_forgotten(module):
     public = {
         name

@@ -1,6 +1,7 @@
+from typing import Any
+
 import numpy
 import pytest
-import torch
 from filtergym.filters import kalman, packed_covariance
 
 
@@ -54,7 +55,7 @@ def test_one_after_the_other_is_the_joint_update_of_the_sensors_that_answered(se
         assert numpy.linalg.eigvalsh(covariance[..., k]).min() > 0.0
 
 
-def test_torch_agrees_and_differentiates() -> None:
+def test_torch_agrees_and_differentiates(torch: Any) -> None:
     _, P, mean = system(3)
     packed, z = packed_covariance.pack(P), numpy.ones((2, 16))
     arguments = (mean, packed, z, (0, 3), (0.5, 2.0), numpy.ones((2, 16)))

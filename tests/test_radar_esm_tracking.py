@@ -2,7 +2,6 @@
 
 import math
 
-import array_api_compat.torch as torch
 import numpy
 import pytest
 from filtergym.envs.controls import signed_exponential
@@ -296,7 +295,7 @@ def test_lanes_do_not_know_their_neighbours(scenario):
 
 @pytest.mark.parametrize("scenario", ["paper", "crowded", "silent", "class-change"])
 @pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
-def test_torch_plays_the_same_episode(scenario, transition):
+def test_torch_plays_the_same_episode(torch, scenario, transition):
     more = {"horizon": 50, **({} if transition is None else {"class_transition": transition})}
     ours, theirs = make(scenario, **more), make(scenario, xp=torch, **more)
     uniforms, normals, rows = draw(ours, 8, 6)
@@ -313,7 +312,7 @@ def test_torch_plays_the_same_episode(scenario, transition):
     assert [tuple(x.shape) for x in leaves(b)] == [x.shape for x in leaves(a)]
 
 
-def test_gradient_from_cost_to_evidence():
+def test_gradient_from_cost_to_evidence(torch):
     """Derivative of the summed cost by torch against central differences."""
     task = make("random", xp=torch, horizon=6)
     uniforms, normals, rows = draw(task, 8, 8)

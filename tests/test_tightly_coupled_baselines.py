@@ -15,7 +15,8 @@ from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER
-from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.filters import gnss_ins
+from naive import dense
 
 from filtergym.results import write_text
 
@@ -96,7 +97,7 @@ def test_bound_is_the_dense_recursion():
                 P[8:11] = P[:, 8:11] = 0.0
             position, velocity = task.satellites_now(state)
             _, rows = gnss_ins.observe(state.truth, position, velocity, state.ins_angles, p.gravity)
-            H = extended_kalman.dense(rows, state.truth)[..., lane]
+            H = dense(rows, state.truth)[..., lane]
             R = numpy.array(task.sensor_variance) * state.noise_factor[:, lane] ** 2
             there = state.available[:, lane] > 0.0
             there[2 * S : 2 * S + 3] &= state.stuck[lane] == 0.0
