@@ -17,9 +17,9 @@ import numpy
 import torch
 from stable_baselines3.common.logger import Logger, make_output_format
 
-from ..baselines.seeds import episode_seeds
 from ..envs.catalogue import make_task
 from ..envs.environment import TaskVectorEnv
+from ..evaluation.seeds import episode_seeds
 from .learned_policy import LearnedPolicy, write_arrays
 from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
 

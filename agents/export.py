@@ -7,8 +7,9 @@ from typing import Any
 import numpy
 import torch
 
-from ..baselines.evaluation import evaluate
-from .learned_policy import read_header, write_arrays
+from ..evaluation.evaluate import evaluate
+from ..evaluation.files import whole_file
+from .learned_policy import read_header, stored_policy, write_arrays
 from .sb3_training import Sb3Policy, load_sb3_policy
 from .training_run import TrainingRun, load_run, save_run
 
@@ -79,16 +80,22 @@ def export_run(folder: Path, out: Path) -> TrainingRun:
         ValueError: if the folder holds no run, or none that can be exported.
     """
     run = load_run(folder)
-    out.parent.mkdir(parents=True, exist_ok=True)
     if run.algorithm == "bptt":
         source = folder / "best" / "agent.safetensors"
         read_header(source)
-        shutil.copyfile(source, out)
+        with whole_file(out) as partial:
+            shutil.copyfile(source, partial)
     else:
         agent = load_sb3_policy(folder / "best" / "model.zip", run.algorithm)
         arrays, output, activation = network_arrays(agent, run.algorithm)
         write_arrays(out, arrays, run, output, activation)
-    dataset = evaluate(run.environment, [str(out)], run.scenario, CHECK_EPISODES, split="validation")
+    dataset = evaluate(
+        run.environment,
+        {"exported": stored_policy(run.environment, out)},
+        run.scenario,
+        CHECK_EPISODES,
+        split="validation",
+    )
     run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
     save_run(run, out.with_suffix(".json"))
     return run

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy
 
-from ..baselines.policy import Policy
-from ..envs.catalogue import make_task, task_class
+from ..envs.catalogue import make_task, short_name, task_class
 from ..envs.task import Task
+from ..evaluation.competitors import Policy
+from ..evaluation.files import whole_file
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
@@ -113,7 +114,7 @@ def write_arrays(
 
     fields = [field.name for field in make_task(run.environment, run.control).fields]
     header = {
-        "environment": run.environment,
+        "environment": task_class(run.environment).id,
         "control": run.control,
         "fields": json.dumps(fields),
         "output": output,
@@ -121,9 +122,8 @@ def write_arrays(
         "run": json.dumps(asdict(run)),
     }
     contiguous = {name: numpy.ascontiguousarray(a, dtype=numpy.float32) for name, a in arrays.items()}
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(save(contiguous, header))
-    partial.replace(path)
+    with whole_file(path) as partial:
+        partial.write_bytes(save(contiguous, header))
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -183,4 +183,4 @@ def stored_policy(id: str, path: Path) -> _Stored:
 
 def pretrained_path(id: str, name: str) -> Path:
     """File of a shipped agent, whether or not there is one."""
-    return PRETRAINED / task_class(id).id.removeprefix("filtergym/") / f"{name}.safetensors"
+    return PRETRAINED / short_name(id) / f"{name}.safetensors"

@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..baselines.policy import Policy
 from ..envs.environment import TaskEnv
 from ..envs.task import Task
+from ..evaluation.competitors import Policy
 
 
 def check_residual(task: Task, policy: Any) -> None:

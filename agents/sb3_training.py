@@ -25,8 +25,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
-from ..baselines.seeds import episode_seeds
 from ..envs.catalogue import make_task
+from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
 

@@ -6,7 +6,6 @@ one, from which ``--resume`` goes on), ``best/`` (the agent with the lowest vali
 
 import importlib.metadata
 import json
-import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -18,9 +17,11 @@ from typing import Any
 
 import xarray
 
-from ..baselines.evaluation import baselines_of, evaluate
-from ..baselines.metrics import tidy_records
-from ..envs.catalogue import find_scenario, nearest, task_class
+from ..baselines.catalogue import baselines_of
+from ..baselines.names import evaluate
+from ..envs.catalogue import find_scenario, importable_name, nearest, task_class
+from ..evaluation.files import whole_folder, writable_folder, write_text
+from ..evaluation.metrics import tidy_records
 
 FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
@@ -88,22 +89,18 @@ def new_run(
         raise ValueError(f"envs and steps must be at least 1, got {envs} and {steps}")
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
-    return TrainingRun(cls.id, control or cls.controls[0], chosen.name, algorithm, seed, envs, steps, values)
+    return TrainingRun(
+        importable_name(cls), control or cls.controls[0], chosen.name, algorithm, seed, envs, steps, values
+    )
 
 
 def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
-    """Return the hyperparameters of an algorithm for an environment.
-
-    Raises:
-        ValueError: if there are none.
-    """
+    """Return the hyperparameters of an algorithm for an environment; default ones where it has none."""
     import yaml
 
     file: Any = files(__package__).joinpath("hyperparameters", f"{FILES[algorithm]}.yml")
     table = yaml.safe_load(file.read_text(encoding="utf-8"))
-    if id not in table:
-        raise ValueError(f"no hyperparameters of {algorithm} for {id}: add them to {file}")
-    return dict(table[id])
+    return dict(table.get(id, table["default"]))
 
 
 def learning_rate_schedule(rate: float | str) -> Callable[[float], float]:
@@ -138,9 +135,7 @@ def installed_versions() -> dict[str, str]:
 
 def save_run(run: TrainingRun, path: Path) -> None:
     """Write a run's record, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(asdict(run), indent=1) + "\n", encoding="utf-8")
-    partial.replace(path)
+    write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
 def load_run(folder: Path) -> TrainingRun:
@@ -187,22 +182,28 @@ def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
     return run
 
 
-@contextmanager
-def replaced_folder(folder: Path) -> Iterator[Path]:
-    """Give a new folder that takes the place of an old one only when it is complete."""
-    partial, old = folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".old")
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
-    yield partial
-    if folder.exists():
-        folder.rename(old)
-    partial.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+def opened_run(folder: Path, asked: TrainingRun, resume: bool) -> TrainingRun:
+    """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
+
+    Raises:
+        ValueError: if the folder cannot be written to, holds a run already, or holds another one.
+    """
+    if not resume and (folder / "run.json").exists():
+        raise ValueError(
+            f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
+        )
+    run = resumed_run(folder, asked) if resume else asked
+    writable_folder(folder)
+    run.command = (
+        f"filtergym train {run.environment} --algo {run.algorithm} --control {run.control} "
+        f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}"
+    )
+    run.versions = installed_versions()
+    return run
 
 
 class Validation:
-    """Scores an agent and the paper's algorithm on the same episodes of the validation split.
+    """Scores an agent, and the paper's algorithm if there is one, on the same episodes of the validation split.
 
     Args:
         run: what is trained.
@@ -212,7 +213,7 @@ class Validation:
         self.run = run
         self.paper = baselines_of(run.environment).score_paper
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_dataset = self._evaluated(self.paper, self.paper)
+        self.paper_dataset = self._evaluated(self.paper, self.paper) if self.paper else None
 
     def _evaluated(self, name: str, policy: Any) -> xarray.Dataset:
         run = self.run
@@ -222,13 +223,16 @@ class Validation:
 
     def score(self, policy: Any) -> dict[str, Any]:
         """Return an entry of ``TrainingRun.validation``."""
-        agent = self._evaluated("agent", policy)
-        dataset = xarray.concat([agent, self.paper_dataset], "policy", combine_attrs="override")
+        dataset = self._evaluated("agent", policy)
+        if self.paper_dataset is not None:
+            dataset = xarray.concat([dataset, self.paper_dataset], "policy", combine_attrs="override")
         found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
+        entry = {"steps": self.run.steps_done, "cost": found["agent", "cost"].value}
+        if not self.paper:
+            return entry
         difference = found["agent", "relative_cost_difference"]
         return {
-            "steps": self.run.steps_done,
-            "cost": found["agent", "cost"].value,
+            **entry,
             "paper": self.paper,
             "paper_cost": found[self.paper, "cost"].value,
             "relative_cost_difference": [difference.value, difference.low, difference.high],
@@ -296,14 +300,14 @@ class Bookkeeping:
         run.validation.append(entry)
         run.seconds = self.seconds_before + time.monotonic() - self.began
         if is_best:
-            with replaced_folder(self.folder / "best") as best:
+            with whole_folder(self.folder / "best") as best:
                 self.save_agent(best)
-        with replaced_folder(self.folder / "checkpoint") as checkpoint:
+        with whole_folder(self.folder / "checkpoint") as checkpoint:
             self.save_checkpoint(checkpoint)
         save_run(run, self.folder / "run.json")
-        value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
-        self.report(
-            f"{steps_done:,} steps: validation cost {entry['cost']:.4g}, {entry['paper']} "
-            f"{entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
-        )
+        line = f"{steps_done:,} steps: validation cost {entry['cost']:.4g}"
+        if self.validation.paper:
+            value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
+            line += f", {entry['paper']} {entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
+        self.report(line)
         return stopping

@@ -6,16 +6,17 @@ defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress call
 """
 
 import importlib
-import pkgutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
 from ..envs.catalogue import nearest
-from .figures import save
+from ..evaluation.figures import save
+from ..evaluation.files import write_text
+from .catalogue import packages
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
 
@@ -57,10 +58,8 @@ class Reproduction:
 
 
 def papers() -> dict[str, str]:
-    """Return the folder of every paper that can be reproduced, by its name on the command line."""
-    package = importlib.import_module(__package__)
-    rooms = [m.name for m in pkgutil.iter_modules(package.__path__) if m.ispkg]
-    return {importlib.import_module(f"{__package__}.{room}").PAPER: room for room in rooms}
+    """Return the package of every paper that can be reproduced, by its name on the command line."""
+    return {package.PAPER: package.__name__ for package in packages()}
 
 
 def paper_module(name: str) -> ModuleType:
@@ -72,7 +71,7 @@ def paper_module(name: str) -> ModuleType:
     known = papers()
     if name not in known:
         raise nearest("paper", name, known)
-    return importlib.import_module(f"{__package__}.{known[name]}.reproduction")
+    return importlib.import_module(f"{known[name]}.reproduction")
 
 
 def episode_count(episodes: int | None, default: int) -> int:
@@ -111,14 +110,8 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list
     ]
 
 
-def save_reproduction(result: Reproduction, folder: Path, write_text: Callable[[Path, str], None]) -> None:
-    """Write ``report.md`` and the figures, all of them or none.
-
-    Args:
-        result: what to write.
-        folder: where; it must exist.
-        write_text: writes a text file.
-    """
+def save_reproduction(result: Reproduction, folder: Path) -> None:
+    """Write ``report.md`` and the figures into an existing folder, all of them or none."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as waiting:
         for name, figure in result.figures.items():
             save(figure, Path(waiting) / f"{name}.png")

@@ -7,18 +7,21 @@ best candidate is kept by its cost on the validation split only if it beats the 
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.catalogue import find_scenario, make_task, nearest, task_class
-from .policy import Tunable
-from .rollout import run_policy
-from .seeds import episode_seeds
+from ..envs.catalogue import find_scenario, make_task, nearest, short_name, task_class
+from ..envs.task import Task
+from ..evaluation.files import write_text
+from ..evaluation.rollout import run_policy
+from ..evaluation.seeds import episode_seeds
+from .catalogue import baselines_of, package_of
+from .table import Tunable
 
 FOLDER = Path("tuned")
 """Where tuned values of one's own are kept, below the working directory."""
@@ -138,19 +141,15 @@ def tune(
     return Tuned(cls.id, policy, chosen.name, rounded, cost, untuned, spent * steps, seed)
 
 
-def _file_name(id: str) -> str:
-    return f"{task_class(id).id.removeprefix('filtergym/')}.json"
-
-
 def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
     """Return tuned values and where they stand: one's own in ``tuned/``, or those that are shipped.
 
     Raises:
         ValueError: if the policy was never tuned.
     """
-    name = _file_name(id)
-    shipped: Any = files(__package__).joinpath(task_class(id).__module__.split(".")[-2], "tuned.json")
-    for place in (FOLDER / name, shipped):
+    package = package_of(id)
+    places: list[Any] = [table_path(id), *([] if package is None else [files(package) / "tuned.json"])]
+    for place in places:
         if place.is_file():
             table = json.loads(place.read_text(encoding="utf-8"))
             if policy in table:
@@ -158,10 +157,10 @@ def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
     raise ValueError(f"no tuned values of policy {policy!r}: run filtergym tune {id} --policy {policy}")
 
 
-def tuned_names(id: str, tunables: Iterable[str]) -> list[str]:
+def tuned_names(id: str) -> list[str]:
     """Return ``NAME-tuned`` of every tunable policy that has stored values."""
     names = []
-    for policy in tunables:
+    for policy in baselines_of(id).tunable:
         try:
             stored_values(id, policy)
         except ValueError:
@@ -170,13 +169,44 @@ def tuned_names(id: str, tunables: Iterable[str]) -> list[str]:
     return names
 
 
-def tuned_policy(id: str, policy: str, tunables: Mapping[str, Tunable]) -> tuple[dict[str, Any], str, Any]:
-    """Return task keywords, control and maker of ``NAME-tuned``."""
+class TunedPolicy(NamedTuple):
+    """A policy with tuned values, some of which belong to the task."""
+
+    task_keywords: dict[str, Any]
+    control: str
+    make: Callable[[Task], Any]
+
+    def __call__(self, task: Task) -> Any:
+        """Make the policy for a task."""
+        return self.make(task)
+
+
+def tuned_policy(id: str, policy: str) -> TunedPolicy:
+    """Return what makes a policy with its stored values for a task.
+
+    Raises:
+        ValueError: if it cannot be tuned, or never was.
+    """
+    tunables = baselines_of(id).tunable
     if policy not in tunables:
         raise nearest("tunable policy", policy, tunables)
     tunable = tunables[policy]
     keywords, make = tunable.apply(stored_values(id, policy)[0])
-    return keywords, tunable.control, make
+    return TunedPolicy(keywords, tunable.control, make)
+
+
+def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
+    """Put tuned values into the environment's file in a folder, which is returned.
+
+    Args:
+        outcome: of a search.
+        command: that made it.
+        folder: of such files.
+    """
+    path = table_path(outcome.environment, folder)
+    existing = path.read_text(encoding="utf-8") if path.exists() else None
+    write_text(path, merged_table(existing, outcome, command))
+    return path
 
 
 def merged_table(existing: str | None, outcome: Tuned, command: str) -> str:
@@ -196,4 +226,4 @@ def merged_table(existing: str | None, outcome: Tuned, command: str) -> str:
 
 def table_path(id: str, folder: Path = FOLDER) -> Path:
     """File of an environment's tuned values in a folder."""
-    return folder / _file_name(id)
+    return folder / f"{short_name(id)}.json"

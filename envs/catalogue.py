@@ -1,6 +1,7 @@
 """Which environments there are, and how a task is made from names and keywords.
 
 Every folder beside this file that defines ``TASK`` is an environment; nothing else needs to know about it.
+A user's own are added by :mod:`.registration`.
 """
 
 import dataclasses
@@ -19,10 +20,17 @@ import numpy
 from .task import Scenario, Task
 from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
 
+ADDED: dict[str, type[Task]] = {}
+"""Environments of users, as they were registered: Gymnasium id -> task class."""
 
-@functools.cache
+
 def catalogue() -> dict[str, type[Task]]:
     """Return every environment: Gymnasium id -> task class."""
+    return {**_shipped(), **ADDED}
+
+
+@functools.cache
+def _shipped() -> dict[str, type[Task]]:
     package = importlib.import_module(__package__)
     rooms = (
         importlib.import_module(f"{__package__}.{m.name}")
@@ -41,12 +49,37 @@ def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
 
 
 def task_class(id: str) -> type[Task]:
-    """Return the task of an environment id; ``filtergym/`` may be left out."""
+    """Return the task of an environment id; ``filtergym/`` may be left out.
+
+    ``module:id`` imports the module first, which registers the environment, as ``gymnasium.make`` does.
+
+    Raises:
+        ValueError: if there is none, or its module cannot be imported.
+    """
+    module, colon, own = id.partition(":")
+    if colon:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ValueError(
+                f"cannot import {module!r}, which registers environment {own!r}: {error}"
+            ) from error
+        id = own
     known = catalogue()
     for candidate in (id, f"filtergym/{id}", f"filtergym/{id}-v0"):
         if candidate in known:
             return known[candidate]
     raise nearest("environment", id, known)
+
+
+def importable_name(cls: type[Task]) -> str:
+    """Id by which another process finds an environment: of a user's with the module that registers it."""
+    return f"{cls.__module__}:{cls.id}" if cls.id in ADDED else cls.id
+
+
+def short_name(id: str) -> str:
+    """Name of an environment for its files, and where an id is too long."""
+    return task_class(id).id.removeprefix("filtergym/").replace("/", "-")
 
 
 def parameter_names(cls: type[Task]) -> list[str]:
@@ -110,11 +143,12 @@ def make_task(
 
 def register() -> None:
     """Register every environment with Gymnasium; calling it again changes nothing."""
-    for id in catalogue():
+    for id, cls in catalogue().items():
         if id not in gymnasium.registry:
             gymnasium.register(
                 id,
                 entry_point="filtergym.envs.environment:TaskEnv",
                 vector_entry_point="filtergym.envs.environment:TaskVectorEnv",
-                kwargs={"task": id},
+                # A spawned process gets no more than this, and must find the environment by it.
+                kwargs={"task": importable_name(cls)},
             )

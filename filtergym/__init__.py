@@ -4,29 +4,51 @@
 Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from .baselines.policy import LOADERS, PolicyLoader
+from .baselines.catalogue import add_baselines
+from .baselines.table import Baselines
 from .envs.catalogue import register
+from .envs.registration import add_task
+from .envs.task import Task
 from .envs.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from .names import evaluate, tidy_records
+
 __version__ = "0.1.0"
-__all__ = ["Trajectory", "register"]
+__all__ = ["Trajectory", "evaluate", "register", "register_task", "tidy_records"]
 
 register()
 
 
-def _learned_policy(id: str, name: str) -> Any:
-    # Imported when asked for: baselines know nothing of agents.
-    from .agents.named_policies import learned_policy
+def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
+    """Make an environment of your own a citizen: it lists, makes, evaluates, renders and trains like the others.
 
-    return learned_policy(id, name)
+    Call it where your module or package is imported, not inside a function. Then any process finds the
+    environment by ``module:id``, as in ``gymnasium.make("my_package:mine/Pendulum-v0")`` and on the command
+    line, and a spawned process, such as a worker of an asynchronous vector environment, imports the module
+    by itself.
+
+    Args:
+        task: class that keeps the contract of :class:`filtergym.envs.task.Task`.
+        baselines: what it is compared with; without them random actions are its only policy, and there is no
+            score.
+
+    Raises:
+        ValueError: if the task does not keep the contract, its id is taken, or the table does not fit it.
+    """
+    add_task(task)
+    if baselines is not None:
+        if baselines.environment != task.id:
+            raise ValueError(f"the baselines are of {baselines.environment!r}, not of {task.id!r}")
+        add_baselines(baselines)
 
 
-def _shipped_agents(id: str) -> list[str]:
-    from .agents.named_policies import shipped_agents
+def __getattr__(name: str) -> Any:
+    # On first use: an evaluation brings xarray, and making environments needs none of it.
+    if name not in ("evaluate", "tidy_records"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from . import names
 
-    return shipped_agents(id)
-
-
-LOADERS.append(PolicyLoader(_learned_policy, _shipped_agents))
+    return getattr(names, name)

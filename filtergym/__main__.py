@@ -9,19 +9,22 @@ import gymnasium
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
-from .baselines.evaluation import baselines_of, evaluate
-from .baselines.figures import evaluation_figures, save
-from .baselines.metrics import Record, tidy_records
+from .baselines.catalogue import baselines_of
 from .baselines.reproduction import paper_module, papers, save_reproduction
-from .baselines.tuning import FOLDER, merged_table, table_path, tune
-from .envs.catalogue import catalogue, find_scenario, nearest, parameter_names, task_class
+from .baselines.tuning import FOLDER, save_tuned, tune
+from .envs.catalogue import catalogue, find_scenario, importable_name, nearest, short_name, task_class
+from .evaluation.figures import evaluation_figures, save
+from .evaluation.files import writable_folder
+from .evaluation.metrics import Record
+from .names import competitor, evaluate, tidy_records
 from .reports import comparison, training_seeds
 from .reports.benchmark import Cell, run_benchmark
+from .reports.listing import environment_lines
+from .reports.pages import insert_between_markers, split_at_markers
+from .reports.records import write_records
 from .reports.room import MARKER, measure_room, room_markdown
-from .reports.tables import grid_table, results_table
-from .results import insert_between_markers, split_at_markers, writable_folder, write_records, write_text
+from .reports.tables import claims_table, grid_table, results_table, tuned_table
 
 app = typer.Typer(
     help="Gymnasium environments for adaptive-filter benchmarking.",
@@ -66,27 +69,21 @@ def parsed_settings(settings: list[str]) -> dict[str, Any]:
 
 
 @app.command("list")
-def list_environments() -> None:
-    """List environments with their controls, scenarios, policies, references and bounds."""
-    for id, cls in catalogue().items():
-        known = baselines_of(id)
-        console.print(f"[bold]{id}[/bold]")
-        console.print(f"  {(cls.__doc__ or '').strip().splitlines()[0]}", highlight=False)
-        rows = {
-            "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
-            "scenarios": [
-                f"{s.name}{' (default, training)' if s.name == cls.default_scenario else ''}"
-                for s in cls.scenarios.values()
-            ],
-            "policies": list(known.policies),
-            "references": list(known.references),
-            "bounds": list(known.bounds),
-            "parameters": parameter_names(cls),
-        }
-        for title, names in rows.items():
-            console.print(f"  {title + ':':<12} {', '.join(names)}", highlight=False, soft_wrap=True)
-        for scenario in cls.scenarios.values():
-            console.print(f"    {scenario.name:<22} {scenario.description}", highlight=False, soft_wrap=True)
+def list_environments(
+    environment: Annotated[
+        list[str] | None,
+        typer.Argument(help="Environment ids, default all; module:id for one that a module registers."),
+    ] = None,
+) -> None:
+    """List environments with their papers, controls, scenarios, policies, references and bounds.
+
+    Example: filtergym list filtergym/ManeuveringTarget-v0
+    """
+    for id in environment or catalogue():
+        first, *lines = environment_lines(id)
+        console.print(f"[bold]{first}[/bold]")
+        for line in lines:
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 @app.command("evaluate")
@@ -164,7 +161,7 @@ def benchmark(
     with progress_bar() as bar:
 
         def started(cell: Cell, total: int) -> Any:
-            line = bar.add_task(f"{cell.environment.removeprefix('filtergym/')} {cell.scenario}", total=total)
+            line = bar.add_task(f"{short_name(cell.environment)} {cell.scenario}", total=total)
             return lambda done: bar.update(line, advance=done)
 
         def finished(records: list[Record]) -> None:
@@ -187,7 +184,7 @@ def comparison_page(
     Example: filtergym comparison results/benchmark.json --into docs/comparison.md
     """
     found = comparison.read_benchmark(records)
-    markers = {id: f"comparison {id.removeprefix('filtergym/')}" for id in found}
+    markers = {id: f"comparison {short_name(id)}" for id in found}
     if into is not None:
         for marker in markers.values():
             split_at_markers(into, marker)
@@ -196,7 +193,7 @@ def comparison_page(
         for grid in compared.grids:
             console.print(grid_table(grid))
         if into is not None:
-            picture = f"images/comparison_{id.removeprefix('filtergym/')}.png"
+            picture = f"images/comparison_{short_name(id)}.png"
             save(compared.figure, writable_folder(into.parent / "images") / Path(picture).name)
             command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
             text = comparison.comparison_markdown(compared, own, picture, command)
@@ -234,15 +231,9 @@ def tune_policy(
             seed,
             progress=lambda steps: bar.update(line, advance=steps),
         )
-    table = Table("value", "untuned", "tuned", title=f"{policy} on {outcome.scenario}")
-    for name, value in outcome.values.items():
-        table.add_row(name, f"{tunable[policy].start[name]:g}", f"{value:g}")
-    table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
-    console.print(table)
-    path = table_path(cls.id, out)
-    command = f"filtergym tune {cls.id} --policy {policy} --budget {budget} --seed {seed}"
-    existing = path.read_text(encoding="utf-8") if path.exists() else None
-    write_text(path, merged_table(existing, outcome, command))
+    console.print(tuned_table(outcome, tunable[policy].start))
+    command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
+    path = save_tuned(outcome, command, out)
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
@@ -265,7 +256,7 @@ def room(
         records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
     console.print(results_table(records))
     if into is not None:
-        command = f"filtergym room {cls.id} --episodes {episodes} --seed {seed} --into {into}"
+        command = f"filtergym room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
         insert_between_markers(into, MARKER, room_markdown(records, command))
 
 
@@ -287,13 +278,39 @@ def reproduce(
     with progress_bar() as bar:
         line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
         result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
-    table = Table("claim", "what was measured", "verdict", title=result.title, show_lines=True)
-    for claim in result.claims:
-        table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
-    console.print(table)
+    console.print(claims_table(result))
     if out is not None:
-        save_reproduction(result, out, write_text)
+        save_reproduction(result, out)
         console.print(f"report and figures in {out}")
+
+
+@app.command("animate")
+def animate(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    policy: Annotated[list[str], typer.Option(help="Policy; repeat for several.")],
+    out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario; default: the training distribution.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    every: Annotated[int, typer.Option(help="Actions from one frame to the next.")] = 2,
+) -> None:
+    """Draw an episode under each policy as an animated GIF.
+
+    Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
+    """
+    try:
+        from .evaluation.animation import episode_frames, write_animation
+    except ImportError as error:
+        raise ValueError(
+            f"animations need more packages: pip install 'filtergym[render]' ({error})"
+        ) from error
+    cls = task_class(environment)
+    writable_folder(out)
+    for name in policy:
+        path = out / f"{cls.id.rpartition('/')[2]}-{name.rpartition(':')[2]}.gif"
+        write_animation(episode_frames(cls.id, name, competitor(cls.id, name), scenario, seed, every), path)
+        console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 @app.command("train")
@@ -337,18 +354,7 @@ def train(
         ) from error
     torch.set_num_threads(1)  # networks this small run slower on more
     run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario)
-    if resume:
-        run = training_run.resumed_run(out, run)
-    elif (out / "run.json").exists():
-        raise ValueError(
-            f"{out} holds a training run: add --resume to go on with it, or choose another folder"
-        )
-    writable_folder(out)
-    run.command = (
-        f"filtergym train {run.environment} --algo {algo} --control {run.control} --scenario {run.scenario} "
-        f"--steps {run.steps} --envs {run.envs} --seed {seed}"
-    )
-    run.versions = training_run.installed_versions()
+    run = training_run.opened_run(out, run, resume)
     with progress_bar() as bar:
         line = bar.add_task(f"training {algo}", total=run.steps)
         trainer(
@@ -407,7 +413,7 @@ def seeds(
     cls = task_class(found[0].run.environment)
     scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
     opponents = policy or training_seeds.default_opponents(cls.id)
-    marker = f"seeds {cls.id.removeprefix('filtergym/')}"
+    marker = f"seeds {short_name(cls.id)}"
     for file in (out, curves):
         if file is not None:
             writable_folder(file.parent)
@@ -415,17 +421,11 @@ def seeds(
         split_at_markers(into, marker)
     if curves is not None:
         save(training_seeds.learning_curves(found), curves)
-    records: list[training_seeds.Comparison] = []
-    grids = []
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
-        for name in scenarios:
-            means = training_seeds.episode_means(
-                found, opponents, name, episodes, seed, split, lambda done: bar.update(line, advance=done)
-            )
-            comparisons = training_seeds.compare(found, means, name, seed, split)
-            records += comparisons
-            grids += training_seeds.comparison_grids(found, comparisons)
+        records, grids = training_seeds.compare_scenarios(
+            found, opponents, scenarios, episodes, seed, split, lambda done: bar.update(line, advance=done)
+        )
     for grid in grids:
         console.print(grid_table(grid))
     if out is not None:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
-from filtergym.baselines.evaluation import evaluate, load_policy
-from filtergym.baselines.policy import ConstantPolicy
 from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.evaluation.competitors import ConstantPolicy
+
+from filtergym import evaluate
+from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
 SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
@@ -115,7 +117,7 @@ def paid(env, actions):
 
 
 def test_zero_correction_is_exactly_the_policy():
-    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
     env = ResidualActions(gymnasium.make(ID), policy)
     memory = None
 
@@ -134,7 +136,7 @@ def test_zero_correction_is_exactly_the_policy():
 
 def test_zero_correction_is_exactly_the_policy_in_an_evaluation():
     def corrected(task):
-        return ResidualPolicy(task, load_policy(ID, "adaptive")(task), Correction(task))
+        return ResidualPolicy(task, competitor(ID, "adaptive")(task), Correction(task))
 
     corrected.control = "gain"
     dataset = evaluate(ID, {"adaptive": "adaptive", "residual": corrected}, episodes=20)
@@ -145,7 +147,7 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
     pytest.importorskip("stable_baselines3")
     from filtergym.agents import to_sb3
 
-    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
 
     def native():
         return gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", horizon=30)
@@ -165,7 +167,7 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
 
 
 def test_residuals_that_cannot_be():
-    policy = load_policy(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
     with pytest.raises(ValueError, match="made for control 'gain', but the environment has 'weights'"):
         ResidualActions(gymnasium.make(ID, control="weights"), policy)
     with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):
@@ -177,7 +179,7 @@ def test_residuals_that_cannot_be():
 def test_shipped_agents_need_no_torch():
     code = (
         "import sys, filtergym\n"
-        "from filtergym.baselines import evaluate\n"
+        "from filtergym import evaluate\n"
         f"evaluate({ID!r}, ['ppo', 'bptt'], episodes=2)\n"
         "assert not {'torch', 'stable_baselines3', 'yaml'} & set(sys.modules)"
     )

@@ -7,9 +7,11 @@ import signal
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.baselines.evaluation import evaluate, load_policy
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
+
+from filtergym import evaluate
+from filtergym.names import competitor
 
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
@@ -135,7 +137,7 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     train(small_run(algorithm, 240, control=control), tmp_path)
     file = tmp_path / "agent.safetensors"
     export_run(tmp_path, file)
-    policy = load_policy(ID, str(file))(make_task(ID, control))
+    policy = competitor(ID, str(file))(make_task(ID, control))
     model = load_sb3_policy(tmp_path / "best" / "model.zip")
     shown = np.random.default_rng(0).normal(0.0, 3.0, (50, *model.observation_space.shape))
     action, expected = policy.predict(shown)[0], model.predict(shown)[0]
@@ -265,10 +267,10 @@ def test_normalisation_is_found_where_rl_zoo3_puts_it(tmp_path):
 def test_files_that_are_no_policies(tmp_path):
     for name in ("a.zip", "a.safetensors"):
         with pytest.raises(ValueError, match=r"no (model|learned policy) at"):
-            load_policy(ID, str(tmp_path / name))
+            competitor(ID, str(tmp_path / name))
         (tmp_path / name).write_bytes(b"garbage" * 30)
         with pytest.raises(ValueError, match=r"cannot read the model|is not a learned policy"):
-            load_policy(ID, str(tmp_path / name))
+            competitor(ID, str(tmp_path / name))
 
 
 def recurrent_agent(control, layers=1):

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from filtergym.baselines.bootstrap import Bootstrap
-from filtergym.baselines.metrics import mean_of_present
+from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.metrics import mean_of_present
 from scipy import stats
 
 

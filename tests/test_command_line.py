@@ -125,10 +125,9 @@ def test_full_benchmark_compares_everything():
 
 
 def test_comparison_shows_what_the_records_say(tmp_path):
-    from filtergym.baselines import evaluate, tidy_records
-
+    from filtergym import evaluate, tidy_records
     from filtergym.reports import comparison
-    from filtergym.results import write_records
+    from filtergym.reports.records import write_records
 
     names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]
     records = tidy_records(evaluate(ENV, names, episodes=10, split="validation"))

@@ -7,10 +7,12 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines.evaluation import baselines_of, evaluate
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, register
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from gymnasium.utils.env_checker import check_env
+
+from filtergym import evaluate
 
 ALLOWED_WARNINGS = (
     "A Box observation space minimum value is -infinity",  # innovations have no bound

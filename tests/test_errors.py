@@ -3,10 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines.evaluation import evaluate, load_policy
-from filtergym.baselines.seeds import episode_seeds
 from filtergym.envs.catalogue import catalogue, make_task, task_class
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.evaluation.seeds import episode_seeds
+
+from filtergym import evaluate
+from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -170,9 +172,9 @@ class TestPolicies:
 
     def test_not_importable(self):
         with pytest.raises(ValueError, match="cannot load policy 'nowhere:Policy'"):
-            load_policy(ID, "nowhere:Policy")
+            competitor(ID, "nowhere:Policy")
         with pytest.raises(ValueError, match="cannot load policy 'math:Policy'"):
-            load_policy(ID, "math:Policy")
+            competitor(ID, "math:Policy")
 
     def test_none(self):
         with pytest.raises(ValueError, match="at least one policy"):

@@ -7,13 +7,13 @@ import gymnasium
 import numpy as np
 import pytest
 import xarray
-from filtergym.baselines import evaluate, tidy_records
-from filtergym.baselines.evaluation import baselines_of
-from filtergym.baselines.policy import Policy
-from filtergym.baselines.seeds import episode_seeds
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.tuning import mean_cost, merged_table, stored_values, tune
+from filtergym.evaluation.competitors import Policy
+from filtergym.evaluation.seeds import episode_seeds
 
 import filtergym
+from filtergym import evaluate, tidy_records
 
 ENV = "filtergym/ManeuveringTarget-v0"
 assert filtergym

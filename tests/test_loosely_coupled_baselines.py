@@ -5,18 +5,20 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines import evaluate, tidy_records
-from filtergym.baselines.evaluation import baselines_of, load_policy
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation import reproduction as paper
 from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
-from filtergym.baselines.rollout import run_policy, run_reference
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.lanes import _replace_lanes
+from filtergym.evaluation.competitors import kind_of
+from filtergym.evaluation.rollout import run_policy, run_reference
 from filtergym.filters import kalman_bucy, loosely_coupled
 from filtergym.filters.linear_systems import van_loan
 
 import filtergym  # noqa: F401  # registers the environments
+from filtergym import evaluate, tidy_records
+from filtergym.names import competitor
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
 KNOWN = baselines_of(ID)
@@ -40,10 +42,10 @@ def on_paper():
 
 def steered(name, scenario, seeds, **keywords):
     """States after every action of a policy or reference, one list."""
-    maker = load_policy(ID, name)
+    maker = competitor(ID, name)
     task = make_task(ID, getattr(maker, "control", None), scenario, **keywords)
     states = []
-    run = run_policy if KNOWN.kind(name) == "policy" else run_reference
+    run = run_policy if kind_of(maker) == "policy" else run_reference
     run(task, maker(task), seeds, states.append, lambda _: None)
     return task, states
 
@@ -191,7 +193,7 @@ def test_a_gain_can_follow_the_augmented_filter(on_paper):
 
 def test_policies_forget_at_the_start_of_an_episode():
     for name in ("time-varying", "innovation-adaptive", "augmented-gain"):
-        maker = load_policy(ID, name)
+        maker = competitor(ID, name)
         env = gym.make(ID, control="gain")
         policy = maker(env.unwrapped.task)
         shown = [env.reset(seed=4)[0], *(env.step(np.array([0.4]))[0] for _ in range(20))]

@@ -5,13 +5,14 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines.evaluation import evaluate
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.trajectory import Trajectory, flown_legs
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from scipy.stats import multivariate_normal
+
+from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
 T, RANGE_SIGMA, BEARING_SIGMA = 6.0, 100.0, math.radians(0.25)

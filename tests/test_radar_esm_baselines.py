@@ -5,15 +5,15 @@ import math
 import gymnasium
 import numpy
 import pytest
-from filtergym.baselines import evaluate, tidy_records
-from filtergym.baselines.bootstrap import Bootstrap
-from filtergym.baselines.evaluation import baselines_of
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking import reproduction as reproduction
-from filtergym.baselines.rollout import started_lanes
 from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.rollout import started_lanes
 
 import filtergym  # noqa: F401  # registers the environments
+from filtergym import evaluate, tidy_records
 
 ID = "filtergym/RadarEsmTracking-v0"
 WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}

@@ -8,12 +8,13 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.baselines.animation import episode_frames, write_animation
 from filtergym.envs import rendering
 from filtergym.envs.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
+from filtergym.evaluation.animation import episode_frames, write_animation
 
 import filtergym  # noqa: F401  # registers the environments
+from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
 CONTROLS = ("gain", "mode", "weights", "evidence")
@@ -248,7 +249,7 @@ def test_human_mode_draws_each_step_into_one_window(monkeypatch):
 def test_animation_is_a_small_looping_file(tmp_path):
     from PIL import Image
 
-    frames = episode_frames(ID, "imm", "paper", seed=3, every=5, horizon=21)
+    frames = episode_frames(ID, "imm", competitor(ID, "imm"), "paper", seed=3, every=5, horizon=21)
     assert len(frames) == 6  # the reset, scans 5, 10, 15, 20, and the last
     path = tmp_path / "new" / "imm.gif"
     write_animation(frames, path)
@@ -258,4 +259,4 @@ def test_animation_is_a_small_looping_file(tmp_path):
         assert image.size == (960, 608)
         assert image.info["loop"] == 0
     with pytest.raises(ValueError, match="does not act"):
-        episode_frames(ID, "known-turn")
+        episode_frames(ID, "known-turn", competitor(ID, "known-turn"))

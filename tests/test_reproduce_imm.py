@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.baselines.bootstrap import Bootstrap, Estimate
-from filtergym.baselines.evaluation import evaluate
 from filtergym.baselines.maneuvering_target import reproduction as paper
 from filtergym.baselines.maneuvering_target.gain_schedules import (
     best_schedule,
@@ -22,6 +20,9 @@ from filtergym.baselines.maneuvering_target.imm_readings import (
     recorded,
 )
 from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.bootstrap import Bootstrap, Estimate
+
+from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
 

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from filtergym.baselines.figures import save
 from filtergym.baselines.reproduction import (
     Claim,
     Grid,
@@ -14,9 +13,8 @@ from filtergym.baselines.reproduction import (
     papers,
     save_reproduction,
 )
+from filtergym.evaluation.figures import save
 from matplotlib.figure import Figure
-
-from filtergym.results import write_text
 
 
 def example() -> Reproduction:
@@ -65,7 +63,7 @@ def test_the_page_holds_claims_tables_and_figures() -> None:
 
 
 def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path) -> None:
-    save_reproduction(example(), tmp_path, write_text)
+    save_reproduction(example(), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["figure_1.png", "figure_2.png", "report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == as_markdown(example())
     assert (tmp_path / "figure_2.png").read_bytes().startswith(b"\x89PNG")
@@ -80,7 +78,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     result = example()
     result.figures["figure_2"] = Unpaintable()
     with pytest.raises(RuntimeError, match="no ink"):
-        save_reproduction(result, tmp_path, write_text)
+        save_reproduction(result, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == "the last one"
 

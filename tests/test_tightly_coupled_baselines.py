@@ -4,21 +4,19 @@ import math
 
 import numpy
 import pytest
-from filtergym.baselines import evaluate, tidy_records
-from filtergym.baselines.bootstrap import Bootstrap, Estimate
-from filtergym.baselines.evaluation import baselines_of
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.reproduction import save_reproduction
-from filtergym.baselines.rollout import run_bound, run_policy
-from filtergym.baselines.seeds import episode_seeds
 from filtergym.baselines.tightly_coupled_navigation import policies as policies
 from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER
-from filtergym.filters import gnss_ins
-from naive import dense
+from filtergym.evaluation.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.rollout import run_bound, run_policy
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.filters import extended_kalman, gnss_ins
 
-from filtergym.results import write_text
+from filtergym import evaluate, tidy_records
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
 KNOWN = baselines_of(ID)
@@ -328,7 +326,7 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
     assert verdicts["C5"] == "reproduced"
     for table in result.tables:
         assert {len(row) for row in table.rows} == {len(table.header)}
-    save_reproduction(result, tmp_path, write_text)
+    save_reproduction(result, tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"report.md", *(f"{name}.png" for name in result.figures)}
 
 

@@ -7,13 +7,15 @@ from typing import Any
 import numpy
 import pytest
 import xarray
-from filtergym.baselines.bootstrap import Bootstrap
-from filtergym.baselines.evaluation import baselines_of, evaluate
-from filtergym.baselines.metrics import Record, tidy_records
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot import reproduction as paper
 from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.metrics import Record
 from filtergym.filters import linear_systems
+
+from filtergym import evaluate, tidy_records
 
 ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])

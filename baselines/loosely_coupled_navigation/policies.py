@@ -18,10 +18,11 @@ from ...envs.loosely_coupled_navigation.task import (
     within,
 )
 from ...envs.task import Array
+from ...evaluation.bootstrap import Bootstrap
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.metrics import Measure, mean_of_present
 from ...filters import loosely_coupled as ins_gnss
-from ..bootstrap import Bootstrap
-from ..metrics import Measure, mean_of_present
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from ..table import Baselines, Tunable
 
 # --- the plain scheme with a constant gain
 
@@ -280,6 +281,7 @@ class Matched:
     square error. Spoofed measurements it leaves out, like those of an outage.
     """
 
+    kind = "reference"
     knows = (
         "the true intensities of all noises, every change of the receiver's, and which samples are spoofed"
     )
@@ -339,6 +341,8 @@ class Matched:
 
 class MatchedCovariance(Matched):
     """The variance of ``matched``: least mean square error of an estimator with the data it uses."""
+
+    kind = "bound"
 
     def update(  # a bound gives mean squares in place of a state
         self, state: LooselyCoupledNavigationState, memory: ErrorState
@@ -451,6 +455,7 @@ TUNABLE = {
 }
 
 BASELINES = Baselines(
+    environment="filtergym/LooselyCoupledNavigation-v0",
     policies={
         "plain-reduced": PlainReduced,
         "plain-white": PlainWhite,

@@ -16,15 +16,15 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation, LooselyCoupledNavigationState
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.figures import styles
+from ...evaluation.rollout import run_policy
+from ...evaluation.seeds import episode_seeds
 from ...filters import kalman_bucy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.linear_systems import steady_kalman_bucy, van_loan
-from ..bootstrap import Bootstrap, Estimate
-from ..evaluation import evaluate, load_policy
-from ..figures import styles
+from ..names import evaluate, own_competitor
 from ..reproduction import Claim, Grid, Reproduction, episode_count
-from ..rollout import run_policy
-from ..seeds import episode_seeds
 
 TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they follow, and INS/GNSS fusion"
 ENV = LooselyCoupledNavigation.id
@@ -158,7 +158,7 @@ class Run(NamedTuple):
 
 def example_run(name: str) -> Run:
     """Fly one episode with the drift ``DRIFT``."""
-    maker = load_policy(ENV, name)
+    maker = own_competitor(ENV, name)
     task: Any = make_task(ENV, maker.control, "paper", fixed_drift=DRIFT)
     rows: list[list[float]] = []
 

@@ -13,10 +13,10 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.task import Episode, Initial
+from ...evaluation.rollout import started_lanes
+from ...evaluation.seeds import episode_seeds
 from ...filters import alpha_beta, imm, kalman
 from ...filters.gaussian import log_density
-from ..rollout import started_lanes
-from ..seeds import episode_seeds
 
 
 class Recording(NamedTuple):

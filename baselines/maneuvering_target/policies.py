@@ -13,7 +13,8 @@ from ...envs.maneuvering_target.banks import GainBank
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.task import Task
 from ...filters import imm
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ..table import Baselines, Tunable
 from .references import KalmanInteractingMultipleModel, KnownInputBound, KnownTurn
 
 
@@ -189,6 +190,7 @@ TUNABLE = {
 }
 
 BASELINES = Baselines(
+    environment="filtergym/ManeuveringTarget-v0",
     policies={
         "imm": InteractingMultipleModel,
         "zero": ZeroEvidence,

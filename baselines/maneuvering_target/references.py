@@ -26,6 +26,7 @@ class KnownTurn(_KalmanReference):
     Inside a manoeuvre its acceleration noise is as large as the manoeuvre's acceleration, elsewhere zero.
     """
 
+    kind = "reference"
     knows = "the scans of every manoeuvre and the size of its acceleration"
 
     def start(self, initial: Initial, truth: Truth) -> Initial:
@@ -72,6 +73,7 @@ class KalmanBank(NamedTuple):
 class KalmanInteractingMultipleModel(_KalmanReference):
     """The usual IMM over two Kalman filters: no manoeuvre, and white acceleration of 2.775 m/s^2."""
 
+    kind = "reference"
     knows = "nothing hidden, but its filters are outside what the action can steer"
     sigmas: ClassVar[tuple[float, float]] = (0.0, 2.775)
 
@@ -109,6 +111,7 @@ class KalmanInteractingMultipleModel(_KalmanReference):
 class KnownInputBound(_KalmanReference):
     """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
 
+    kind = "bound"
     knows = "the acceleration in every scan"
 
     def start(self, initial: Initial, truth: Truth) -> Array:

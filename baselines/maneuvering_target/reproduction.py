@@ -17,9 +17,9 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ..bootstrap import Bootstrap, Estimate
-from ..evaluation import evaluate
-from ..figures import styles
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.figures import styles
+from ..names import evaluate
 from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
 from .gain_schedules import Flight, best_schedule, maneuver_flight, mean_square_errors, ramp_schedule
 from .imm_readings import Likelihood, Reading, Recording, interacting_multiple_model, recorded

@@ -13,11 +13,12 @@ import xarray
 from ...envs.controls import signed_exponential
 from ...envs.radar_esm_tracking.task import COUNT_SHOWN, RadarEsmTracking, State
 from ...envs.task import Array, Task
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.metrics import Measure, squared_errors
 from ...filters import bounds, class_fusion, imm, kalman
 from ...filters.small_matrices import cholesky
-from ..bootstrap import Bootstrap, Estimate
-from ..metrics import Measure, squared_errors
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from ..table import Baselines, Tunable
 
 SURE = 0.9
 """Probability from which a class counts as recognised."""
@@ -239,6 +240,7 @@ class _KnownClass:
 class Ideal(_KnownClass):
     """The Kalman filter of the true class; where the class changes it switches its model at that scan."""
 
+    kind = "reference"
     knows = "the true class at every scan"
 
     def start(self, state: State) -> _Track:
@@ -271,6 +273,7 @@ class Ideal(_KnownClass):
 class KnownClassBound(_KnownClass):
     """Exact mean square error of the ideal filter, by its covariance recursion: no estimator does better."""
 
+    kind = "bound"
     knows = "the true class at every scan"
 
     def start(self, state: State) -> _Track:
@@ -449,6 +452,7 @@ TUNABLE = {
 }
 
 BASELINES = Baselines(
+    environment="filtergym/RadarEsmTracking-v0",
     policies={
         "quasi-optimal": QuasiOptimal,
         "joint-type": JointType,

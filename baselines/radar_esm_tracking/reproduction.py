@@ -19,9 +19,9 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
+from ...evaluation.figures import styles
 from ...filters import class_fusion
-from ..evaluation import evaluate
-from ..figures import styles
+from ..names import evaluate
 from ..reproduction import Claim, Grid, Reproduction, Verdict
 from .policies import SURE
 

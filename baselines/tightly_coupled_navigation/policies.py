@@ -21,10 +21,11 @@ from ...envs.tightly_coupled_navigation.task import (
     State,
     TightlyCoupledNavigation,
 )
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.metrics import Measure, squared_errors
 from ...filters import extended_kalman, gnss_ins
-from ..bootstrap import Bootstrap, Estimate
-from ..metrics import Measure, squared_errors
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from ..table import Baselines, Tunable
 
 LASTING = 10
 """Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
@@ -272,6 +273,7 @@ class KnownMode(_KnownMode):
     its standard deviation.
     """
 
+    kind = "reference"
     knows = (
         "the true hypothesis at every step, when a manoeuvre begins, the true noise of every sensor, when the "
         "accelerometers stick, and multipath errors"
@@ -325,6 +327,7 @@ class KnownModeBound(_KnownMode):
     known), Singer's in manoeuvres, and the acceleration with which each begins given.
     """
 
+    kind = "bound"
     knows = (
         "the true hypothesis at every step, the acceleration with which a manoeuvre begins, the true noise of "
         "every sensor, when the accelerometers stick, and multipath errors"
@@ -545,6 +548,7 @@ TUNABLE = {
 }
 
 BASELINES = Baselines(
+    environment="filtergym/TightlyCoupledNavigation-v0",
     policies={
         "multi-hypothesis": MultiHypothesis,
         "sticky": Sticky,

@@ -22,13 +22,13 @@ from ...envs.catalogue import make_task
 from ...envs.controls import signed_exponential
 from ...envs.task import Task
 from ...envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER, TightlyCoupledNavigation
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.competitors import Policy
+from ...evaluation.figures import styles
+from ...evaluation.rollout import run_policy, run_reference
+from ...evaluation.seeds import episode_seeds
 from ...filters import gnss_ins, imm
-from ..bootstrap import Bootstrap, Estimate
-from ..figures import styles
-from ..policy import Policy
 from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
-from ..rollout import run_policy, run_reference
-from ..seeds import episode_seeds
 from .policies import KnownMode, chain, lasting, switches
 
 TITLE = "Adaptive multi-hypothesis algorithm of an inertial-satellite navigation system"

@@ -13,10 +13,11 @@ from ...envs.catalogue import make_task
 from ...envs.controls import signed_exponential
 from ...envs.task import Array
 from ...envs.uav_autopilot.task import MODES, State, UavAutopilot
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.metrics import Measure
 from ...filters import linear_systems, packed_covariance
-from ..bootstrap import Bootstrap, Estimate
-from ..metrics import Measure
-from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from ..table import Baselines, Tunable
 
 OVER_SMOOTHED, WIDE_BAND = 0.01, 100.0
 """Factors on the process noise of the two badly tuned filters."""
@@ -122,6 +123,7 @@ class InnovationAdaptive(Policy):
 class TrueState:
     """The autopilot gets the state itself: no estimator feeds this loop better."""
 
+    kind = "reference"
     knows = "the whole state"
 
     def __init__(self, task: UavAutopilot) -> None:
@@ -142,6 +144,7 @@ class Matched:
     It is not told of a slower actuator.
     """
 
+    kind = "reference"
     knows = "the present level of the disturbance and of each sensor's noise"
 
     def __init__(self, task: UavAutopilot) -> None:
@@ -191,6 +194,7 @@ class Matched:
 class SteadyKalman:
     """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
 
+    kind = "reference"
     knows = "nothing hidden, but its gain is outside what the action can steer"
 
     def __init__(self, task: UavAutopilot) -> None:
@@ -224,6 +228,7 @@ class KnownNoiseBound:
     does not depend on the control: the filters of all policies face the same bound.
     """
 
+    kind = "bound"
     knows = "the level of every noise and the true actuator"
 
     def __init__(self, task: UavAutopilot) -> None:
@@ -468,6 +473,7 @@ TUNABLE = {
 }
 
 BASELINES = Baselines(
+    environment="filtergym/UavAutopilot-v0",
     policies={
         "kalman": Kalman,
         "over-smoothed": OverSmoothed,

@@ -17,12 +17,12 @@ import numpy
 
 from ...envs.catalogue import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
+from ...evaluation.figures import COLOURS
+from ...evaluation.rollout import run_policy, run_reference
+from ...evaluation.seeds import episode_seeds
 from ...filters import linear_systems
-from ..evaluation import evaluate
-from ..figures import COLOURS
+from ..names import evaluate
 from ..reproduction import Claim, Grid, Reproduction, episode_count
-from ..rollout import run_policy, run_reference
-from ..seeds import episode_seeds
 from .policies import Kalman, RawSensors, TrueState, stationary
 
 TITLE = "Stochastic simulation of a UAV autopilot with the optimal Kalman filter (Gridnev, Rusetski, Rak)"

@@ -4,18 +4,19 @@ Quick: the telling policies in the paper's scenario and the training distributio
 compare, in all scenarios, tuned and learned policies among them.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.evaluation import baselines_of, evaluate
-from ..baselines.figures import evaluation_figures, save
-from ..baselines.metrics import Record, tidy_records
+from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
-from ..envs.catalogue import catalogue, task_class
-from ..results import writable_folder, write_records
+from ..envs.catalogue import catalogue, short_name, task_class
+from ..evaluation.figures import evaluation_figures, save
+from ..evaluation.files import writable_folder
+from ..evaluation.metrics import Record
+from ..names import evaluate, tidy_records
+from .records import read_records, write_records
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
@@ -34,7 +35,7 @@ class Cell(NamedTuple):
     @property
     def name(self) -> str:
         """Start of the names of the cell's files."""
-        return f"{self.environment.removeprefix('filtergym/')}.{self.scenario}"
+        return f"{short_name(self.environment)}.{self.scenario}"
 
     @property
     def measurements(self) -> int:
@@ -55,9 +56,10 @@ def benchmark_policies(id: str, full: bool) -> tuple[str, ...]:
     known = baselines_of(id)
     if not full:
         return known.benchmark or known.names
-    tuned = tuned_names(id, known.tunable)
+    tuned = tuned_names(id)
     everything = (known.score_paper, *known.policies, *tuned, *shipped_agents(id))
-    return tuple(dict.fromkeys((*everything, *known.references, *known.bounds)))
+    names = dict.fromkeys((*everything, *known.references, *known.bounds))
+    return tuple(name for name in names if name)
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
@@ -128,9 +130,7 @@ def run_benchmark(
     for cell in wanted:
         path = unfinished / f"{cell.name}.{cell.episodes}.{split}{seed}.json"
         tick = started(cell, cell.measurements)
-        done: list[Record] = []
-        if path.exists():
-            done = [Record(**values) for values in json.loads(path.read_text(encoding="utf-8"))]
+        done = read_records(path) if path.exists() else []
         if {record.policy for record in done} == set(cell.policies):
             tick(cell.measurements)
         else:

@@ -1,16 +1,16 @@
 """The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.evaluation import baselines_of
-from ..baselines.figures import draw_differences
-from ..baselines.metrics import Record
+from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import Grid, markdown_table
 from ..envs.catalogue import task_class
+from ..evaluation.figures import draw_differences
+from ..evaluation.metrics import Record
+from .records import read_records
 from .tables import with_interval
 
 DIFFERENCE = "relative_cost_difference"
@@ -30,12 +30,8 @@ def read_benchmark(path: Path) -> dict[str, list[Record]]:
     Raises:
         ValueError: if the file is not one.
     """
-    try:
-        records = [Record(**values) for values in json.loads(path.read_text(encoding="utf-8"))]
-    except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"cannot read the records of a benchmark in {path}: {error}") from error
     found: dict[str, list[Record]] = {}
-    for record in records:
+    for record in read_records(path):
         found.setdefault(record.environment, []).append(record)
     return found
 
@@ -63,7 +59,7 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
     """
     cls = task_class(records[0].environment)
     known = baselines_of(cls.id)
-    paper, columns = known.score_paper, compared_policies(cls.id, records)
+    paper, columns = paper_of(cls.id), compared_policies(cls.id, records)
     if paper not in {record.policy for record in records}:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records if r.window == "all"}
@@ -84,7 +80,8 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
         *columns,
         *(name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found),
     ]
-    heads = {name: f"`{name}`{_role(cls.id, name)}" for name in (paper, *shown)}
+    kinds, learned = {r.policy: r.kind for r in records}, shipped_agents(cls.id)
+    heads = {name: f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in (paper, *shown)}
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
     grids = [
         Grid(
@@ -109,21 +106,16 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             percent = tuple(100.0 * x for x in interval if x is not None)
             if len(percent) == 3:
                 row[name] = percent
-    figure = draw_differences(differences, columns, shipped_agents(cls.id), cls.id, paper)
+    figure = draw_differences(differences, columns, learned, cls.id, paper)
     return Comparison(cls.id, grids, figure)
 
 
-def _role(id: str, name: str) -> str:
-    known = baselines_of(id)
-    if name == known.score_paper:
+def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
+    if name == paper:
         return " (paper)"
-    return (
-        " (learned)"
-        if name in shipped_agents(id)
-        else ""
-        if known.kind(name) == "policy"
-        else f" ({known.kind(name)})"
-    )
+    if name in learned:
+        return " (learned)"
+    return "" if kind == "policy" else f" ({kind})"
 
 
 def _two_lines(record: Record | None, scale: float) -> str:

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
-from ..baselines.evaluation import baselines_of, evaluate
-from ..baselines.metrics import Record, tidy_records
+from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import markdown_table
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import task_class
+from ..evaluation.metrics import Record
+from ..names import evaluate, tidy_records
 from .tables import main_components, with_interval
 
 MARKER = "room table"
@@ -16,11 +17,11 @@ MARKER = "room table"
 def room_policies(id: str) -> list[str]:
     """Names in the room table: best constant action, paper, tuned policies, references, bounds."""
     known = baselines_of(id)
-    tuned = tuned_names(id, known.tunable)
+    tuned = tuned_names(id)
     constant = f"{known.best_constant}-tuned"
     first = [constant] if constant in tuned else []
     others = [name for name in tuned if name != constant]
-    return [*first, known.score_paper, *others, *known.references, *known.bounds]
+    return [*first, paper_of(id), *others, *known.references, *known.bounds]
 
 
 def measure_room(id: str, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:

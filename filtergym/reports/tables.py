@@ -1,12 +1,14 @@
 """Tables of results for the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
 
-from ..baselines.reproduction import Grid
+from ..baselines.catalogue import baselines_of
+from ..baselines.reproduction import Grid, Reproduction
+from ..baselines.tuning import Tuned
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
@@ -80,11 +82,29 @@ def results_table(records: Sequence[Any]) -> Table:
         score = found.get((name, "score", "", "all"))
         row.append("no room" if score is not None and score.value is None else with_interval(score))
         table.add_row(*row)
-    table.caption = (
-        "score: 0 = the paper's algorithm, 1 = the reference that it is measured against.\n"
-        "References and bounds know what no policy can."
-    )
+    known = baselines_of(first.environment)
+    told = {**known.references, **known.bounds}
+    notes = ["score: 0 = the paper's algorithm, 1 = the reference that it is measured against."]
+    notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
+    table.caption = escape("\n".join(notes))
     table.caption_justify = "left"
+    return table
+
+
+def claims_table(result: Reproduction) -> Table:
+    """Return the claims of a paper with what was measured and the verdicts."""
+    table = Table("claim", "what was measured", "verdict", title=result.title, show_lines=True)
+    for claim in result.claims:
+        table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
+    return table
+
+
+def tuned_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
+    """Return what a search has found beside the values that it started from."""
+    table = Table("value", "untuned", "tuned", title=f"{outcome.policy} on {outcome.scenario}")
+    for name, value in outcome.values.items():
+        table.add_row(name, f"{start[name]:g}", f"{value:g}")
+    table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
     return table
 
 

@@ -12,12 +12,15 @@ import numpy
 from scipy.special import stdtrit
 
 from ..agents.training_run import TrainingRun, best_agent, load_run
-from ..baselines.bootstrap import CONFIDENCE, Bootstrap, Estimate
-from ..baselines.evaluation import baselines_of, evaluate, load_policy
-from ..baselines.figures import draw_learning_curves
-from ..baselines.metrics import reported_components, score, squared_errors
+from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import Grid, markdown_table
 from ..baselines.tuning import tuned_names
+from ..envs.catalogue import task_class
+from ..evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
+from ..evaluation.competitors import kind_of
+from ..evaluation.figures import draw_learning_curves
+from ..evaluation.metrics import reported_components, score, squared_errors
+from ..names import competitor, evaluate
 from .tables import shown_components, with_interval
 
 
@@ -152,15 +155,15 @@ def learning_curves(runs: Sequence[SeedRun]) -> Any:
         values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
         curves.setdefault(member.algorithm, []).append((steps, values))
     title = f"{first.environment}, scenario {first.scenario}; dots: best agents"
-    return draw_learning_curves(curves, title, baselines_of(first.environment).score_paper)
+    return draw_learning_curves(curves, title, paper_of(first.environment))
 
 
 def default_opponents(id: str) -> list[str]:
     """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
     known = baselines_of(id)
     untuned = [name for name in known.tunable if name != known.best_constant]
-    tuned = tuned_names(id, known.tunable)
-    return list(dict.fromkeys([known.score_paper, *known.compared, *untuned, *tuned, *known.references]))
+    tuned = tuned_names(id)
+    return list(dict.fromkeys([paper_of(id), *known.compared, *untuned, *tuned, *known.references]))
 
 
 def episode_means(
@@ -179,12 +182,12 @@ def episode_means(
     """
     id = runs[0].run.environment
     policies: dict[str, tuple[Any, str | None]] = {
-        member.name: (load_policy(id, str(member.agent)), member.run.control) for member in runs
+        member.name: (competitor(id, str(member.agent)), member.run.control) for member in runs
     }
-    for name in dict.fromkeys([baselines_of(id).score_paper, *opponents]):
-        if baselines_of(id).kind(name) == "bound":
+    for name in dict.fromkeys([paper_of(id), *opponents]):
+        policies[name] = competitor(id, name), None
+        if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
-        policies[name] = load_policy(id, name), None
     cost: dict[str, numpy.ndarray] = {}
     squares: dict[str, dict[str, numpy.ndarray]] = {}
     units: dict[str, str] = {}
@@ -209,8 +212,8 @@ def compare(
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
     """
-    id: str = runs[0].run.environment
-    paper, reference = baselines_of(id).score_paper, baselines_of(id).score_bound
+    id = task_class(runs[0].run.environment).id
+    paper, reference = paper_of(id), baselines_of(id).score_bound
     episodes = len(means.cost[paper])
     bootstrap = Bootstrap(episodes)
     cost = {name: bootstrap.means(values) for name, values in means.cost.items()}
@@ -279,7 +282,7 @@ def compare(
 def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison]) -> list[Grid]:
     """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
     first = comparisons[0]
-    paper = baselines_of(first.environment).score_paper
+    paper = paper_of(first.environment)
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
     units = {c.component: c.unit for c in comparisons if c.metric == "rmse"}
     errors = [f"RMSE {name.replace('_', ' ')}, {unit}" for name, unit in units.items()]
@@ -335,6 +338,26 @@ def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison])
         ],
     )
     return [each, variation, medians]
+
+
+def compare_scenarios(
+    runs: Sequence[SeedRun],
+    opponents: Sequence[str],
+    scenarios: Sequence[str],
+    episodes: int,
+    seed: int,
+    split: str,
+    progress: Callable[[int], None] = lambda done: None,
+) -> tuple[list[Comparison], list[Grid]]:
+    """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them."""
+    records: list[Comparison] = []
+    grids: list[Grid] = []
+    for scenario in scenarios:
+        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress)
+        comparisons = compare(runs, means, scenario, seed, split)
+        records += comparisons
+        grids += comparison_grids(runs, comparisons)
+    return records, grids
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[SeedRun], command: str) -> str:

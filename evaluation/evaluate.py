@@ -3,81 +3,22 @@
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
 """
 
-import importlib
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy
 import xarray
 
-from ..envs.catalogue import catalogue, find_scenario, make_task, nearest, task_class
+from ..envs.catalogue import find_scenario, make_task, nearest, task_class
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
-from .policy import LOADERS, Baselines
+from .competitors import kind_of
 from .rollout import Progress, run_bound, run_policy, run_reference
 from .seeds import episode_seeds
-from .tuning import tuned_names, tuned_policy
 
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
-
-
-class TunedPolicy(NamedTuple):
-    """A policy with tuned values, some of which belong to the task."""
-
-    task_keywords: dict[str, Any]
-    control: str
-    make: Callable[[Task], Any]
-
-    def __call__(self, task: Task) -> Any:
-        """Make the policy for a task."""
-        return self.make(task)
-
-
-@cache
-def _all_baselines() -> dict[str, Baselines]:
-    found = {}
-    for id, cls in catalogue().items():
-        room = cls.__module__.split(".")[-2]
-        found[id] = importlib.import_module(f"{__package__}.{room}").BASELINES
-    return found
-
-
-def baselines_of(id: str) -> Baselines:
-    """Return what an environment is compared with."""
-    return _all_baselines()[task_class(id).id]
-
-
-def load_policy(id: str, name: str) -> Any:
-    """Return what makes a policy, reference estimator or bound for a task.
-
-    Args:
-        id: environment id.
-        name: one of the environment's own, ``module:Class`` of a user's, or what one of ``LOADERS`` knows.
-
-    Raises:
-        ValueError: if there is no such name.
-    """
-    known = baselines_of(id)
-    for table in (known.policies, known.references, known.bounds):
-        if name in table:
-            return table[name]
-    if name.endswith("-tuned"):
-        return TunedPolicy(*tuned_policy(id, name.removesuffix("-tuned"), known.tunable))
-    if ":" in name:
-        module_name, _, attribute = name.partition(":")
-        try:
-            return getattr(importlib.import_module(module_name), attribute)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"cannot load policy {name!r}: {error}") from error
-    for loader in LOADERS:
-        maker = loader.load(task_class(id).id, name)
-        if maker is not None:
-            return maker
-    others = [other for loader in LOADERS for other in loader.names(task_class(id).id)]
-    raise nearest("policy", name, [*known.names, *tuned_names(id, known.tunable), *others])
 
 
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
@@ -129,26 +70,32 @@ def _run_chunk(
 
 def evaluate(
     env: str,
-    policies: Sequence[str] | Mapping[str, Any],
+    competitors: Mapping[str, Any],
     scenario: Any = None,
     episodes: int = 500,
     seed: int = 0,
     split: str = "test",
     control: str | None = None,
     progress: Progress | None = None,
+    *,
+    paper: str = "",
+    reference: str = "",
     **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, reference estimators and bounds over the same episodes.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        policies: names, or a mapping from a name to a name, a class, or an object with a ``predict`` method.
+        competitors: by the name that stands in the tables: each a class or function that makes it for a task,
+            or an object with a ``predict`` method.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
+        paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
+        reference: name of the competitor whose score is 1; kept likewise.
         **keywords: parameters of the task.
 
     Returns:
@@ -157,36 +104,28 @@ def evaluate(
         ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
 
     Raises:
-        ValueError: for unknown names, or a policy that does not fit the control.
+        ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
+            the control.
     """
     cls = task_class(env)
     chosen = find_scenario(cls, scenario, keywords)
-    known = baselines_of(cls.id)
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
-    makers: dict[str, Any] = (
-        {
-            name: load_policy(cls.id, entry) if isinstance(entry, str) else entry
-            for name, entry in policies.items()
-        }
-        if isinstance(policies, Mapping)
-        else {name: load_policy(cls.id, name) for name in policies}
-    )
-    if not makers:
+    if not competitors:
         raise ValueError("name at least one policy")
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
-    kinds = {name: known.kind(name) for name in makers}
+    kinds = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
     tasks: dict[str, Task] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
-    for name, maker in makers.items():
+    for name, maker in competitors.items():
         tuned_keywords = getattr(maker, "task_keywords", {})
         controls[name] = _control_of(maker, kinds[name], control, cls, name)
         tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
     for name, task in tasks.items():
-        shown = getattr(getattr(makers[name], "observation_space", None), "shape", None)
+        shown = getattr(getattr(competitors[name], "observation_space", None), "shape", None)
         if shown is not None and shown != (len(task.fields),):
             raise ValueError(
                 f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
@@ -194,19 +133,20 @@ def evaluate(
             )
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
-    for name, maker in makers.items():
+    for name, maker in competitors.items():
         make = maker if callable(maker) else lambda _task, maker=maker: maker
         chunks = [
             _run_chunk(tasks[name], make(tasks[name]), kinds[name], seeds[i : i + CHUNK], tick)
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
-    return _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
+    dataset = _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
+    return dataset.assign_attrs(paper=paper, reference=reference)
 
 
 def _dataset(
     per_policy: dict[str, dict[str, numpy.ndarray]],
-    kinds: dict[str, str],
+    kinds: Mapping[str, str],
     controls: dict[str, str],
     tasks: dict[str, Task],
     scenario: Scenario,

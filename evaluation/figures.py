@@ -8,6 +8,7 @@ import numpy
 import xarray
 
 from .bootstrap import Bootstrap
+from .files import whole_file
 from .metrics import reported_components, squared_errors
 
 LINES = ("-", "--", "-.", ":")
@@ -280,9 +281,5 @@ def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
 
 def save(figure: Any, path: Path) -> None:
     """Save a figure as PNG, whole or not at all."""
-    partial = path.with_suffix(".partial")
-    try:
+    with whole_file(path) as partial:
         figure.savefig(partial, format="png", dpi=130)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

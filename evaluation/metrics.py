@@ -5,14 +5,13 @@ numerator and denominator are resampled together.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
 from .bootstrap import Bootstrap, Estimate
-from .evaluation import baselines_of
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -139,32 +138,37 @@ def score(
 
 def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
-    known = baselines_of(dataset.attrs["environment"])
+    paper_name, reference_name = dataset.attrs["paper"], dataset.attrs["reference"]
     present = dataset["policy"].values.tolist()
-    if known.score_paper not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
+    if paper_name not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
     cost = {
         p: bootstrap.means(dataset["cost"].sel(policy=p).values.mean(axis=1))
-        for p in {name, known.score_paper, known.score_bound} & set(present)
+        for p in {name, paper_name, reference_name} & set(present)
     }
-    paper = cost[known.score_paper]
+    paper = cost[paper_name]
     yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
     yield Measure("relative_cost_difference", "", "all", bootstrap.interval(cost[name] / paper - 1.0), "1")
-    if known.score_bound in cost:
-        yield Measure("score", "", "all", score(cost[name], paper, cost[known.score_bound], bootstrap), "1")
+    if reference_name in cost:
+        yield Measure("score", "", "all", score(cost[name], paper, cost[reference_name], bootstrap), "1")
 
 
-def tidy_records(dataset: xarray.Dataset) -> list[Record]:
+def tidy_records(
+    dataset: xarray.Dataset, metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None = None
+) -> list[Record]:
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``, ``nees``, ``nis``, ``mean_mode_probability``, ``cost`` (uncapped mean), ``return`` (of
     the capped reward), ``beyond_huber_bound`` (share of measurements where the cap binds),
     ``cost_difference`` and ``relative_cost_difference`` to the paper's algorithm (paired), ``score``
-    = (C_paper - C) / (C_paper - C_bound), and the environment's own metrics.
+    = (C_paper - C) / (C_paper - C_reference), and the environment's own metrics.
+
+    Args:
+        dataset: from an evaluation.
+        metrics: the environment's own, from one policy's part of the dataset.
     """
     bootstrap = Bootstrap(dataset.sizes["episode"])
-    own = baselines_of(dataset.attrs["environment"]).metrics
     attrs = dataset.attrs
 
     def finite(value: float) -> float | None:
@@ -173,8 +177,8 @@ def tidy_records(dataset: xarray.Dataset) -> list[Record]:
     records = []
     for name in dataset["policy"].values.tolist():
         measures: list[Any] = [*_measures(dataset, name, bootstrap), *_comparisons(dataset, name, bootstrap)]
-        if own is not None:
-            measures += own(dataset.sel(policy=name), bootstrap)
+        if metrics is not None:
+            measures += metrics(dataset.sel(policy=name), bootstrap)
         for m in measures:
             records.append(
                 Record(

@@ -1,33 +1,29 @@
-"""Animated pictures of an episode under a policy, for documentation.
+"""Animated pictures of an episode under a policy, for documentation."""
 
-``python -m filtergym.baselines.animation ManeuveringTarget --scenario paper --policy imm --out DIR``
-"""
-
-import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import gymnasium
 import numpy
-import typer
 from PIL import Image
 
 from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
-from .evaluation import baselines_of, load_policy
+from .competitors import kind_of
+from .files import whole_file
 
 SHADES = 7
 """Steps from a colour of the figure to white, for smooth edges."""
 
 
 def episode_frames(
-    env: str, policy: str, scenario: Any = None, seed: int = 0, every: int = 2, **keywords: Any
+    env: str, name: str, policy: Any, scenario: Any = None, seed: int = 0, every: int = 2, **keywords: Any
 ) -> list[Image.Image]:
     """Play an episode and draw it.
 
     Args:
         env: environment id.
-        policy: name of one of its policies, or ``module:Class``.
+        name: of the policy, for the title.
+        policy: what makes it for a task, or an object with a ``predict`` method.
         scenario: name of a scenario, or a trajectory.
         seed: of the episode, as in ``reset``.
         every: actions from one frame to the next; the last action is always shown.
@@ -38,15 +34,13 @@ def episode_frames(
     """
     if every < 1:
         raise ValueError(f"every must be at least 1, got {every}")
-    cls = task_class(env)
-    if baselines_of(cls.id).kind(policy) != "policy":
-        raise ValueError(f"{policy!r} is no policy: it does not act in the environment")
-    maker = load_policy(cls.id, policy)
-    control = getattr(maker, "control", None)
-    world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
+    if kind_of(policy) != "policy":
+        raise ValueError(f"{name!r} is no policy: it does not act in the environment")
+    control = getattr(policy, "control", None)
+    world = TaskEnv(task_class(env).id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
-    world.picture.caption = f"policy {policy}"
-    actor = maker(world.task)
+    world.picture.caption = f"policy {name}"
+    actor = policy(world.task) if callable(policy) else policy
     observation, _ = world.reset(seed=seed)
     frames, memory, finished = [Image.fromarray(_frame(world))], None, False
     taken = 0
@@ -97,11 +91,9 @@ def write_animation(frames: list[Image.Image], path: Path, frames_per_second: fl
     palette = _palette()
     drawn = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000.0 / frames_per_second)] * (len(drawn) - 1) + [2000]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.part")
-    try:
+    with whole_file(path) as partial:
         drawn[0].save(
-            unfinished,
+            partial,
             format="GIF",
             save_all=True,
             append_images=drawn[1:],
@@ -109,30 +101,3 @@ def write_animation(frames: list[Image.Image], path: Path, frames_per_second: fl
             loop=0,
             optimize=True,
         )
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-
-
-def animate(
-    env: Annotated[str, typer.Argument(help="environment id")],
-    policy: Annotated[list[str], typer.Option(help="policy; may be given several times")],
-    out: Annotated[Path, typer.Option(help="folder for the GIFs")] = Path("results"),
-    scenario: Annotated[str | None, typer.Option(help="scenario; default: the training distribution")] = None,
-    seed: Annotated[int, typer.Option(help="seed of the episode")] = 0,
-    every: Annotated[int, typer.Option(help="actions from one frame to the next")] = 2,
-) -> None:
-    """Write one animated GIF for each policy, all of the same episode."""
-    try:
-        name = task_class(env).id.rpartition("/")[2]
-        for one in policy:
-            path = out / f"{name}-{one.rpartition(':')[2]}.gif"
-            write_animation(episode_frames(env, one, scenario, seed, every), path)
-            typer.echo(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
-    except (ValueError, OSError, gymnasium.error.Error) as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
-
-
-if __name__ == "__main__":
-    typer.run(animate)

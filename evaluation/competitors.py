@@ -2,29 +2,22 @@
 
 A **policy** sees observations and returns actions; learned or classical, it answers Stable-Baselines3's
 call. A **reference** estimates from the measurements, never through actions, and may be told what no
-competitor knows; it is never ranked with policies. A **bound** is computed.
+competitor knows; it is never ranked with policies. A **bound** is computed. Each says what it is by its ``kind``;
+what says nothing is a policy, such as a model of Stable-Baselines3.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy
 
 from ..envs.task import Array, Task
 
-
-class PolicyLoader(NamedTuple):
-    """Where policies come from that are not an environment's own."""
-
-    load: Callable[[str, str], Any]
-    """From an environment's id and a name to what makes a policy for a task; None for a name not its own."""
-    names: Callable[[str], list[str]]
-    """From an environment's id to the names that it has for it."""
+Kind = Literal["policy", "reference", "bound"]
 
 
-LOADERS: list[PolicyLoader] = []
-"""Asked, in order, for a policy that is not among an environment's own; whoever has policies adds to it."""
+def kind_of(competitor: Any) -> Kind:
+    """Say what a competitor is, or what a maker makes."""
+    return getattr(competitor, "kind", "policy")
 
 
 class Policy:
@@ -34,6 +27,7 @@ class Policy:
     goes in and out, so that one object serves any number of episodes.
     """
 
+    kind: ClassVar[Kind] = "policy"
     control: ClassVar[str]
     """The control that the policy's actions are meant for."""
 
@@ -105,6 +99,7 @@ class Reference(Protocol):
     It starts where everyone starts. In a closed loop it flies a truth of its own, on the same noise.
     """
 
+    kind: ClassVar[Kind] = "reference"
     knows: ClassVar[str]
     """What it is told, in words; printed wherever it is reported."""
 
@@ -125,6 +120,7 @@ class Reference(Protocol):
 class Bound(Protocol):
     """A computed limit of the mean square error."""
 
+    kind: ClassVar[Kind] = "bound"
     knows: ClassVar[str]
 
     def __init__(self, task: Task) -> None: ...
@@ -134,54 +130,3 @@ class Bound(Protocol):
 
     def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Any]:
         """Bound of the mean square of ``task.components``, ``(C, N)``, and the memory."""
-
-
-@dataclass(frozen=True)
-class Tunable:
-    """What can be tuned in a policy, and what a choice of values means."""
-
-    control: str
-    """The control of the policy."""
-    limits: Mapping[str, tuple[float, float]]
-    """Lower and upper limit of each value, in the order of the search."""
-    start: Mapping[str, float]
-    """The values in force without tuning."""
-    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]
-    """From values to keywords of the task and what makes the policy for it."""
-
-
-@dataclass(frozen=True)
-class Baselines:
-    """What an environment is compared with: the table at the end of each module in :mod:`.policies`."""
-
-    policies: Mapping[str, Callable[[Any], Policy]]
-    references: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
-    bounds: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
-    score_paper: str = ""
-    """The policy whose score is 0."""
-    score_bound: str = ""
-    """The reference estimator or bound whose score is 1."""
-    benchmark: tuple[str, ...] = ()
-    """Names that the quick benchmark runs, in the order of the table."""
-    compared: tuple[str, ...] = ()
-    """Untuned policies that learned agents are compared with, beside the paper's and the tuned ones."""
-    physical: tuple[str, str] = ("rmse", "position")
-    """Metric and component that the comparison shows beside the cost."""
-    measurement_seconds: float = 5e-6
-    """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
-    full benchmark."""
-    tunable: Mapping[str, Tunable] = field(default_factory=dict)
-    """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
-    best_constant: str = ""
-    """The tunable policy that stands for the best constant action in the room table."""
-    metrics: Callable[[Any, Any], list[Any]] | None = None
-    """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
-
-    def kind(self, name: str) -> str:
-        """Return "policy", "reference" or "bound"."""
-        return "reference" if name in self.references else "bound" if name in self.bounds else "policy"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Every name, policies first."""
-        return (*self.policies, *self.references, *self.bounds)

@@ -1,0 +1,89 @@
+"""Which baselines an environment has.
+
+Every folder beside this file holds those of one environment and exports them as ``BASELINES``; a user's
+environment brings its own, or none.
+"""
+
+import importlib
+import pkgutil
+from functools import cache
+from types import ModuleType
+
+from ..envs.catalogue import nearest, task_class
+from ..evaluation.competitors import RandomPolicy, kind_of
+from .table import Baselines
+
+ADDED: dict[str, Baselines] = {}
+"""Baselines of users' environments: Gymnasium id -> table."""
+
+
+def packages() -> list[ModuleType]:
+    """Return the packages of this folder, one for each environment."""
+    package = importlib.import_module(__package__)
+    return [
+        importlib.import_module(f"{__package__}.{module.name}")
+        for module in pkgutil.iter_modules(package.__path__)
+        if module.ispkg
+    ]
+
+
+@cache
+def _by_environment() -> dict[str, ModuleType]:
+    return {package.BASELINES.environment: package for package in packages()}
+
+
+def package_of(id: str) -> ModuleType | None:
+    """Return the package that holds an environment's baselines; None where there is none."""
+    return _by_environment().get(task_class(id).id)
+
+
+def baselines_of(id: str) -> Baselines:
+    """Return what an environment is compared with; only random actions where nothing is known."""
+    id = task_class(id).id
+    package = package_of(id)
+    if package is not None:
+        return package.BASELINES
+    return ADDED.get(id) or Baselines(id, {"random": RandomPolicy})
+
+
+def paper_of(id: str) -> str:
+    """Name of the policy that is the paper's algorithm.
+
+    Raises:
+        ValueError: if the environment's baselines name none, so that nothing can be measured against it.
+    """
+    name = baselines_of(id).score_paper
+    if not name:
+        raise ValueError(
+            f"{task_class(id).id} has no paper's algorithm to compare with: register it with baselines whose "
+            "score_paper names one"
+        )
+    return name
+
+
+def add_baselines(table: Baselines) -> None:
+    """Keep what a user's environment is compared with.
+
+    Raises:
+        ValueError: if the table names what is not there.
+    """
+    cls = task_class(table.environment)
+    reference = {**table.references, **table.bounds}
+    if table.score_paper not in ("", *table.policies):
+        raise nearest("policy as score_paper", table.score_paper, table.policies)
+    if table.score_bound not in ("", *reference):
+        raise nearest("reference as score_bound", table.score_bound, reference)
+    for name, maker in table.policies.items():
+        control = getattr(maker, "control", None)
+        if control is not None and control not in cls.controls:
+            raise nearest(f"control of policy {name!r}", control, cls.controls)
+    tables = {"policy": table.policies, "reference": table.references, "bound": table.bounds}
+    for kind, makers in tables.items():
+        for name, maker in makers.items():
+            if kind_of(maker) != kind:
+                raise ValueError(
+                    f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
+                )
+            if kind != "policy" and not getattr(maker, "knows", ""):
+                raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
+    ADDED[cls.id] = table

@@ -1,0 +1,58 @@
+"""What stands in an environment's table of baselines."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..evaluation.competitors import Policy
+
+
+@dataclass(frozen=True)
+class Tunable:
+    """What can be tuned in a policy, and what a choice of values means."""
+
+    control: str
+    """The control of the policy."""
+    limits: Mapping[str, tuple[float, float]]
+    """Lower and upper limit of each value, in the order of the search."""
+    start: Mapping[str, float]
+    """The values in force without tuning."""
+    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]
+    """From values to keywords of the task and what makes the policy for it."""
+
+
+@dataclass(frozen=True)
+class Baselines:
+    """What an environment is compared with: the table at the end of each module ``policies``."""
+
+    environment: str
+    """Gymnasium id."""
+    policies: Mapping[str, Callable[[Any], Policy]]
+    references: Mapping[str, Any] = field(default_factory=dict)
+    """Classes that keep the protocol :class:`.Reference`."""
+    bounds: Mapping[str, Any] = field(default_factory=dict)
+    """Classes that keep the protocol :class:`.Bound`."""
+    score_paper: str = ""
+    """The policy whose score is 0."""
+    score_bound: str = ""
+    """The reference estimator or bound whose score is 1."""
+    benchmark: tuple[str, ...] = ()
+    """Names that the quick benchmark runs, in the order of the table."""
+    compared: tuple[str, ...] = ()
+    """Untuned policies that learned agents are compared with, beside the paper's and the tuned ones."""
+    physical: tuple[str, str] = ("rmse", "position")
+    """Metric and component that the comparison shows beside the cost."""
+    measurement_seconds: float = 5e-6
+    """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
+    full benchmark."""
+    tunable: Mapping[str, Tunable] = field(default_factory=dict)
+    """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    best_constant: str = ""
+    """The tunable policy that stands for the best constant action in the room table."""
+    metrics: Callable[[Any, Any], list[Any]] | None = None
+    """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every name, policies first."""
+        return (*self.policies, *self.references, *self.bounds)

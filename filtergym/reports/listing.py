@@ -1,0 +1,38 @@
+"""What there is: an environment with its paper, controls, scenarios and competitors, in lines for the terminal."""
+
+from collections.abc import Iterator
+
+from ..agents.named_policies import shipped_agents
+from ..baselines.catalogue import baselines_of
+from ..baselines.tuning import tuned_names
+from ..envs.catalogue import importable_name, parameter_names, task_class
+
+
+def environment_lines(id: str) -> Iterator[str]:
+    """Describe an environment; the first line is its id."""
+    cls = task_class(id)
+    known = baselines_of(id)
+    yield importable_name(cls)
+    yield f"  {(cls.__doc__ or '').strip().partition(chr(10))[0]}"
+    if cls.paper_source:
+        yield f"  paper:       {cls.paper_source}"
+    rows = {
+        "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
+        "policies": list(known.policies),
+        "tuned": tuned_names(id),
+        "learned": shipped_agents(id),
+        "parameters": parameter_names(cls),
+    }
+    for title, names in rows.items():
+        if names:
+            yield f"  {title + ':':<12} {', '.join(names)}"
+    for title, table in (("references", known.references), ("bounds", known.bounds)):
+        if table:
+            yield f"  {title}:"
+        for name, maker in table.items():
+            yield f"    {name:<22} knows {maker.knows}"
+    yield "  scenarios:"
+    for scenario in cls.scenarios.values():
+        role = " (default)" if scenario.name == cls.default_scenario else ""
+        role += " (training)" if scenario.training else ""
+        yield f"    {scenario.name:<22} {scenario.description}{role}"

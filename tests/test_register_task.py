@@ -1,0 +1,253 @@
+"""An environment of a user's own package is a citizen: nothing here is in the catalogue by itself."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.table import Baselines
+from filtergym.envs import registration
+from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.maneuvering_target.task import ManeuveringTarget
+from filtergym.envs.task import Task
+from filtergym.evaluation.competitors import ConstantPolicy
+
+import filtergym
+
+MODULE = '''
+import filtergym
+from filtergym.envs.maneuvering_target.task import ManeuveringTarget
+from filtergym.evaluation.competitors import ConstantPolicy
+
+
+class Turns(ManeuveringTarget):
+    """An aircraft that turns, once more."""
+
+    id = "mine/Turns-v0"
+    paper_source = "nobody's"
+
+    def picture(self):
+        return None
+
+
+class Middle(ConstantPolicy):
+    control = "gain"
+    action = (0.0,)
+
+
+filtergym.register_task(Turns)
+'''
+ID = "turns_package:mine/Turns-v0"
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Folder of a module that registers an environment on import; forgotten after the test."""
+    (tmp_path / "turns_package.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop("turns_package", None)
+    forget("mine/Turns-v0")
+
+
+@pytest.fixture
+def turns():
+    """Class of an environment that is not registered yet."""
+
+    class Turns(ManeuveringTarget):
+        id = "mine/Turns-v0"
+
+    yield Turns
+    forget(Turns.id)
+
+
+def forget(id):
+    registration.ADDED.pop(id, None)
+    baselines.ADDED.pop(id, None)
+    gymnasium.registry.pop(id, None)
+
+
+def run(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "filtergym", *arguments],
+        capture_output=True, text=True, cwd=cwd, check=False, env={**os.environ, "PYTHONPATH": str(cwd)},
+    )  # fmt: skip
+
+
+def test_gymnasium_makes_and_renders_it(package):
+    env = gymnasium.make(ID, control="gain", render_mode="rgb_array", horizon=5)
+    own = gymnasium.make("filtergym/ManeuveringTarget-v0", control="gain", horizon=5)
+    observation, _ = env.reset(seed=3)
+    np.testing.assert_array_equal(observation, own.reset(seed=3)[0])
+    env.step(env.action_space.sample())
+    assert env.render().shape == (608, 960, 3)
+    vector = gymnasium.make_vec(ID, num_envs=3, horizon=5)
+    np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
+    assert "mine/Turns-v0" in catalogue()
+    assert "mine/Turns-v0" not in filtergym.envs.catalogue._shipped()
+
+
+def test_a_spawned_process_finds_it(package):
+    vector = gymnasium.make_vec(
+        ID, num_envs=2, vectorization_mode="async", vector_kwargs={"context": "spawn"}, horizon=5
+    )
+    try:
+        observation, _ = vector.reset(seed=3)
+    finally:
+        vector.close()
+    np.testing.assert_array_equal(observation[0], gymnasium.make(ID, horizon=5).reset(seed=3)[0])
+
+
+def test_evaluation_without_baselines(package):
+    dataset = filtergym.evaluate(
+        ID, {"mine": "turns_package:Middle", "random": "random"}, episodes=3, horizon=20
+    )
+    records = filtergym.tidy_records(dataset)
+    assert {r.policy for r in records} == {"mine", "random"}
+    assert {r.environment for r in records} == {"mine/Turns-v0"}
+    assert not {"score", "cost_difference"} & {r.metric for r in records}
+    with pytest.raises(ValueError, match="unknown policy 'imm': choose from random"):
+        filtergym.evaluate(ID, ["imm"])
+
+
+def test_evaluation_with_baselines(turns):
+    """With the tables of the environment that it equals, it comes out as that does."""
+    original = "filtergym/ManeuveringTarget-v0"
+    filtergym.register_task(turns, replace(baselines.baselines_of(original), environment=turns.id))
+    names = ["imm", "adaptive", "known-turn", "known-input-bound"]
+    own, others = (
+        {
+            (r.policy, r.kind, r.metric, r.component, r.window): r.value
+            for r in filtergym.tidy_records(filtergym.evaluate(id, names, episodes=20))
+        }
+        for id in (turns.id, original)
+    )
+    assert own == others
+    assert ("adaptive", "policy", "score", "", "all") in own
+
+
+def test_the_command_line_lists_and_evaluates_it(package):
+    listed = run("list", ID, cwd=package)
+    assert listed.returncode == 0, listed.stderr
+    assert listed.stdout.startswith(ID)
+    assert "nobody's" in listed.stdout
+    out = run(
+        "evaluate", ID, "--policy", "turns_package:Middle", "--policy", "random", "--episodes", "4", "--out", "out",
+        "--set", "horizon=20", cwd=package,
+    )  # fmt: skip
+    assert out.returncode == 0, out.stderr
+    assert len(json.loads((package / "out" / "records.json").read_text())) > 0
+    result = run("benchmark", "--environment", ID, "--out", "results", cwd=package)
+    assert result.returncode == 0, result.stderr
+    refused = run("room", ID, cwd=package)
+    assert refused.returncode == 2
+    assert "has no paper's algorithm to compare with" in refused.stderr
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_training_with_default_hyperparameters(package, algorithm):
+    pytest.importorskip("stable_baselines3")
+    steps = ("--steps", "2000", "--envs", "4", "--validate-every", "100000")
+    result = run("train", ID, "--algo", algorithm, *steps, "--out", "run", cwd=package)
+    assert result.returncode == 0, result.stderr
+    record = json.loads((package / "run" / "run.json").read_text())
+    assert record["environment"] == ID
+    assert list(record["validation"][-1]) == ["steps", "cost"]
+    result = run("export", "run", cwd=package)
+    assert result.returncode == 0, result.stderr
+    result = run("evaluate", ID, "--policy", "run/agent.safetensors", "--episodes", "3", cwd=package)
+    assert result.returncode == 0, result.stderr
+
+
+def test_registering_again_changes_nothing(turns):
+    filtergym.register_task(turns)
+    filtergym.register_task(turns)
+    assert task_class("mine/Turns-v0") is turns
+    assert make_task("mine/Turns-v0", "mode").control == "mode"
+
+
+def test_what_ships_keeps_the_contract():
+    for cls in catalogue().values():
+        registration._check_contract(cls)
+
+
+@dataclass(frozen=True)
+class NoHorizon:
+    decision_interval: int = 1
+
+
+def broken(**attributes):
+    return type("Broken", (ManeuveringTarget,), {"id": "mine/Broken-v0", **attributes})
+
+
+class Stumbling(ManeuveringTarget):
+    id = "mine/Stumbling-v0"
+
+    def __init__(self, *arguments, **keywords):
+        raise KeyError("sigma")
+
+
+@pytest.mark.parametrize(
+    ("task", "expected"),
+    [
+        (ManeuveringTarget, "'filtergym/ManeuveringTarget-v0' is there already"),
+        (broken(id="filtergym/UavAutopilot-v0"), "'filtergym/UavAutopilot-v0' is there already"),
+        ("mine/Turns-v0", "subclass of filtergym.envs.task.Task"),
+        (int, "subclass of filtergym.envs.task.Task"),
+        (type("Empty", (Task,), {}), "Empty lacks the methods"),
+        (broken(id="Turns"), "such as 'mine/Broken-v0', got 'Turns'"),
+        (broken(controls=()), "needs at least one control"),
+        (broken(scenarios={}), "needs its default scenario 'random' among its scenarios, got none"),
+        (broken(Parameters=NoHorizon), "with horizon and decision_interval"),
+        (Stumbling, "cannot be made with control 'gain': KeyError"),
+    ],
+)
+def test_an_ill_formed_task_gets_one_sentence(task, expected):
+    before = set(catalogue())
+    with pytest.raises(ValueError, match=expected) as caught:
+        filtergym.register_task(task)
+    assert "\n" not in str(caught.value)
+    assert set(catalogue()) == before
+
+
+def test_baselines_must_fit_the_task(turns):
+    class Elsewhere(ConstantPolicy):
+        control = "throttle"
+        action = (0.0,)
+
+    class NoKind:
+        knows = "nothing"
+
+    class Silent:
+        kind = "bound"
+
+    for table, expected in (
+        (Baselines("mine/Other-v0", {}), "are of 'mine/Other-v0', not of 'mine/Turns-v0'"),
+        (Baselines(turns.id, {}, score_paper="imm"), "unknown policy as score_paper 'imm'"),
+        (Baselines(turns.id, {"far": Elsewhere}), "unknown control of policy 'far' 'throttle'"),
+        (Baselines(turns.id, {}, {"none": NoKind}), "stands in the table as reference"),
+        (Baselines(turns.id, {}, bounds={"none": Silent}), "does not say what it knows"),
+    ):
+        with pytest.raises(ValueError, match=expected):
+            filtergym.register_task(turns, table)
+
+
+def test_an_unknown_module_gets_one_sentence():
+    with pytest.raises(ValueError, match="cannot import 'nowhere'"):
+        filtergym.evaluate("nowhere:mine/Turns-v0", ["random"])
+
+
+def test_importing_filtergym_stays_light(tmp_path):
+    code = (
+        "import sys, filtergym\n"
+        "heavy = {'xarray', 'torch', 'matplotlib', 'scipy.optimize', 'yaml', 'typer'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+        "assert callable(filtergym.evaluate) and 'xarray' in sys.modules and 'torch' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(tmp_path))
