@@ -57,27 +57,3 @@ def torch():
     """
     pytest.importorskip("torch")
     return importlib.import_module("array_api_compat.torch")
-
-
-@pytest.fixture
-def assert_blind():
-    """Check that neither observation nor estimator depends on the truth of a state, given its measurement."""
-
-    def check(task, state, other_truth, actions):
-        """``other_truth``: the fields of the state that are truth, with other values."""
-        changed = state._replace(**other_truth)
-        assert (task.cost(changed) != task.cost(state)).all(), "the truth was not changed enough to matter"
-        np.testing.assert_array_equal(task.observe(changed), task.observe(state))
-        after, changed_after = task.act(state, actions), task.act(changed, actions)
-        for name in set(state._fields) - set(other_truth):
-            _assert_identical(getattr(changed_after, name), getattr(after, name), name)
-
-    return check
-
-
-def _assert_identical(one, other, name):
-    if isinstance(one, tuple):
-        for part, other_part in zip(one, other, strict=True):
-            _assert_identical(part, other_part, name)
-    elif one is not None:
-        np.testing.assert_array_equal(one, other, err_msg=name)

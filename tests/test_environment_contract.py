@@ -1,5 +1,6 @@
 """What holds for every single environment, task, policy and control of the catalogue."""
 
+import inspect
 import json
 import warnings
 from functools import partial
@@ -10,6 +11,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, register
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.task import Episode
 from gymnasium.utils.env_checker import check_env
 
 from filtergym import evaluate
@@ -42,6 +44,51 @@ def run(env, actions, seed=21):
         paid.append(reward)
         assert not terminated
     return np.stack(shown), np.array(paid), truncated
+
+
+def test_bank_needs_nothing_but_the_measurements(env_id, control, short, random_actions):
+    """No truth: fed with what the world said, and with nothing else, the bank shows and estimates the same."""
+    task = make_task(env_id, control, **short)
+    rng, episode = np.random.default_rng(3), None
+    noise = task.noise
+    episode = task.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
+    alone = task.bank.start(episode.measurement)
+    for step in range(task.horizon):
+        row = np.concatenate([rng.normal(size=(noise.normals, 8)), rng.random((noise.row_uniforms, 8))])
+        episode = task.measure(episode, row)
+        alone = task.bank.predict(alone, episode.measurement)
+        np.testing.assert_array_equal(
+            task.observe(Episode(None, episode.measurement, alone)), task.observe(episode)
+        )
+        action = random_actions(task.action_space, 8, step).T
+        episode = task.act(episode, action)
+        alone = task.bank.act(alone, episode.measurement, action)
+        np.testing.assert_array_equal(task.bank.mean(alone), task.mean(episode))
+        np.testing.assert_array_equal(task.bank.covariance(alone), task.covariance(episode))
+
+
+def test_functions_of_a_bank_have_no_door_for_the_truth(env_id, control):
+    doors = {"self", "initial", "state", "measurement", "action"}
+    for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
+        function = getattr(type(make_task(env_id, control).bank), name)
+        assert set(inspect.signature(function).parameters) <= doors, name
+
+
+def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
+    """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
+    task = make_task(env_id, **short).estimated_outside()
+    noise = task.noise
+    episode = task.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
+    mean, covariance = episode.measurement.mean, episode.measurement.covariance
+    count = len(task.components)
+    assert mean.shape == (count, 8)
+    assert covariance.shape == (count, count, 8)
+    np.testing.assert_array_equal(covariance, covariance.swapaxes(0, 1))
+    for _ in range(3):
+        episode = task.measure(episode, np.zeros((noise.normals + noise.row_uniforms, 8)))
+        np.testing.assert_array_equal(task.mean(episode), mean)
+        assert np.isfinite(task.error(episode)).all()
+        assert np.isfinite(task.cost(episode)).all()
 
 
 def test_episode_ends_by_truncation_at_the_horizon(env_id, control, short, random_actions):

@@ -14,7 +14,7 @@ from filtergym.envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, RES
 from filtergym.evaluation.bootstrap import Bootstrap, Estimate
 from filtergym.evaluation.rollout import run_bound, run_policy
 from filtergym.evaluation.seeds import episode_seeds
-from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.filters import gnss_ins
 
 from filtergym import evaluate, tidy_records
 
