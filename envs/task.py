@@ -304,6 +304,8 @@ class Task(ABC):
     """What the action can steer, and the bank that it steers; the first is the default."""
     controls: ClassVar[tuple[str, ...]]
     """Names of ``banks``."""
+    actions: ClassVar[Mapping[str, str]] = {}
+    """What an action means under each control, in words."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]

@@ -20,6 +20,7 @@ from .evaluation.metrics import Record
 from .names import competitor, evaluate, tidy_records
 from .reports import comparison, training_seeds
 from .reports.benchmark import Cell, run_benchmark
+from .reports.environment_page import environment_tables, put_tables
 from .reports.listing import environment_lines
 from .reports.pages import insert_between_markers, split_at_markers
 from .reports.records import write_records
@@ -258,6 +259,22 @@ def room(
     if into is not None:
         command = f"filtergym room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
         insert_between_markers(into, MARKER, room_markdown(records, command))
+
+
+@app.command("page")
+def page(
+    environment: Annotated[str, typer.Argument(help="Environment id.")],
+    into: Annotated[Path | None, typer.Option(help="Page whose tables are replaced.")] = None,
+) -> None:
+    """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
+
+    Example: filtergym page filtergym/ManeuveringTarget-v0
+    """
+    if into is not None:
+        console.print(f"{into}: {', '.join(put_tables(environment, into))}", markup=False)
+        return
+    for name, table in environment_tables(environment).items():
+        console.print(f"{name}\n\n{table}\n", markup=False, soft_wrap=True)
 
 
 @app.command("reproduce")

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, parameter_names
+from filtergym.reports.environment_page import environment_tables, put_tables
 
 DOCS = Path(__file__).parent.parent / "docs"
 HEADINGS = (
@@ -14,11 +15,25 @@ HEADINGS = (
 )  # fmt: skip
 
 
-def page(id: str) -> str:
+def page_file(id: str) -> Path:
     """Return the page that is about an environment: it says so below its title."""
-    pages = [path.read_text(encoding="utf-8") for path in (DOCS / "environments").glob("*.md")]
-    [own] = [text for text in pages if text.splitlines()[2].startswith(f"`{id}`")]
+    pages = (DOCS / "environments").glob("*.md")
+    [own] = [p for p in pages if p.read_text(encoding="utf-8").splitlines()[2].startswith(f"`{id}`")]
     return own
+
+
+def page(id: str) -> str:
+    """Text of that page."""
+    return page_file(id).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("id", catalogue())
+def test_tables_of_the_page_are_those_of_the_code(id, tmp_path):
+    """If not: ``filtergym page ID --into docs/environments/PAGE.md``."""
+    copy = tmp_path / "page.md"
+    copy.write_text(page(id), encoding="utf-8")
+    assert put_tables(id, copy) == list(environment_tables(id))
+    assert copy.read_text(encoding="utf-8") == page(id)
 
 
 @pytest.mark.parametrize("id", catalogue())

@@ -36,14 +36,7 @@ class ManeuveringTarget(Task):
 
     ## Action Space
 
-    | control | space | meaning |
-    |---|---|---|
-    | `gain` (default) | `Box(-1, 1, (1,))` | position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; beta = alpha^2 / (2 - alpha) |
-    | `mode` | `Discrete(2)` | the filter of the bank that is believed; the bank collapses to one filter that switches |
-    | `weights` | `Box(0, 1, (2,))` | weights of the bank, normalised; all zero is uniform |
-    | `evidence` | `Box(-1, 1, (2,))` | times `evidence_scale` nats, added to the log-posterior of each mode; 0 is the IMM |
-
-    Values outside the box are taken at its edge.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
     ## Observation Space
 
@@ -84,6 +77,13 @@ class ManeuveringTarget(Task):
     )
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
+    actions = {
+        "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
+        "beta = alpha^2 / (2 - alpha)",
+        "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
+        "weights": "weights of the bank, normalised; all zero is uniform",
+        "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
+    }
     banks = {"gain": GainBank, "mode": FilterBank, "weights": FilterBank, "evidence": FilterBank}
     scenarios = SCENARIOS
     components = (

@@ -1,5 +1,6 @@
 """Pages whose tables are made by a command and stand between markers."""
 
+import re
 from pathlib import Path
 
 from ..evaluation.files import write_text
@@ -18,6 +19,12 @@ def split_at_markers(path: Path, name: str) -> tuple[str, str]:
     if not found_begin or not found_end:
         raise ValueError(f"{path} needs the lines {begin} and {end}, between which the table is put")
     return before + begin, end + after
+
+
+def markers_of(path: Path) -> list[str]:
+    """Names of the markers that a page has; none if there is no such page."""
+    page = path.read_text(encoding="utf-8") if path.is_file() else ""
+    return re.findall(r"<!-- (.+?): begin -->", page)
 
 
 def insert_between_markers(path: Path, name: str, text: str) -> None:
