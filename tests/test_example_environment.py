@@ -1,0 +1,98 @@
+"""The complete small example in the documentation: a user's own environment in one file."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.baselines import catalogue as baselines
+from filtergym.envs import registration
+from filtergym.envs.catalogue import make_task
+from gymnasium.utils.env_checker import check_env
+
+import filtergym
+from filtergym.reports.environment_page import environment_tables
+
+FOLDER = Path(__file__).parent.parent / "docs" / "examples"
+ID = "mine/InvertedPendulum-v0"
+
+
+@pytest.fixture(scope="module")
+def example():
+    """The module, registered; forgotten afterwards."""
+    spec = importlib.util.spec_from_file_location("inverted_pendulum", FOLDER / "inverted_pendulum.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["inverted_pendulum"] = module
+    spec.loader.exec_module(module)
+    yield module
+    for table in (sys.modules, registration.ADDED, baselines.ADDED, gymnasium.registry):
+        table.pop("inverted_pendulum", None)
+        table.pop(ID, None)
+
+
+def test_it_is_short():
+    assert len((FOLDER / "inverted_pendulum.py").read_text().splitlines()) < 300
+
+
+def test_environment(example):
+    env = gymnasium.make(ID, render_mode="rgb_array", horizon=8)
+    check_env(env.unwrapped, skip_render_check=True)
+    vector = gymnasium.make_vec(ID, num_envs=3, horizon=8)
+    shown, _ = vector.reset(seed=4)
+    single, _ = env.reset(seed=6)
+    np.testing.assert_array_equal(shown[2], single)
+    for k in range(8):
+        action = np.full((3, 1), 0.1 * k)
+        shown, *_ = vector.step(action)
+        single, *_, truncated, _ = env.step(action[2])
+        np.testing.assert_array_equal(shown[2], single)
+    assert truncated
+    assert env.render().ndim == 3
+
+
+def test_closed_loop_flies_a_truth_of_its_own_on_the_same_noise(example):
+    dataset = filtergym.evaluate(
+        ID, ["kalman", "matching", "random", "known-gusts"], episodes=60, horizon=150
+    )
+    cost = dataset["cost"].mean(["episode", "time"]).to_series()
+    assert cost["known-gusts"] < cost["matching"] < cost["kalman"]
+    # Nominal noise and its covariance are right where the gusts are as believed.
+    believed = filtergym.evaluate(ID, ["kalman"], episodes=200, horizon=50, gust_levels=(1.0, 1.0))
+    nees = believed["nees"].values[0, :, 20:]
+    assert abs(nees.mean() - 2.0) < 4 * nees.mean(axis=1).std() / np.sqrt(200)
+
+
+def test_torch(example):
+    torch = pytest.importorskip("torch")
+    one = gymnasium.make_vec(ID, num_envs=2, horizon=8)
+    other = gymnasium.make_vec(ID, num_envs=2, horizon=8, backend="torch")
+    shown, _ = one.reset(seed=1)
+    np.testing.assert_allclose(other.reset(seed=1)[0], shown, rtol=1e-13, atol=1e-13)
+    action = np.full((2, 1), 0.3)
+    for _ in range(8):
+        shown, paid, *_ = one.step(action)
+        tensor, reward, *_ = other.step(torch.tensor(action))
+        # Sines and logarithms differ in the last bit, and the loop feeds that back.
+        np.testing.assert_allclose(tensor, shown, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(reward, paid, rtol=1e-11, atol=1e-11)
+
+
+def test_tables_of_its_page(example):
+    tables = environment_tables(ID)
+    assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in tables["fields"]
+    assert "Limits of its true factor" in tables["parameters"]
+    assert "Knows the factor on the gusts at every moment." in tables["policies"]
+    assert make_task(ID).noise.uniforms == 3
+
+
+def test_command_line_finds_it_in_the_working_directory():
+    arguments = ["evaluate", f"inverted_pendulum:{ID}", "--policy", "kalman", "--policy", "known-gusts"]
+    done = subprocess.run(
+        [sys.executable, "-m", "filtergym", *arguments, "--episodes", "5", "--set", "horizon=20"],
+        capture_output=True, text=True, cwd=FOLDER, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "known-gusts" in done.stdout
