@@ -342,3 +342,21 @@ def test_max_episode_steps(env_id, short, random_actions):
 def test_rejects_no_environments(env_id):
     with pytest.raises(ValueError, match="num_envs"):
         TaskVectorEnv(env_id, 0)
+
+
+def test_snapshot_of_the_lanes_is_gone_back_to_as_often_as_one_likes(env_id, control, short, random_actions):
+    env = native(env_id, 3, AutoresetMode.SAME_STEP, control=control, reward="relative", **short).unwrapped
+    env.reset(seed=5)
+    env.step(random_actions(env.single_action_space, 3, 0))
+    snapshot = env.lanes.snapshot()
+    runs = []
+    for _ in range(2):
+        env.lanes.restore(snapshot)
+        # Through the end, whose restarts draw from the generators.
+        shown = [env.step(random_actions(env.single_action_space, 3, k))[:2] for k in range(1, 5)]
+        env.lanes.restart([1])
+        runs.append([*(part for pair in shown for part in pair), env.lanes.observe()])
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="the snapshot holds 3 environments, not 2"):
+        TaskVectorEnv(env_id, num_envs=2, control=control, **short).lanes.restore(snapshot)

@@ -12,8 +12,8 @@ import numpy
 from ...envs.maneuvering_target.banks import GainBank
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.task import Task
-from ...filters import imm
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...filters import imm
 from ..table import Baselines, Tunable
 from .references import KalmanInteractingMultipleModel, KnownInputBound, KnownTurn
 
