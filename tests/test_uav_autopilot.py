@@ -3,8 +3,9 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.envs.task import Scenario
-from filtergym.envs.uav_autopilot.task import COORDINATES, State, UavAutopilot, UavAutopilotParameters
+from filtergym.envs.task import Episode, Scenario
+from filtergym.envs.uav_autopilot.parameters import COORDINATES, UavAutopilotParameters
+from filtergym.envs.uav_autopilot.task import UavAutopilot
 from filtergym.filters import gaussian, linear_systems
 
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])
@@ -27,8 +28,15 @@ class Noise:
         self.rows = rng.standard_normal((steps, task.noise.normals, N))
 
 
-def begin(task: UavAutopilot, noise: Noise) -> State:
+def begin(task: UavAutopilot, noise: Noise) -> Episode:
     return task.measure(task.begin(noise.uniforms, noise.initial), noise.rows[0])
+
+
+def leaves(part: Any) -> list[Any]:
+    """Arrays of nested tuples, in order."""
+    if isinstance(part, tuple):
+        return [array for item in part for array in leaves(item)]
+    return [part]
 
 
 def actions(task: UavAutopilot, seed: int, steps: int, N: int) -> numpy.ndarray:
@@ -171,18 +179,18 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
     held, dropped, u = numpy.zeros(len(H)), 0, 0.0
     for k in range(steps):
         x, P = F @ x + B * u, F @ P @ F.T
-        rows = state.available[:, lane] > 0
+        rows = state.measurement.available[:, lane] > 0
         dropped += int((~rows).sum())
-        held[rows] = state.measurement[rows, lane]
+        held[rows] = state.measurement.reading[rows, lane]
         shown = numpy.zeros(len(H))
         S = H @ (P + scale * Q) @ H.T + R
         shown[rows] = ((held - H @ x) / numpy.sqrt(numpy.diag(S)))[rows]
         # A covariance of five states, packed against full, over 60 steps.
-        numpy.testing.assert_allclose(state.innovation[:, lane], shown, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(state.bank.innovation[:, lane], shown, rtol=0, atol=1e-9)
         if rows.any():
             nu = (held - H @ x)[rows]
             nis = nu @ numpy.linalg.solve(S[numpy.ix_(rows, rows)], nu) / rows.sum()
-            assert state.nis[lane] == pytest.approx(nis, rel=1e-9)
+            assert state.bank.nis[lane] == pytest.approx(nis, rel=1e-9)
         choice = a[k][..., lane]
         scale = 100.0 ** numpy.clip(choice[0], -1, 1) if control == "gain" else 100.0 if choice == 1 else 1.0
         P = P + scale * Q
@@ -193,19 +201,19 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         raw = control == "mode" and choice == 2
         state = task.act(state, a[k])
         estimate = H.T @ held if raw else x
-        numpy.testing.assert_allclose(state.estimate[:, lane], estimate, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(state.bank.estimate[:, lane], estimate, rtol=0, atol=1e-9)
         if not raw:
             numpy.testing.assert_allclose(task.covariance(state)[..., lane], P, rtol=1e-9, atol=1e-9)
-        u = d.feedforward * state.command[lane] - L @ estimate
-        truth = state.truth[:, lane].copy()
-        truth[task.output] -= state.command[lane]
+        u = d.feedforward * state.measurement.command[lane] - L @ estimate
+        truth = state.truth.state[:, lane].copy()
+        truth[task.output] -= state.measurement.command[lane]
         cost = (truth @ d.weight @ truth + d.control_weight * u**2) / task.cost_unit
         assert task.cost(state)[lane] == pytest.approx(cost, rel=1e-9)
         numpy.testing.assert_allclose(
-            task.error(state)[:, lane], estimate - state.truth[:, lane], rtol=0, atol=1e-9
+            task.error(state)[:, lane], estimate - state.truth.state[:, lane], rtol=0, atol=1e-9
         )
         state = task.measure(state, noise.rows[k + 1])
-        assert state.control[lane] == pytest.approx(u, abs=1e-9)
+        assert state.measurement.control[lane] == pytest.approx(u, abs=1e-9)
     assert dropped > 0
 
 
@@ -217,14 +225,18 @@ def test_truth_follows_from_the_control_and_noise_covariances_are_those_stated(p
     d = task.design
     for level in (1.0, 4.0):
         after = task.measure(before, noise.rows[int(level > 1)])
-        w = after.truth - d.true_model.F @ before.truth - d.true_model.B * after.control
+        w = (
+            after.truth.state
+            - d.true_model.F @ before.truth.state
+            - d.true_model.B * after.measurement.control
+        )
         Q = level**2 * d.true_model.scaled_noise + d.true_model.other_noise
         sigma = numpy.sqrt(numpy.diag(Q))
         # Five standard errors of a sample covariance of 80 000.
         numpy.testing.assert_allclose(
             w @ w.T / 80_000 / numpy.outer(sigma, sigma), Q / numpy.outer(sigma, sigma), rtol=0, atol=0.025
         )
-        v = (after.measurement - d.H @ after.truth) / numpy.sqrt(numpy.diag(d.R))[:, None]
+        v = (after.measurement.reading - d.H @ after.truth.state) / numpy.sqrt(numpy.diag(d.R))[:, None]
         numpy.testing.assert_allclose(v @ v.T / 80_000, numpy.eye(len(d.R)), rtol=0, atol=0.025)
         before = task.act(after, numpy.zeros((1, 80_000)))
 
@@ -243,10 +255,12 @@ def test_monte_carlo_of_the_reference_table(
     sums = numpy.zeros((5, N))
     n, m = task.covariance(state).shape[0], len(task.sensors)
     for k in range(burn + steps):
-        shown = state.nis
+        shown = state.bank.nis
         state = task.act(state, action)
         if feedback == "true":
-            state = state._replace(estimate=state.truth)
+            true = state.truth.state
+            steered = task.feedback(true, state.measurement)
+            state = state._replace(bank=state.bank._replace(estimate=true, control=steered))
         if k >= burn:
             _, nees = gaussian.log_density(task.error(state), task.covariance(state))
             record = task.records(state)
@@ -324,7 +338,7 @@ def test_shapes_names_and_finiteness_in_every_scenario(plant: str, control: str)
             assert (numpy.linalg.eigvalsh(numpy.moveaxis(task.covariance(state), -1, 0)) > 0).all()
             assert (task.cost(state) >= 0).all()
             state = task.measure(state, noise.rows[k + 1])
-        assert all(array.shape[-1] == 8 for array in state)
+        assert all(array.shape[-1] == 8 for array in leaves(state))
         assert len({f.name for f in task.fields}) == len(task.fields)
 
 
@@ -337,21 +351,23 @@ def test_observation_is_recomputed_from_the_measurements_alone(plant: str, contr
     noise, other, a = Noise(task, N, 0, steps + 1), Noise(task, N, 1, steps + 1), actions(task, 0, steps, N)
     drives = task.noise.normals - len(task.sensors)
     one = task.begin(noise.uniforms, noise.initial)
-    two = one._replace(truth=5.0 * other.initial, level=3.0 * one.level, levels=3.0 * one.levels)
+    levels = one.truth.levels._replace(values=3.0 * one.truth.levels.values)
+    truth = one.truth._replace(state=5.0 * other.initial, level=levels.values[0], levels=levels)
+    two = one._replace(truth=truth)
     sigmas = numpy.array(task.parameters.value("sensor_sigmas"))[:, None]
     for k in range(steps):
         one = task.measure(one, noise.rows[k])
         drive = other.rows[k].copy()
         drive[drives:] = 0.0
         trial = task.measure(two, drive)
-        wanted = task.design.H @ one.truth + sigmas * one.sensor_level * noise.rows[k][drives:]
-        drive[drives:] = (wanted - task.design.H @ trial.truth) / (sigmas * trial.sensor_level)
+        wanted = task.design.H @ one.truth.state + sigmas * one.truth.sensor_level * noise.rows[k][drives:]
+        drive[drives:] = (wanted - task.design.H @ trial.truth.state) / (sigmas * trial.truth.sensor_level)
         two = task.measure(two, drive)
-        assert numpy.abs(one.truth - two.truth).max() > 0.1
+        assert numpy.abs(one.truth.state - two.truth.state).max() > 0.1
         # The readings agree to rounding, amplified by the filter for 80 steps.
         numpy.testing.assert_allclose(task.observe(one), task.observe(two), rtol=0, atol=1e-9)
         one, two = task.act(one, a[k]), task.act(two, a[k])
-        numpy.testing.assert_allclose(one.estimate, two.estimate, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(one.bank.estimate, two.bank.estimate, rtol=0, atol=1e-9)
 
 
 @BOTH
@@ -362,14 +378,24 @@ def test_noise_does_not_depend_on_the_actions_but_the_truth_does(plant: str) -> 
     B, F = task.design.true_model.B, task.design.true_model.F
     for k in range(30):
         low, high = task.act(low, numpy.full((1, 8), -1.0)), task.act(high, numpy.full((1, 8), 1.0))
-        previous = low.truth, high.truth
+        previous = low.truth.state, high.truth.state
         low, high = task.measure(low, noise.rows[k + 1]), task.measure(high, noise.rows[k + 1])
-        w = [s.truth - F @ x - B * s.control for s, x in zip((low, high), previous, strict=True)]
+        w = [
+            s.truth.state - F @ x - B * s.measurement.control
+            for s, x in zip((low, high), previous, strict=True)
+        ]
         numpy.testing.assert_allclose(w[0], w[1], rtol=0, atol=1e-11)
-        numpy.testing.assert_array_equal(low.available, high.available)
-        numpy.testing.assert_array_equal(low.command, high.command)
+        numpy.testing.assert_array_equal(low.measurement.available, high.measurement.available)
+        numpy.testing.assert_array_equal(low.measurement.command, high.measurement.command)
     controlled = slice(0, 4 if plant == "U" else 2)  # nothing moves the gust
-    assert numpy.abs(low.truth - high.truth)[controlled].min() > 1e-6
+    assert numpy.abs(low.truth.state - high.truth.state)[controlled].min() > 1e-6
+
+
+def chosen(lanes: numpy.ndarray, one: Any, other: Any) -> Any:
+    """Nested tuples of arrays, of one in some lanes and of the other elsewhere."""
+    if isinstance(one, tuple):
+        return type(one)(*(chosen(lanes, a, b) for a, b in zip(one, other, strict=True)))
+    return numpy.where(lanes, one, other)
 
 
 def test_lanes_at_different_times_and_batch_widths() -> None:
@@ -385,10 +411,10 @@ def test_lanes_at_different_times_and_batch_widths() -> None:
         if k == 30:  # lanes 8 to 15 start again
             fresh = begin(task, noise)
             lane = numpy.arange(16) >= 8
-            wide = State(*(numpy.where(lane, f, w) for f, w in zip(fresh, wide, strict=True)))
+            wide = chosen(lane, fresh, wide)
         wide = task.measure(task.act(wide, a[k]), noise.rows[k + 1])
         small = task.measure(task.act(small, a[k][:, :8]), narrow.rows[k + 1])
-    for w, s in zip(wide, small, strict=True):
+    for w, s in zip(leaves(wide), leaves(small), strict=True):
         numpy.testing.assert_array_equal(w[..., :8], s)
 
 
@@ -402,16 +428,15 @@ def test_mode_nominal_is_gain_zero_and_wide_band_is_gain_one_bit_for_bit_or_near
                 by_mode.act(a, numpy.full(8, mode)),
                 by_gain.act(b, numpy.full((1, 8), gain, numpy.float32)),
             )
-            numpy.testing.assert_allclose(a.estimate, b.estimate, rtol=0, atol=tolerance)
+            numpy.testing.assert_allclose(a.bank.estimate, b.bank.estimate, rtol=0, atol=tolerance)
             a, b = by_mode.measure(a, noise.rows[k + 1]), by_gain.measure(b, noise.rows[k + 1])
 
 
 def test_action_beyond_the_box_is_the_action_at_its_edge() -> None:
     task = make("U")
     state = begin(task, Noise(task, 8, 0, 1))
-    for array, limit in zip(
-        task.act(state, numpy.full((1, 8), 9.0)), task.act(state, numpy.ones((1, 8))), strict=True
-    ):
+    beyond, edge = task.act(state, numpy.full((1, 8), 9.0)), task.act(state, numpy.ones((1, 8)))
+    for array, limit in zip(leaves(beyond), leaves(edge), strict=True):
         numpy.testing.assert_array_equal(array, limit)
 
 
@@ -431,7 +456,7 @@ def test_torch_gives_the_same_roll_out(torch: Any, plant: str, control: str) -> 
             (plain.observe(one), tensor.observe(two)),
             (plain.cost(one), tensor.cost(two)),
             (plain.covariance(one), tensor.covariance(two)),
-            *zip(one, two, strict=True),
+            *zip(leaves(one), leaves(two), strict=True),
         ]
         for x, y in pairs:
             assert y.dtype == torch.float64
@@ -474,24 +499,22 @@ def test_random_episodes_hold_what_they_promise() -> None:
     task = make("U")
     N, p = 400, task.parameters
     noise = Noise(task, N, 0, 1)
-    state = task.begin(noise.uniforms, noise.initial)
-    times = state.command_times
+    truth = task.begin(noise.uniforms, noise.initial).truth
+    times, levels = truth.commands.times, truth.levels.values
     assert (numpy.diff(times, axis=0) > 0).all()
     assert (times.max(axis=0) <= p.horizon).all()
-    assert numpy.abs(state.levels).min() >= 0.25
-    assert numpy.abs(state.levels).max() <= 4.0
-    assert abs(numpy.log(state.levels).mean()) < 0.12  # log-uniform about one: four standard errors
-    command = [
-        task._in_force(numpy.full(N, k), numpy.zeros(N), times, state.commands) for k in range(p.horizon)
-    ]
+    assert numpy.abs(levels).min() >= 0.25
+    assert numpy.abs(levels).max() <= 4.0
+    assert abs(numpy.log(levels).mean()) < 0.12  # log-uniform about one: four standard errors
+    command = [truth.commands.at(numpy.full(N, k), numpy) for k in range(p.horizon)]
     changes = (numpy.diff(numpy.array(command), axis=0) != 0).sum(axis=0)
     assert changes.min() >= 4
     assert changes.max() <= 12
     assert set(numpy.unique(changes)) > {6, 8, 10}  # steps are one change, doublets three
-    length = state.dropout_stops - state.dropout_starts
+    length = truth.dropout_stops - truth.dropout_starts
     assert (length >= 1).all()
     assert (length <= 15).all()
-    assert (state.dropout_stops <= p.horizon + 1).all()
+    assert (truth.dropout_stops <= p.horizon + 1).all()
 
 
 def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:
@@ -499,7 +522,7 @@ def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone(
         task = make(plant, "sensor-degradation")
         noise = Noise(task, 8, 0, 1)
         state = task.begin(noise.uniforms, noise.initial)
-        after = state.sensor_levels[1, :, 0]
+        after = state.truth.sensor_levels.values[1, :, 0]
         assert dict(zip(task.sensors, after, strict=True))["rate"] == pytest.approx(5.0)
         assert sorted(after)[:-1] == [1.0] * (len(after) - 1)
     lag = make("U", "actuator-lag").design

@@ -23,7 +23,9 @@ from ...evaluation.seeds import episode_seeds
 from ...filters import linear_systems
 from ..names import evaluate
 from ..reproduction import Claim, Grid, Reproduction, episode_count
-from .policies import Kalman, RawSensors, TrueState, stationary
+from .policies import Kalman, RawSensors
+from .references import TrueState
+from .theory import stationary
 
 TITLE = "Stochastic simulation of a UAV autopilot with the optimal Kalman filter (Gridnev, Rusetski, Rak)"
 EPISODES = 600
@@ -59,7 +61,7 @@ class Signals:
     observation: numpy.ndarray
     estimate: numpy.ndarray
     innovation: numpy.ndarray
-    """In units of the output; exact once the filter's covariance has settled."""
+    """In units of the output; exact once the filter's covariance has settled. NaN without a filter."""
     nees: numpy.ndarray
     """Normalised estimation error squared per coordinate."""
     nis: numpy.ndarray
@@ -75,24 +77,27 @@ def _run(keywords: dict[str, Any], scenario: str, loop: str, episodes: int, prog
     shown = task.measured.index(task.output)
     kept: dict[str, list[numpy.ndarray]] = {}
     truths: list[numpy.ndarray] = []
+    judge = task.estimated_outside() if loop == "true-state" else task
 
     def record(state: Any) -> None:
-        error = task.error(state)[:, :episodes]
-        covariance = numpy.moveaxis(task.covariance(state)[..., :episodes], -1, 0)
+        error = judge.error(state)[:, :episodes]
+        covariance = numpy.moveaxis(judge.covariance(state)[..., :episodes], -1, 0)
+        told = judge.records(state)
+        silent = numpy.full_like(told["output"], numpy.nan)
         whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
         values = {
-            "output": state.truth[task.output],
-            "control": task.autopilot(state),
-            "cost": task.cost(state) * task.cost_unit,
-            "observation": state.measurement[shown],
-            "estimate": state.estimate[task.output],
-            "innovation": state.innovation[shown],
-            "nis": state.nis,
+            "output": told["output"],
+            "control": told["control_signal"],
+            "cost": judge.cost(state) * task.cost_unit,
+            "observation": state.measurement.reading[shown],
+            "estimate": judge.mean(state)[task.output],
+            "innovation": told.get("innovation", silent),
+            "nis": told.get("nis", silent),
         }
         for name, value in values.items():
             kept.setdefault(name, []).append(value[:episodes])
         kept.setdefault("nees", []).append((whitened * error.T).sum(axis=1) / len(error))
-        truths.append(state.truth[:, :episodes])
+        truths.append(state.truth.state[:, :episodes])
 
     seeds = episode_seeds("test", 0, episodes)
     if loop == "true-state":

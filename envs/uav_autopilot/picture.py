@@ -4,8 +4,9 @@ import math
 from collections.abc import Sequence
 
 from ..rendering import Picture, Strip, error_strip
-from ..task import Task
-from .task import COORDINATES, MODES, State, UavAutopilot
+from ..task import Episode, Task
+from .banks import MODES, Filter
+from .task import UavAutopilot
 
 CONTROL = {"P": ("commanded acceleration", "m/s²"), "U": ("elevator command", "deg")}
 LEAST = 1.5
@@ -26,28 +27,30 @@ class UavAutopilotPicture(Picture):
         )
         self.sensor = self.task.sensors[self.shown]
 
-    def records(self, state: State) -> dict[str, float]:
+    def records(self, state: Episode) -> dict[str, float]:
         """Signals of the loop, NIS, and the levels of the noise."""
-        task, i = self.task, self.task.output
+        task, truth, estimator = self.task, state.truth, state.bank
+        assert isinstance(estimator, Filter)
+        answered = state.measurement.available[self.shown, 0] > 0.0
         values = {
-            "command": state.command[0],
-            "output": state.truth[i, 0],
-            "estimate": state.estimate[i, 0],
-            "control": task.autopilot(state)[0],
+            "command": truth.command[0],
+            "output": truth.state[task.output, 0],
+            "estimate": estimator.estimate[task.output, 0],
+            "control": estimator.control[0],
             # A line breaks off where there is no reading.
-            "innovation": state.innovation[self.shown, 0] if state.available[self.shown, 0] else math.nan,
-            "mean_nis": state.mean_nis[0],
-            "level": state.level[0],
-            "log10_scale": math.log10(state.scale[0]),
+            "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
+            "mean_nis": estimator.mean_nis[0],
+            "level": truth.level[0],
+            "log10_scale": math.log10(estimator.scale[0]),
         }
         if task.control == "mode":
-            values["mode"] = float(state.action[:, 0].argmax())
-        return values | {f"sensor_level.{s}": state.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
+            values["mode"] = float(estimator.action[:, 0].argmax())
+        return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
     def strips(self) -> Sequence[Strip]:
         """Left column the loop, right column the filter."""
         task = self.task
-        output = COORDINATES[task.parameters.plant][task.output]
+        output = task.components[task.output]
         name, unit = CONTROL[task.parameters.plant]
         disturbance = "gusts" if task.parameters.plant == "U" else "control"
         levels = {disturbance: "level", **{s: f"sensor_level.{s}" for s in task.sensors}}

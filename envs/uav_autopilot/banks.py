@@ -1,0 +1,325 @@
+"""The Kalman filter of UavAutopilot that is steered; equations (10) to (12), packed as ``packed_covariance``."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import gaussian, packed_covariance
+from ...filters.ordered_sums import ordered_sum
+from ..observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, Compression, Quantity
+from ..task import Bank
+from .parameters import UavAutopilotParameters
+from .world import Measurement, Start
+
+if TYPE_CHECKING:
+    from .task import UavAutopilot
+
+MODES = ("nominal", "wide-band", "raw-sensors")
+FLOORED_LOG = Compression("log of ", lambda value, xp: xp.log(xp.clip(value, 1e-6, None)), numpy.exp)
+"""The logarithm of squares, which may be zero."""
+
+
+class Filter(NamedTuple):
+    """N Kalman filters, and the controls that follow from them."""
+
+    mean: Array
+    """After ``predict`` predicted, after ``act`` updated, ``(n, N)``."""
+    covariance: Array
+    """Packed triangle; after ``predict`` it is ``F P F^T``, without process noise."""
+    estimate: Array
+    """What the autopilot uses and the task reports, ``(n, N)``."""
+    estimate_covariance: Array
+    """Packed triangle of its covariance."""
+    control: Array
+    """u that follows from it and from the command, ``(N,)``."""
+    scale: Array
+    """Factor on the process noise in the last update, ``(N,)``."""
+    action: Array
+    """Last action as shown, ``(A, N)``."""
+    innovation: Array
+    """Over sigma; 0 in a dropout, ``(m, N)``."""
+    nis: Array
+    """Normalised innovation squared per available reading, ``(N,)``."""
+    mean_innovation: Array
+    """Short average of the innovation, ``(m, N)``."""
+    mean_square: Array
+    """Short average of its square, ``(m, N)``."""
+    mean_nis: Array
+    """Short average of the NIS, ``(N,)``."""
+
+
+class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
+    """What both controls share: a subclass says what an action does to the process noise."""
+
+    parameters: UavAutopilotParameters
+    shown_action: Block
+    no_action: tuple[float, ...]
+    """What is shown as the last action before the first."""
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        super().__init__(task)
+        constant, design, n, m = task.constant, task.design, len(task.components), len(task.sensors)
+        model, pack = design.model, packed_covariance.pack
+        self.F, self.B = constant(model.F), constant(model.B)
+        self.propagator = constant(packed_covariance.propagator(model.F))
+        scaled, other = (constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise))
+        self.process_noise = scaled + other
+        self.R = constant(design.R[:, :, None])
+        self.sensor_identity = constant(numpy.eye(m)[:, :, None])
+        self.sensor_sigmas = constant(self.parameters.value("sensor_sigmas"))[:, None]
+        self.sensor_entries = [
+            packed_covariance.position(n, i, j) for i in task.measured for j in task.measured
+        ]
+        self.diagonal = packed_covariance.diagonal(n)
+        self.trace_weights = constant(1.0 / (n * numpy.diag(design.steady.posterior))[:, None])
+        self.forget = 1.0 / self.parameters.averaging_measurements
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What the filter and the autopilot know, scaled; sigmas are the filter's before it is acted on."""
+        sensors, horizon = self.task.sensors, self.task.horizon
+        unit = 1.0 / self.task.output_sigma
+        return (
+            Block(
+                "innovation",
+                lambda f, _: f.innovation,
+                "the innovation over its sigma; 0 in a dropout",
+                sensors,
+                SIGNED_LOG,
+            ),
+            Block(
+                "mean_innovation",
+                lambda f, _: f.mean_innovation,
+                "short average of the innovation over its sigma",
+                sensors,
+            ),
+            Block(
+                "log_mean_square",
+                lambda f, _: f.mean_square,
+                "the short average of its square",
+                sensors,
+                FLOORED_LOG,
+            ),
+            Block(
+                "log_nis",
+                lambda f, _: f.nis,
+                "the normalised innovation squared per available reading",
+                shown=FLOORED_LOG,
+            ),
+            Block("log_mean_nis", lambda f, _: f.mean_nis, "its short average", shown=FLOORED_LOG),
+            Block(
+                "command",
+                lambda _, measurement: unit * measurement.command,
+                "the command over the output sensor's sigma",
+                shown=SIGNED_LOG,
+            ),
+            Block(
+                "control",
+                lambda _, measurement: unit * measurement.control,
+                "the control in force over the output sensor's sigma",
+                shown=SIGNED_LOG,
+            ),
+            Block(
+                "reading",
+                lambda _, measurement: measurement.reading / self.sensor_sigmas,
+                "the last valid reading over its sigma",
+                sensors,
+                SIGNED_LOG,
+            ),
+            Block(
+                "log_trace",
+                lambda f, _: self.log_trace(f),
+                "the mean of the variances over those of the settled filter",
+                shown=KEPT_AS_LOG,
+            ),
+            Block(
+                "available",
+                lambda _, measurement: measurement.available,
+                "1 where the sensor answered, 0 in a dropout",
+                sensors,
+                over_interval="mean",
+            ),
+            Block(
+                "time",
+                lambda _, measurement: measurement.number / horizon,
+                "measurements so far over the horizon",
+            ),
+            self.shown_action,
+        )
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """Readings and command as they are."""
+        sigmas, unit = self.parameters.value("sensor_sigmas"), self.task.output_sigma
+        return (
+            Quantity(
+                "reading_in_units",
+                ", ".join(self.task.components[i].unit for i in self.task.measured),
+                "last valid reading of each sensor",
+                lambda read: sigmas * read("reading"),
+            ),
+            Quantity(
+                "command_in_units",
+                self.task.components[self.task.output].unit,
+                "command",
+                lambda read: unit * read("command"),
+            ),
+        )
+
+    def log_trace(self, state: Filter) -> Array:
+        """Log of the predicted covariance's trace, with the process noise of the last action."""
+        variances = state.covariance[self.diagonal] + state.scale * self.process_noise[self.diagonal]
+        return self.xp.log(ordered_sum(self.trace_weights * variances))
+
+    def start(self, initial: Start) -> Filter:
+        """Start as everyone is told, with averages as a consistent filter has them."""
+        xp = self.xp
+        zeros = 0.0 * self.task.readings_of(initial.mean)
+        one = zeros[0] + 1.0
+        covariance = packed_covariance.pack(initial.covariance)
+        return Filter(
+            mean=initial.mean,
+            covariance=covariance,
+            estimate=initial.mean,
+            estimate_covariance=covariance,
+            control=self.task.autopilot(initial.mean, initial.command),
+            scale=one,
+            action=xp.stack([value * one for value in self.no_action]),
+            innovation=zeros,
+            nis=one,
+            mean_innovation=zeros,
+            mean_square=zeros + 1.0,
+            mean_nis=one,
+        )
+
+    def predict(self, state: Filter, measurement: Measurement) -> Filter:
+        """Equation (10), and the innovations, with the process noise of the last action."""
+        xp, available, m = self.xp, measurement.available, len(self.task.sensors)
+        mean = xp.matmul(self.F, state.mean) + self.B * measurement.control
+        covariance = xp.matmul(self.propagator, state.covariance)
+        residual = available * (measurement.reading - self.task.readings_of(mean))
+        predicted = covariance[self.sensor_entries] + state.scale * self.process_noise[self.sensor_entries]
+        S = xp.reshape(predicted, (m, m, -1)) + self.R
+        # A sensor without a reading counts as one with unit variance that agrees with the prediction.
+        S = S * (available[:, None] * available[None]) + self.sensor_identity * (1.0 - available[None])
+        _, squared_distance = gaussian.log_density(residual, S)
+        innovation = residual / xp.sqrt(xp.stack([S[i, i] for i in range(m)]))
+        count = ordered_sum(available[i] for i in range(m))
+        nis = xp.where(count > 0.0, squared_distance / xp.clip(count, 1.0, None), state.mean_nis)
+        forget = self.forget
+        return state._replace(
+            mean=mean,
+            covariance=covariance,
+            innovation=innovation,
+            nis=nis,
+            mean_innovation=state.mean_innovation + forget * available * (innovation - state.mean_innovation),
+            mean_square=state.mean_square + forget * available * (innovation**2 - state.mean_square),
+            mean_nis=state.mean_nis + forget * (nis - state.mean_nis),
+        )
+
+    def steered(self, action: Array) -> tuple[Array, Array]:
+        """Return the action as shown, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
+        raise NotImplementedError
+
+    def believed(
+        self, update: packed_covariance.Update, measurement: Measurement, shown: Array
+    ) -> tuple[Array, Array]:
+        """Return what the autopilot uses, and its packed covariance."""
+        return update.mean, update.covariance
+
+    def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
+        """Equations (12), (11) with the process noise that the action asks for, and the control."""
+        shown, scale = self.steered(action)
+        update = packed_covariance.update_coordinates(
+            state.mean,
+            state.covariance + scale * self.process_noise,
+            measurement.reading,
+            self.task.measured,
+            self.task.sensor_variances,
+            measurement.available,
+        )
+        estimate, covariance = self.believed(update, measurement, shown)
+        return state._replace(
+            mean=update.mean,
+            covariance=update.covariance,
+            estimate=estimate,
+            estimate_covariance=covariance,
+            control=self.task.autopilot(estimate, measurement.command),
+            scale=scale,
+            action=shown,
+        )
+
+    def mean(self, state: Filter) -> Array:
+        """What the autopilot uses, ``(n, N)``."""
+        return state.estimate
+
+    def covariance(self, state: Filter) -> Array:
+        """Covariance reported for it, ``(n, n, N)``."""
+        return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
+
+    def feedback(self, state: Filter) -> Array:
+        """Report the control that follows from the estimate and the command, ``(N,)``."""
+        return state.control
+
+    def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
+        """NIS per available reading, and the innovation over its sigma of the output's sensor (of the first
+        where the output is not measured).
+        """
+        task = self.task
+        shown = task.measured.index(task.output) if task.output in task.measured else 0
+        return {"nis": state.nis, "innovation": state.innovation[shown]}
+
+
+class GainBank(_AutopilotFilter):
+    """Control ``gain``: the action scales the process noise."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
+    shown_action = Block("action", lambda f, _: f.action, "last action")
+    no_action = (0.0,)
+
+    def steered(self, action: Array) -> tuple[Array, Array]:
+        """Scale by ``10 ** (gain_decades a)``."""
+        xp = self.xp
+        shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
+        return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
+
+
+class ModeBank(_AutopilotFilter):
+    """Control ``mode``: nominal, wide-band, or raw sensors, behind which the filter runs on."""
+
+    action_space = gymnasium.spaces.Discrete(len(MODES))
+    shown_action = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
+    no_action = (1.0, 0.0, 0.0)
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        super().__init__(task)
+        # Of raw readings it is the covariance of their nominal noise; a coordinate without a sensor, taken as
+        # zero, has the stationary variance of the nominal loop.
+        d = task.design
+        unmeasured = numpy.where(d.H.any(axis=0), 0.0, numpy.diag(d.state_covariance))
+        raw = d.H.T @ d.R @ d.H + numpy.diag(unmeasured)
+        self.raw_covariance = task.constant(packed_covariance.pack(raw)[:, None])
+
+    def steered(self, action: Array) -> tuple[Array, Array]:
+        """Scale by ``wide_band_scale`` in mode "wide-band"."""
+        xp = self.xp
+        shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
+        return shown, 1.0 + (self.parameters.wide_band_scale - 1.0) * shown[1]
+
+    def believed(
+        self, update: packed_covariance.Update, measurement: Measurement, shown: Array
+    ) -> tuple[Array, Array]:
+        """Readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""
+        xp, reading, measured = self.xp, measurement.reading, self.task.measured
+        zero = xp.zeros_like(reading[0])
+        rows = [
+            reading[measured.index(i)] if i in measured else zero for i in range(len(self.task.components))
+        ]
+        raw = shown[2] > 0.0
+        return (
+            xp.where(raw, xp.stack(rows), update.mean),
+            xp.where(raw, self.raw_covariance, update.covariance),
+        )

@@ -1,0 +1,126 @@
+"""The plants of UavAutopilot and the design of the loop: autopilot, nominal filter, theory."""
+
+from typing import NamedTuple
+
+import numpy
+
+from ...filters import linear_systems
+from ...filters.gusts import vertical_gust
+from .parameters import COORDINATES, OUTPUT, UavAutopilotParameters
+
+
+class Model(NamedTuple):
+    """Discrete plant with its noise in two parts, as NumPy arrays."""
+
+    F: numpy.ndarray
+    """Transition matrix (7), ``(n, n)``."""
+    B: numpy.ndarray
+    """``(n, 1)``."""
+    scaled_noise: numpy.ndarray
+    """Covariance of the part of the process noise that the disturbance's level multiplies, ``(n, n)``."""
+    other_noise: numpy.ndarray
+    """Covariance of the rest, ``(n, n)``."""
+
+
+def constant_rate(parameters: UavAutopilotParameters) -> Model:
+    """Plant P: ``F = [[1, T], [0, 1]]``, "with the first derivative of the useful signal" (paper).
+
+    Reading: the scan has "1 0,25 / F = 0 =1"; the "=" is a stray sign. ``B = [T^2/2, T]`` and noise that
+    enters with the control are ours.
+    """
+    T = parameters.value("sampling_interval")
+    B = numpy.array([[T**2 / 2], [T]])
+    Q = parameters.acceleration_sigma**2 * B @ B.T
+    return Model(numpy.array([[1.0, T], [0.0, 1.0]]), B, Q, numpy.zeros((2, 2)))
+
+
+def pitch_channel(parameters: UavAutopilotParameters, actuator_lag: float = 1.0) -> Model:
+    """Plant U: short period, pitch, actuator and gust of a small aircraft, in degrees and deg/s.
+
+    With the aerodynamic angle ``a = incidence + gust``:
+    ``incidence' = rate - Z_a a - Z_d elevator``, ``rate' = M_a a + M_q rate + M_d elevator + w_q``,
+    ``pitch' = rate``, ``elevator' = (u - elevator) / tau + w_d``, ``gust' = -(V / L) gust + w_g``.
+    """
+    p = parameters
+    lift = p.air_density * p.airspeed * p.wing_area / (2.0 * p.mass)
+    moment = p.air_density * p.airspeed**2 * p.wing_area * p.chord / (2.0 * p.pitch_inertia)
+    Z_a, Z_d = lift * p.lift_incidence, lift * p.lift_elevator
+    M_a, M_d = moment * p.moment_incidence, moment * p.moment_elevator
+    M_q = moment * p.moment_rate * p.chord / (2.0 * p.airspeed)
+    tau = p.actuator_time_constant * actuator_lag
+    gust = vertical_gust(p.airspeed, p.gust_length, p.gust_sigma)
+    A = numpy.array(
+        [
+            [-Z_a, 1.0, 0.0, -Z_d, -Z_a],
+            [M_a, M_q, 0.0, M_d, M_a],
+            [0.0, 1.0, 0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, -1.0 / tau, 0.0],
+            [0.0, 0.0, 0.0, 0.0, -gust.rate],
+        ]
+    )
+    drive = numpy.array([[0.0], [0.0], [0.0], [1.0 / tau], [0.0]])
+    T = p.value("sampling_interval")
+    F, B = linear_systems.zero_order_hold(A, drive, T)
+    _, scaled = linear_systems.van_loan(A, numpy.diag([0.0, 0.0, 0.0, 0.0, gust.intensity]), T)
+    rest = numpy.diag([0.0, p.moment_disturbance, 0.0, p.actuator_disturbance, 0.0])
+    _, other = linear_systems.van_loan(A, rest, T)
+    return Model(F, B, scaled, other)
+
+
+class Design(NamedTuple):
+    """Everything that is computed once: believed and true plant, autopilot, filter, theory of the loop."""
+
+    model: Model
+    """What the filter and the autopilot believe."""
+    true_model: Model
+    H: numpy.ndarray
+    """``(m, n)``."""
+    R: numpy.ndarray
+    """Nominal, ``(m, m)``."""
+    feedback: numpy.ndarray
+    """L, ``(1, n)``."""
+    feedforward: float
+    """N."""
+    weight: numpy.ndarray
+    """Of the state in the cost, ``(n, n)``."""
+    control_weight: float
+    steady: linear_systems.SteadyFilter
+    """The nominal filter once settled."""
+    state_covariance: numpy.ndarray
+    """Of the state in the nominal loop without command, ``(n, n)``."""
+
+
+def design(parameters: UavAutopilotParameters) -> Design:
+    """Design the loop.
+
+    Raises:
+        ValueError: if L does not stabilise the plant, or the sensors do not determine the state.
+    """
+    if parameters.plant == "P":
+        model = true_model = constant_rate(parameters)
+    else:
+        model, true_model = pitch_channel(parameters), pitch_channel(parameters, parameters.actuator_lag)
+    names = [c.name for c in COORDINATES[parameters.plant]]
+    H = numpy.eye(len(names))[[names.index(sensor) for sensor in parameters.value("sensors")]]
+    R = numpy.diag(numpy.square(parameters.value("sensor_sigmas")))
+    weight = numpy.diag(parameters.value("state_weights"))
+    control_weight = parameters.value("control_weight")
+    if parameters.feedback is None:
+        L = linear_systems.discrete_regulator(model.F, model.B, weight, numpy.array([[control_weight]]))
+    else:
+        L = numpy.array([parameters.feedback])
+    for plant, word in ((model, "the plant"), (true_model, "the plant with the true actuator")):
+        radius = linear_systems.spectral_radius(plant.F - plant.B @ L)
+        if radius >= 1.0:
+            raise ValueError(
+                f"feedback must stabilise {word}: with L = {L[0].round(6).tolist()} the spectral radius of "
+                f"F - B L is {radius:.6g}, and must be below 1"
+            )
+    Q = model.scaled_noise + model.other_noise
+    steady = linear_systems.steady_kalman(model.F, H, Q, R)
+    loop = linear_systems.estimate_feedback_loop(model.F, model.B, H, L, steady.gain, Q, R)
+    n = len(names)
+    X = linear_systems.stationary_covariance(*loop)[:n, :n]
+    output = numpy.eye(n)[names.index(OUTPUT[parameters.plant])]
+    N = linear_systems.feedforward_gain(model.F, model.B, output, L)
+    return Design(model, true_model, H, R, L, N, weight, control_weight, steady, X)

@@ -1,0 +1,252 @@
+"""The aircraft of UavAutopilot, what disturbs it, and its sensors; equations (8) and (9)."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy
+
+from ...filters import linear_systems
+from ..draws import Draws
+from ..observation import Array
+from ..task import World
+from .parameters import UavAutopilotParameters
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from .task import UavAutopilot
+
+FARTHEST = 1e4
+"""Where a coordinate of a lost loop stops, in its own unit: far beyond what any stable loop reaches, and
+small enough for squares to stay numbers."""
+
+
+class Steps(NamedTuple):
+    """A signal that is constant between its steps."""
+
+    values: Array
+    """At the start and from each step on, ``(J + 1, ..., N)``."""
+    times: Array
+    """Numbers of the measurements at which it steps, ascending, ``(J, N)``."""
+
+    def at(self, number: Array, xp: "ModuleType") -> Array:
+        """Value at a measurement, ``(..., N)``."""
+        value = self.values[0]
+        for i in range(self.times.shape[0]):
+            value = xp.where(number >= self.times[i], self.values[i + 1], value)
+        return value
+
+
+class Truth(NamedTuple):
+    """The aircraft, the noise, and the course of the episode."""
+
+    number: Array
+    """Measurements so far, ``(N,)``."""
+    state: Array
+    """In the units of the task's components, ``(n, N)``."""
+    reading: Array
+    """Last valid reading of each sensor, which it holds during a dropout, ``(m, N)``."""
+    command: Array
+    """r at this measurement, ``(N,)``."""
+    level: Array
+    """Of the disturbance in the interval before this measurement, ``(N,)``."""
+    sensor_level: Array
+    """Factor on the sensors' noise at this measurement, ``(m, N)``."""
+    commands: Steps
+    """Values ``(J + 1, N)``."""
+    levels: Steps
+    """Values ``(J + 1, N)``."""
+    sensor_levels: Steps
+    """Values ``(J + 1, m, N)``."""
+    dropout_starts: Array
+    """First measurement without a reading, ``(D, m, N)``."""
+    dropout_stops: Array
+    """First measurement with a reading again, ``(D, m, N)``."""
+
+
+class Start(NamedTuple):
+    """What everyone is told of the start."""
+
+    mean: Array
+    """Zero, ``(n, N)``."""
+    covariance: Array
+    """That of ``initial_sigmas``, ``(n, n, N)``."""
+    command: Array
+    """Zero: nothing is commanded before the first measurement, ``(N,)``."""
+
+
+class Measurement(NamedTuple):
+    """What the sensors say, and what the autopilot knows: its command and its control.
+
+    The nominal standard deviations of the sensors are the parameter ``sensor_sigmas``; by how much their noise
+    differs from it nobody says.
+    """
+
+    number: Array
+    """Measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
+    reading: Array
+    """Of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero if there
+    was none yet."""
+    available: Array
+    """1 where a sensor answered, 0 in a dropout, ``(m, N)``."""
+    command: Array
+    """r at this measurement, in the unit of the output, ``(N,)``."""
+    control: Array
+    """u in force since the measurement before: what was fed back, m/s^2 (plant P) or deg (U), ``(N,)``."""
+
+
+class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
+    """An aircraft that is flown by what is fed back, its gusts, and its sensors."""
+
+    parameters: UavAutopilotParameters
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        super().__init__(task)
+        p, constant, plant = self.parameters, task.constant, task.design.true_model
+        scaled, other = (
+            factor[:, numpy.any(factor != 0.0, axis=0)]
+            for factor in map(linear_systems.noise_factor, (plant.scaled_noise, plant.other_noise))
+        )
+        self.scaled_drives = scaled.shape[1]
+        """Normal numbers that the level of the disturbance multiplies; they come first."""
+        self.drives = scaled.shape[1] + other.shape[1]
+        """Normal numbers that drive the plant; those of the sensors follow."""
+        self.initial_normals = len(task.components)
+        self.normals = self.drives + len(task.sensors)
+        self.noise_factor = constant(numpy.hstack([scaled, other]))
+        self.F, self.B = constant(plant.F), constant(plant.B)
+        self.sensor_sigmas = constant(p.value("sensor_sigmas"))[:, None]
+        self.initial_sigmas = constant(p.value("initial_sigmas"))[:, None]
+        self.initial_covariance = constant(numpy.diag(numpy.square(p.value("initial_sigmas"))))[:, :, None]
+        self.changing = constant(
+            [[float(p.changing_sensors is None or s in p.changing_sensors)] for s in task.sensors]
+        )
+        self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
+        """Coordinate and weight of every square in the cost."""
+        self.manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
+        self.dropouts = -(-p.horizon // p.dropout_period) if p.dropout_period else 0
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
+        """Draw what the episode will be like, and the state at its start."""
+        xp, p, m = self.xp, self.parameters, len(self.task.sensors)
+        state = self.initial_sigmas * normals
+        zero = xp.zeros_like(state[0])
+        commands = self._commands(draws, zero)
+        levels = self._parts(draws, "disturbance", p.disturbance_levels, p.disturbance_times, zero)
+        sensor_levels = self._parts(draws, "sensor", p.sensor_levels, p.sensor_times, zero, m)
+        sensor_levels = sensor_levels._replace(values=1.0 + self.changing * (sensor_levels.values - 1.0))
+        no_dropout = xp.stack([zero] * m)
+        starts, stops = [no_dropout], [no_dropout]
+        for i in range(self.dropouts):
+            length = draws.integer(f"dropout_length_{i}", p.dropout_length, m)
+            room = draws.unit(f"dropout_{i}", m) * (p.dropout_period - length)
+            starts.append(i * p.dropout_period + 1.0 + xp.floor(room))
+            stops.append(starts[-1] + length)
+        if p.plant == "U":
+            state = xp.concat([state[:-1], state[-1:] * levels.values[0]])
+        truth = Truth(
+            number=zero,
+            state=state,
+            reading=no_dropout,
+            command=zero,
+            level=levels.values[0],
+            sensor_level=sensor_levels.values[0],
+            commands=commands,
+            levels=levels,
+            sensor_levels=sensor_levels,
+            dropout_starts=xp.stack(starts)[1:],
+            dropout_stops=xp.stack(stops)[1:],
+        )
+        covariance = xp.broadcast_to(self.initial_covariance, (*self.initial_covariance.shape[:2], len(zero)))
+        return truth, Start(xp.zeros_like(state), covariance, zero)
+
+    def _parts(
+        self,
+        draws: Draws,
+        kind: str,
+        levels: Sequence[tuple[float, float]],
+        times: Sequence[tuple[int, int]],
+        zero: Array,
+        count: int | None = None,
+    ) -> Steps:
+        """Draw the level in each part of the episode, and when the parts begin."""
+        values = [draws.log_uniform(f"{kind}_level_{i}", limits, count) for i, limits in enumerate(levels)]
+        begins = [draws.integer(f"{kind}_time_{i}", limits) for i, limits in enumerate(times)]
+        return Steps(self.xp.stack(values), self.xp.stack([zero, *begins])[1:])
+
+    def _commands(self, draws: Draws, zero: Array) -> Steps:
+        """Draw the command.
+
+        In each period of random manoeuvres, at a random time, either a step to a new level or a doublet
+        about the present one, as likely.
+        """
+        xp, p = self.xp, self.parameters
+        if p.step_size:
+            return Steps(xp.stack([zero, zero + p.step_size]), (zero + p.step_time)[None])
+        low, high = p.command_amplitude
+        values, times = [zero], [zero]
+        for i in range(self.manoeuvres):
+            doublet = draws.event(f"doublet_{i}", 0.5)
+            limits = i * p.command_period + 1, (i + 1) * p.command_period - 2 * p.doublet_width
+            start = draws.integer(f"manoeuvre_time_{i}", limits)
+            size = draws.uniform(f"size_{i}", (-1.0, 1.0))
+            amplitude = xp.where(size < 0.0, -1.0, 1.0) * (low + (high - low) * xp.abs(size))
+            present = values[-1]
+            times += [start, start + p.doublet_width, start + 2.0 * p.doublet_width]
+            values += [
+                xp.where(doublet, present + amplitude, amplitude),
+                xp.where(doublet, present - amplitude, amplitude),
+                xp.where(doublet, present, amplitude),
+            ]
+        return Steps(xp.stack(values), xp.stack(times)[1:])
+
+    def advance(self, truth: Truth, noise: Array, feedback: Array) -> tuple[Truth, Measurement]:
+        """The control acts for one interval; the sensors that work answer.
+
+        Args:
+            truth: at the measurement before.
+            noise: ``(normals, N)``.
+            feedback: the control u, ``(N,)``.
+        """
+        xp = self.xp
+        number = truth.number + 1.0
+        level, sensor_level = truth.levels.at(number, xp), truth.sensor_levels.at(number, xp)
+        drive, readout = noise[: self.drives], noise[self.drives :]
+        drive = xp.concat([drive[: self.scaled_drives] * level, drive[self.scaled_drives :]])
+        disturbance = xp.matmul(self.noise_factor, drive)
+        state = xp.matmul(self.F, truth.state) + self.B * feedback + disturbance
+        state = xp.clip(state, -FARTHEST, FARTHEST)
+        reading = self.task.readings_of(state) + self.sensor_sigmas * sensor_level * readout
+        available = xp.ones_like(reading)
+        for i in range(truth.dropout_starts.shape[0]):
+            out = (number >= truth.dropout_starts[i]) & (number < truth.dropout_stops[i])
+            available = xp.where(out, 0.0, available)
+        reading = xp.where(available > 0.0, reading, truth.reading)
+        command = truth.commands.at(number, xp)
+        truth = truth._replace(
+            number=number,
+            state=state,
+            reading=reading,
+            command=command,
+            level=level,
+            sensor_level=sensor_level,
+        )
+        return truth, Measurement(number, reading, available, command, feedback)
+
+    def state(self, truth: Truth) -> Array:
+        """State of the plant, ``(n, N)``."""
+        return truth.state
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
+        task = self.task
+        control = task.autopilot(mean, truth.command)
+        total = task.design.control_weight * control * control
+        for i, weight in self.weights:
+            deviation = truth.state[i] - truth.command if i == task.output else truth.state[i]
+            total = total + weight * deviation * deviation
+        return total * (1.0 / task.cost_unit)
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """Output and command, in the unit of the output."""
+        return {"output": truth.state[self.task.output], "command": truth.command}
