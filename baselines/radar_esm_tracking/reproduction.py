@@ -23,7 +23,7 @@ from ...filters import class_fusion
 from ..evaluation import evaluate
 from ..figures import styles
 from ..reproduction import Claim, Grid, Reproduction, Verdict
-from .policies import SURE
+from .metrics import SURE
 
 TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
 EPISODES = 20000
