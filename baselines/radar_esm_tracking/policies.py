@@ -169,7 +169,7 @@ class Leaky(_Posterior):
         last = imm.log_probabilities(self.last_weight(observation).T)
         this_scan = self.log_likelihood(observation).T
         predicted = self.transition.T @ imm.mode_posterior(last, this_scan)
-        usable = self.decision(observation)[:, : self.task.types] * (1.0 - self.refused(observation))
+        usable = self.decision(observation)[:, :-1] * (1.0 - self.refused(observation))
         return imm.log_probabilities(predicted) + self.esm * (self.log_esm @ usable.T)
 
 

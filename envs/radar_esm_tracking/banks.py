@@ -4,7 +4,7 @@ Equations and their numbers stand in ``filters/class_fusion.py``.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -92,107 +92,69 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
     def blocks(self) -> Sequence[Block]:
         """Innovations and likelihoods of each class's filter, ESM decisions, last weights and the clock."""
         xp, p, classes = self.xp, self.parameters, self.task.modes
-        types = tuple(str(j) for j in range(self.task.types))
+        none = self.task.types
+        types = tuple(str(j) for j in range(none))
+        time_factor = p.sampling_interval / TIME_SHOWN
         average = f"exponential average over {p.averaging_measurements:g} scans"
         count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
 
-        def refused(f: Filters, measurement: Measurement) -> Array:
-            return xp.astype((measurement.decision < self.task.types) & ~f.used, xp.float64)
-
-        def innovation(i: int) -> Callable[[Filters, Measurement], Array]:
-            return lambda f, _: f.innovation[i]
-
-        def average_innovation(i: int) -> Callable[[Filters, Measurement], Array]:
-            return lambda f, _: f.average_innovation[i]
-
         return (
             Block(
-                "innovation_range", innovation(0), "the whitened innovation of the range", classes, SIGNED_LOG
+                "innovation_range", lambda f, _: f.innovation[0], "the whitened innovation of the range",
+                classes, SIGNED_LOG,
             ),
             Block(
-                "innovation_range_rate",
-                innovation(1),
-                "the whitened innovation of the range rate, without what the range explains",
-                classes,
-                SIGNED_LOG,
+                "innovation_range_rate", lambda f, _: f.innovation[1],
+                "the whitened innovation of the range rate, without what the range explains", classes, SIGNED_LOG,
             ),
             Block(
-                "average_innovation_range",
-                average_innovation(0),
-                f"the {average} of innovation_range",
-                classes,
-                SIGNED_LOG,
+                "average_innovation_range", lambda f, _: f.average_innovation[0],
+                f"the {average} of innovation_range", classes, SIGNED_LOG,
             ),
             Block(
-                "average_innovation_range_rate",
-                average_innovation(1),
-                f"the {average} of innovation_range_rate",
-                classes,
-                SIGNED_LOG,
+                "average_innovation_range_rate", lambda f, _: f.average_innovation[1],
+                f"the {average} of innovation_range_rate", classes, SIGNED_LOG,
             ),
             Block(
-                "log_likelihood",
-                lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood of this scan's radar measurement minus the largest, nats",
-                classes,
-                SIGNED_LOG,
+                "log_likelihood", lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
+                "the log-likelihood of this scan's radar measurement minus the largest, nats", classes, SIGNED_LOG,
             ),
             Block(
-                "accumulated_log_likelihood",
-                lambda f, _: f.accumulated - xp.max(f.accumulated, axis=0),
-                "the sum of the log-likelihoods since the start minus the largest, nats",
-                classes,
-                SIGNED_LOG,
+                "accumulated_log_likelihood", lambda f, _: f.accumulated - xp.max(f.accumulated, axis=0),
+                "the sum of the log-likelihoods since the start minus the largest, nats", classes, SIGNED_LOG,
             ),
             Block(
-                "log_squared_innovation",
-                lambda f, _: f.log_squared,
-                "the normalised innovation squared",
-                classes,
-                KEPT_AS_LOG1P,
+                "log_squared_innovation", lambda f, _: f.log_squared, "the normalised innovation squared",
+                classes, KEPT_AS_LOG1P,
             ),
             Block(
-                "average_log_squared_innovation",
-                lambda f, _: f.average_log_squared,
-                f"{average} of log_squared_innovation",
-                classes,
+                "average_log_squared_innovation", lambda f, _: f.average_log_squared,
+                f"{average} of log_squared_innovation", classes,
             ),
             Block(
-                "decision",
-                lambda f, measurement: one_hot(measurement.decision, self.task.types + 1, xp),
+                "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, xp),
                 "1 where the ESM decides for this emitter type; none: for nothing at this scan",
-                (*types, "none"),
-                over_interval="mean",
+                (*types, "none"), over_interval="mean",
             ),
             Block(
                 "decision_refused",
-                refused,
-                "1 where the bearing gate refuses the decision",
-                over_interval="mean",
+                lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
+                "1 where the bearing gate refuses the decision", over_interval="mean",
             ),
             Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types),
             Block(
-                "refused_count",
-                lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN),
-                f"refused {count}",
-                types,
+                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types
             ),
             Block(
-                "bearing_difference",
-                lambda f, measurement: measurement.bearing_difference,
-                "radar minus ESM bearing over the gate",
-                shown=scaled(1.0 / self.gate),
-                over_interval="mean",
+                "bearing_difference", lambda f, measurement: measurement.bearing_difference,
+                "radar minus ESM bearing over the gate", shown=scaled(1.0 / self.gate), over_interval="mean",
             ),
             Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes),
             Block(
-                "time",
-                lambda f, measurement: (
-                    xp.astype(measurement.scan, xp.float64) * (p.sampling_interval / TIME_SHOWN)
-                ),
+                "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * time_factor,
                 f"time since the start of the track over {TIME_SHOWN:g} s",
             ),
-        )
+        )  # fmt: skip
 
     # --- the clock
 
