@@ -8,6 +8,8 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking import reproduction as reproduction
+from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
+from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import started_lanes
@@ -149,32 +151,33 @@ def test_exact_errors_after_a_minute():
 
 
 def played(task, estimator, seeds, decisions):
-    """States after the estimator's update, with the task's own before it."""
-    lanes = started_lanes(task, seeds)
-    memory = estimator.start(lanes.state)
-    states = []
+    """What was told of the start; then episodes after each measurement, and the estimator's mean and covariance."""
+    begun, states = [], []
+    lanes = started_lanes(task, seeds, begun.append)
+    (start,) = begun
+    memory = estimator.start(start.measurement, start.truth)
+    zero = lanes.widened(numpy.zeros((len(seeds), task.classes)))
 
-    def update(state):
+    def update(episode):
         nonlocal memory
-        after, memory = estimator.update(state, memory)
-        states.append((state, after))
-        return after
+        mean, covariance, memory = estimator.update(episode.measurement, episode.truth, memory)
+        states.append((episode, mean, covariance))
+        return task.act(episode, zero)
 
     for _ in range(decisions):
         lanes.step(update)
-    return states
+    return start.measurement, states
 
 
 def test_ideal_is_the_channel_of_the_true_class():
     task = make_task(ID, scenario="random")
-    for before, after in played(task, baselines.Ideal(task), range(24), 120):
-        lane, true = numpy.arange(24), before.truth.target_class
+    _, states = played(task, Ideal(task), range(24), 120)
+    for episode, mean, covariance in states:
+        lane, true = numpy.arange(24), episode.truth.target_class
         # The channel's gains were computed in advance; 120 scans of rounding.
-        assert after.estimate == pytest.approx(before.bank.mean[:, true, lane], rel=1e-9, abs=1e-7)
-        reported = numpy.moveaxis(before.bank.covariance[:, :, true, lane], -1, 0)
-        assert numpy.moveaxis(after.estimate_covariance, -1, 0) == pytest.approx(reported, rel=1e-9)
-        squared = (before.bank.innovation[:, true, lane] ** 2).sum(axis=0)
-        assert task.records(after)["nis"] == pytest.approx(squared, rel=1e-7, abs=1e-9)
+        assert mean == pytest.approx(episode.bank.mean[:, true, lane], rel=1e-9, abs=1e-7)
+        reported = numpy.moveaxis(episode.bank.covariance[:, :, true, lane], -1, 0)
+        assert numpy.moveaxis(covariance, -1, 0) == pytest.approx(reported, rel=1e-9)
 
 
 def test_ideal_switches_its_model_at_the_change():
@@ -182,32 +185,24 @@ def test_ideal_switches_its_model_at_the_change():
     task = make_task(ID, scenario="class-change")
     models, start = task.design_models(task.parameters)
     H, R = models.H, models.R
-    states = played(task, baselines.Ideal(task), range(8), 120)
+    told, states = played(task, Ideal(task), range(8), 120)
     first = task.parameters.class_change[0]
     for lane in range(8):
         changes = 0
-        mean = covariance = None
         governed = int(states[0][0].truth.target_class[lane])
-        for before, after in states:
-            z = before.measurement[:, lane]
-            if mean is None:
-                # Scan 0 taken back from the innovation of the channel of S2, to differ from the code under test.
-                Theta = (
-                    H @ (models.Phi[..., 2] @ start[..., 2] @ models.Phi[..., 2].T + models.Q[..., 2]) @ H.T
-                    + R
-                )
-                z0 = z - numpy.linalg.cholesky(Theta) @ before.bank.innovation[:, 2, lane]
-                mean, covariance = numpy.array([z0[0] - 0.5 * z0[1], z0[1], 0.0]), start[..., governed]
+        mean, covariance = numpy.append(told.first.radar[:, lane], 0.0), start[..., governed]
+        for episode, estimate, reported in states:
+            z = episode.measurement.radar[:, lane]
             Phi = models.Phi[..., governed]
             mean, P = Phi @ mean, Phi @ covariance @ Phi.T + models.Q[..., governed]
             K = P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R)
             mean, covariance = mean + K @ (z - H @ mean), P - K @ H @ P
-            assert after.estimate[:, lane] == pytest.approx(mean, rel=1e-8, abs=1e-6)
-            assert after.estimate_covariance[:, :, lane] == pytest.approx(covariance, rel=1e-6, abs=1e-6)
-            now = int(before.truth.target_class[lane])
+            assert estimate[:, lane] == pytest.approx(mean, rel=1e-8, abs=1e-6)
+            assert reported[:, :, lane] == pytest.approx(covariance, rel=1e-6, abs=1e-6)
+            now = int(episode.truth.target_class[lane])
             if now != governed:
                 changes += 1
-                assert 0.5 * before.scan[lane] >= first
+                assert 0.5 * episode.measurement.scan[lane] >= first
             governed = now
         assert changes == 1
 
@@ -215,8 +210,7 @@ def test_ideal_switches_its_model_at_the_change():
 def test_ideal_does_not_depend_on_what_the_bank_does():
     one = evaluate(ID, ["ideal"], "class-change", 20)
     mixing = evaluate(ID, ["ideal"], "class-change", 20, class_transition=reproduction.leaking(0.05))
-    # Scan 0 is taken back from innovations that two formulas compute.
-    assert mixing["error"].values == pytest.approx(one["error"].values, rel=1e-7, abs=1e-6)
+    assert (mixing["error"].values == one["error"].values).all()
 
 
 def test_ideal_keeps_its_bound_where_the_class_changes():
@@ -266,7 +260,7 @@ def test_weights_against_bayes_written_out(cls, arguments):
         likelihood = numpy.exp(before.bank.log_likelihood - before.bank.log_likelihood.max(axis=0))
         radar = radar * likelihood
         for n in range(16):
-            used, refused = before.used_counts[:, n], before.refused_counts[:, n]
+            used, refused = before.bank.used_counts[:, n], before.bank.refused_counts[:, n]
             if cls is baselines.RadarOnly:
                 P = radar[:, n]
             elif cls is baselines.EsmOnly:
@@ -277,8 +271,8 @@ def test_weights_against_bayes_written_out(cls, arguments):
                 counts = esm * (used + arguments.get("refused", 0.0) * refused)
                 P = radar[:, n] * (composition @ numpy.prod(recognition**counts, axis=1))
             else:
-                decision = int(before.intercept.decision[n])
-                factor = pi[:, decision] ** esm if before.intercept.used[n] else 1.0
+                decision = int(before.measurement.decision[n])
+                factor = pi[:, decision] ** esm if before.bank.used[n] else 1.0
                 last = before.bank.probabilities[:, n] if previous is None else previous[:, n]
                 P = ((last * likelihood[:, n]) @ q) * factor
             # The observation compresses the logarithms; the last digits are lost.
@@ -406,12 +400,17 @@ def test_metrics_follow_from_the_dataset(records):
 
 
 def test_metrics_of_the_ideal_filter_and_of_a_bound(records):
+    """The ideal filter has errors and a covariance, but no class probabilities; a bound has neither."""
     _, found = records
-    assert found["ideal", "mean_true_class_probability", "", "60 s"].value == 1.0
-    assert found["ideal", "sure_and_wrong", "", "60 s"].value == 0.0
-    nis = found["ideal", "nis", "measurement", "all"]
-    assert nis.low < 2.0 < nis.high
-    assert not [key for key in found if key[0] == "known-class-bound" and key[1] == "calibration_ratio"]
+    ratio = found["ideal", "calibration_ratio", "acceleration", "all"]
+    assert ratio.low < 1.0 < ratio.high
+    nees = found["ideal", "nees", "state", "all"]
+    assert nees.low < 3.0 < nees.high
+    of_classes = {"rmse_by_class", "calibration_ratio"}
+    assert {key[1] for key in found if key[0] == "ideal"} >= of_classes
+    beliefs = {"mean_true_class_probability", "sure_and_wrong", "confidence_excess", "nis"}
+    assert not [key for key in found if key[0] == "ideal" and key[1] in beliefs]
+    assert not [key for key in found if key[0] == "known-class-bound" and key[1] in of_classes | beliefs]
 
 
 def test_time_quantile_is_the_order_statistic_and_knows_the_censored():
@@ -421,9 +420,9 @@ def test_time_quantile_is_the_order_statistic_and_knows_the_censored():
     seconds = 0.5 * numpy.arange(1, 13)
     times = numpy.sort(numpy.append(seconds, math.inf)[first[chosen]])
     for share in (0.1, 0.5, 0.9):
-        estimate = baselines.time_quantile(Bootstrap(101), first, chosen, seconds, share)
+        estimate = time_quantile(Bootstrap(101), first, chosen, seconds, share)
         assert estimate.value == times[math.ceil(share * len(times)) - 1]
-    assert baselines.time_quantile(Bootstrap(101), first, chosen, seconds, 0.999).value == math.inf
+    assert time_quantile(Bootstrap(101), first, chosen, seconds, 0.999).value == math.inf
 
 
 def test_short_runs_report_what_they_reach():

@@ -23,7 +23,7 @@ from ...evaluation.figures import styles
 from ...filters import class_fusion
 from ..names import evaluate
 from ..reproduction import Claim, Grid, Reproduction, Verdict
-from .policies import SURE
+from .metrics import SURE
 
 TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
 EPISODES = 20000

@@ -20,8 +20,8 @@ from ..rendering import (
     error_strip,
     grown,
 )
-from ..task import Task
-from .task import RadarEsmTracking, State
+from ..task import Episode, Task
+from .task import RadarEsmTracking
 
 ACCELERATION = (0.105, 0.555, 0.395, 0.345)
 DECISIONS = (0.105, 0.075, 0.395, 0.38)
@@ -52,24 +52,23 @@ class RadarEsmTrackingPicture(Picture):
 
     # --- the history
 
-    def records(self, state: State) -> dict[str, float]:
+    def records(self, state: Episode) -> dict[str, float]:
         """Accelerations, weights, true class and type, and the decision of this scan."""
-        intercept, truth = state.intercept, state.truth
-        decided = intercept.decision[0] < self.task.types
-        used = bool(intercept.used[0])
+        filters, truth, decision = state.bank, state.truth, state.measurement.decision[0]
+        decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
         return {
             "true": truth.motion[2, 0],
-            "estimate": state.estimate[2, 0],
-            **{f"filter.{s}": state.bank.mean[2, s, 0] for s in range(self.task.classes)},
-            **{f"weight.{s}": state.bank.probabilities[s, 0] for s in range(self.task.classes)},
+            "estimate": self.task.mean(state)[2, 0],
+            **{f"filter.{s}": filters.mean[2, s, 0] for s in range(self.task.classes)},
+            **{f"weight.{s}": filters.probabilities[s, 0] for s in range(self.task.classes)},
             "true_class": truth.target_class[0],
             "true_type": truth.emitter_type[0],
-            "used": intercept.decision[0] if used else nothing,
-            "refused": intercept.decision[0] if decided and not used else nothing,
+            "used": decision if used else nothing,
+            "refused": decision if decided and not used else nothing,
         }
 
-    def begin(self, state: State) -> None:
+    def begin(self, state: Episode) -> None:
         """Note when the class changes, and how large accelerations will be."""
         truth, p = state.truth, self.task.parameters
         change = int(truth.change_scan[0])
@@ -171,7 +170,7 @@ class RadarEsmTrackingPicture(Picture):
         """Limits for this episode's class."""
         self.acceleration.set_ylim(-self.height, self.height)
 
-    def draw(self, history: History, state: State) -> None:
+    def draw(self, history: History, state: Episode) -> None:
         """Draw what has been acted on."""
         empty = numpy.empty(0)
         times = numpy.arange(1, len(history.get("true", empty)) + 1)

@@ -1,0 +1,280 @@
+"""The filters of RadarEsmTracking that are steered: one for each class, weighed by the radar and the ESM.
+
+Equations and their numbers stand in ``filters/class_fusion.py``.
+"""
+
+import math
+from collections.abc import Sequence
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import class_fusion, imm
+from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ..controls import bank_action_space, bank_probabilities
+from ..observation import KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, scaled
+from ..task import Bank
+from .parameters import RadarEsmTrackingParameters
+from .world import Measurement, Start
+
+if TYPE_CHECKING:
+    from .task import RadarEsmTracking
+
+TIME_SHOWN = 60.0
+"""Seconds of track that the clock in the observation shows as one."""
+COUNT_SHOWN = 10.0
+"""Decisions that a count in the observation shows as one."""
+
+
+class Filters(NamedTuple):
+    """M Kalman filters, one for each class, and the ESM decisions so far."""
+
+    mean: Array
+    """After the radar update (and mixing), ``(3, M, N)``."""
+    covariance: Array
+    """``(3, 3, M, N)``."""
+    log_predicted: Array
+    """Log-probability of the classes given the radar, before the ESM, up to a constant, ``(M, N)``."""
+    innovation: Array
+    """Whitened, ``(2, M, N)``."""
+    log_squared: Array
+    """log(1 + normalised innovation squared), ``(M, N)``."""
+    log_likelihood: Array
+    """Of this scan's radar measurement, ``(M, N)``."""
+    average_innovation: Array
+    """Exponential average, ``(2, M, N)``."""
+    average_log_squared: Array
+    """Exponential average of ``log_squared``, ``(M, N)``."""
+    accumulated: Array
+    """Sum of the log-likelihoods since the start, ``(M, N)``."""
+    used: Array
+    """Whether there is an ESM decision at this scan that the gate (6) lets pass, ``(N,)`` of booleans."""
+    used_counts: Array
+    """Decisions for each type so far that could be used, ``(J, N)``."""
+    refused_counts: Array
+    """Decisions for each type so far that the gate refused, ``(J, N)``."""
+    probabilities: Array
+    """Weights in force, ``(M, N)``."""
+
+
+class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
+    """Every control: one Kalman filter for each class; with class transitions they mix on their weights."""
+
+    parameters: RadarEsmTrackingParameters
+
+    def __init__(self, task: "RadarEsmTracking") -> None:
+        super().__init__(task)
+        p, constant = self.parameters, task.constant
+        self.forgetting = math.exp(-1.0 / p.averaging_measurements)
+        self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
+        self.mixes = not numpy.array_equal(numpy.array(p.class_transition), numpy.eye(task.classes))
+        self.class_transition = constant(p.class_transition)
+        models, start = task.design_models(p)
+        self.start_covariance = constant(start)[..., None]
+        # One scan beyond the horizon is measured; lanes that wait for their reset stay at the last column.
+        self.last_scan = p.horizon + 1
+        if not self.mixes:
+            channels = class_fusion.design_channels(models, start, self.last_scan)
+            self.channels = class_fusion.Channels(*(constant(table) for table in channels))
+        esm = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
+        silence = numpy.ones((task.classes, 1))
+        self.log_esm = imm.log_probabilities(constant(numpy.concatenate([esm, silence], axis=1)))
+        self.log_prior = imm.log_probabilities(constant(p.prior))[:, None]
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """One class, or a number for each."""
+        return bank_action_space(self.task.control, self.task.classes)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """Innovations and likelihoods of each class's filter, ESM decisions, last weights and the clock."""
+        xp, p, classes = self.xp, self.parameters, self.task.modes
+        none = self.task.types
+        types = tuple(str(j) for j in range(none))
+        time_factor = p.sampling_interval / TIME_SHOWN
+        average = f"exponential average over {p.averaging_measurements:g} scans"
+        count = f"decisions for this emitter type so far over {COUNT_SHOWN:g}"
+
+        return (
+            Block(
+                "innovation_range", lambda f, _: f.innovation[0], "the whitened innovation of the range",
+                classes, SIGNED_LOG,
+            ),
+            Block(
+                "innovation_range_rate", lambda f, _: f.innovation[1],
+                "the whitened innovation of the range rate, without what the range explains", classes, SIGNED_LOG,
+            ),
+            Block(
+                "average_innovation_range", lambda f, _: f.average_innovation[0],
+                f"the {average} of innovation_range", classes, SIGNED_LOG,
+            ),
+            Block(
+                "average_innovation_range_rate", lambda f, _: f.average_innovation[1],
+                f"the {average} of innovation_range_rate", classes, SIGNED_LOG,
+            ),
+            Block(
+                "log_likelihood", lambda f, _: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
+                "the log-likelihood of this scan's radar measurement minus the largest, nats", classes, SIGNED_LOG,
+            ),
+            Block(
+                "accumulated_log_likelihood", lambda f, _: f.accumulated - xp.max(f.accumulated, axis=0),
+                "the sum of the log-likelihoods since the start minus the largest, nats", classes, SIGNED_LOG,
+            ),
+            Block(
+                "log_squared_innovation", lambda f, _: f.log_squared, "the normalised innovation squared",
+                classes, KEPT_AS_LOG1P,
+            ),
+            Block(
+                "average_log_squared_innovation", lambda f, _: f.average_log_squared,
+                f"{average} of log_squared_innovation", classes,
+            ),
+            Block(
+                "decision", lambda f, measurement: one_hot(measurement.decision, none + 1, xp),
+                "1 where the ESM decides for this emitter type; none: for nothing at this scan",
+                (*types, "none"), over_interval="mean",
+            ),
+            Block(
+                "decision_refused",
+                lambda f, measurement: xp.astype((measurement.decision < none) & ~f.used, xp.float64),
+                "1 where the bearing gate refuses the decision", over_interval="mean",
+            ),
+            Block("used_count", lambda f, _: f.used_counts * (1.0 / COUNT_SHOWN), f"used {count}", types),
+            Block(
+                "refused_count", lambda f, _: f.refused_counts * (1.0 / COUNT_SHOWN), f"refused {count}", types
+            ),
+            Block(
+                "bearing_difference", lambda f, measurement: measurement.bearing_difference,
+                "radar minus ESM bearing over the gate", shown=scaled(1.0 / self.gate), over_interval="mean",
+            ),
+            Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes),
+            Block(
+                "time", lambda f, measurement: xp.astype(measurement.scan, xp.float64) * time_factor,
+                f"time since the start of the track over {TIME_SHOWN:g} s",
+            ),
+        )  # fmt: skip
+
+    # --- the clock
+
+    def start(self, initial: Start) -> Filters:
+        """Start all filters on the first radar measurement, and weigh them by the first ESM decision."""
+        xp = self.xp
+        mean = xp.stack([initial.mean] * self.task.classes, axis=1)
+        zeros = 0.0 * mean[:2]
+        zero = zeros[0]
+        log_predicted = self.log_prior + zero
+        no_counts = xp.stack([zero[0]] * self.task.types)
+        used, used_counts, refused_counts = self._counted(no_counts, no_counts, initial.first)
+        return Filters(
+            mean=mean,
+            covariance=self.start_covariance + zero[0],
+            log_predicted=log_predicted,
+            innovation=zeros,
+            log_squared=zero,
+            log_likelihood=zero,
+            average_innovation=zeros,
+            average_log_squared=zero,
+            accumulated=zero,
+            used=used,
+            used_counts=used_counts,
+            refused_counts=refused_counts,
+            probabilities=imm.mode_posterior(log_predicted, self._esm_log_likelihood(used, initial.first)),
+        )
+
+    def predict(self, state: Filters, measurement: Measurement) -> Filters:
+        """Predict by one scan and take in the radar measurement; the ESM decision only counts so far."""
+        xp, models, f = self.xp, self.task.models, state
+        if self.mixes:
+            mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
+                f.probabilities, f.mean, f.covariance, measurement.radar, models, self.class_transition
+            )
+        else:
+            channels, column = self.channels, xp.clip(measurement.scan, 0, self.last_scan)
+            mean, innovation, log_likelihood = class_fusion.update_channels(
+                f.mean,
+                measurement.radar,
+                models.Phi,
+                models.H,
+                xp.take(channels.gain, column, axis=-1),
+                xp.take(channels.whitening, column, axis=-1),
+                xp.take(channels.log_normaliser, column, axis=-1),
+            )
+            covariance = xp.take(channels.covariance, column, axis=-1)
+            log_predicted = imm.log_probabilities(f.probabilities) + log_likelihood
+        log_squared = xp.log1p(ordered_sum(innovation * innovation))
+        used, used_counts, refused_counts = self._counted(f.used_counts, f.refused_counts, measurement)
+        return Filters(
+            mean,
+            covariance,
+            log_predicted,
+            innovation,
+            log_squared,
+            log_likelihood,
+            self._averaged(f.average_innovation, innovation),
+            self._averaged(f.average_log_squared, log_squared),
+            f.accumulated + log_likelihood,
+            used,
+            used_counts,
+            refused_counts,
+            f.probabilities,
+        )
+
+    def _averaged(self, old: Array, new: Array) -> Array:
+        """Exponential average with a new value taken in."""
+        return self.forgetting * old + (1.0 - self.forgetting) * new
+
+    def _counted(
+        self, used_counts: Array, refused_counts: Array, measurement: Measurement
+    ) -> tuple[Array, Array, Array]:
+        """Whether the gate (6) lets this scan's decision pass, and the counts with it."""
+        xp, decision = self.xp, measurement.decision
+        decided = one_hot(decision, self.task.types, xp)
+        used = (decision < self.task.types) & (xp.abs(measurement.bearing_difference) <= self.gate)
+        accepted = xp.astype(used, decided.dtype) * decided
+        return used, used_counts + accepted, refused_counts + (decided - accepted)
+
+    def _esm_log_likelihood(self, used: Array, measurement: Measurement) -> Array:
+        """Logarithm of pi(rho | s) of a decision that may be used, otherwise 0, ``(M, N)``."""
+        usable = self.xp.where(used, measurement.decision, self.task.types)
+        return self.xp.take(self.log_esm, usable, axis=1)
+
+    def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
+        """Put the weights of the action in force."""
+        probabilities = bank_probabilities(
+            self.task.control,
+            action,
+            state.log_predicted,
+            self._esm_log_likelihood(state.used, measurement),
+            self.parameters.evidence_scale,
+            self.xp,
+        )
+        return state._replace(probabilities=probabilities)
+
+    # --- what comes out
+
+    def mean(self, state: Filters) -> Array:
+        """Combination of the filters (11), ``(3, N)``."""
+        return weighted_sum(state.probabilities, state.mean)
+
+    def covariance(self, state: Filters) -> Array:
+        """Covariance (12), with the spread of the filters."""
+        return imm.combine(state.mean, state.covariance, state.probabilities)[1]
+
+    def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
+        """Weights and NIS.
+
+        The NIS of the bank is the mean over the classes by their probability given the radar; where these are
+        calibrated its expectation is 2, that of the true class's filter.
+        """
+        squared = ordered_sum(state.innovation * state.innovation)
+        return {
+            "mode_probability": state.probabilities,
+            "nis": weighted_sum(imm.normalised_exponential(state.log_predicted), squared),
+        }
+
+
+def one_hot(index: Array, count: int, xp: ModuleType) -> Array:
+    """Rows of which the one with the index is 1, ``(count, N)``."""
+    return xp.astype(xp.arange(count, device=index.device)[:, None] == index, xp.float64)

@@ -1,0 +1,123 @@
+"""Every constant of RadarEsmTracking, with its limits."""
+
+from dataclasses import dataclass
+
+from ...filters import singer
+from ..parameters import Limits, TaskParameters, check, parameter, sized, square_matrix
+
+STANDARD_GRAVITY = 9.81
+"""m/s^2."""
+
+
+@dataclass(frozen=True)
+class RadarEsmTrackingParameters(TaskParameters):
+    """Every constant of the task; each is a keyword of ``gym.make``."""
+
+    sampling_interval: float = parameter(0.5, above=0.0)
+    """Radar revisit time T, s (paper)."""
+    horizon: int = parameter(120, at_least=1)
+    """Scans acted on in one episode (ours: 60 s; the paper does not say)."""
+    esm_period: int = parameter(4, at_least=1)
+    """Scans from one ESM decision to the next, W (paper: 2 s)."""
+    manoeuvrability: tuple[float, ...] = parameter((0.025, 0.033, 0.1), above=0.0)
+    """Inverse correlation time of the acceleration of each class S0, S1, ..., 1/s (paper)."""
+    acceleration_sigma: tuple[float, ...] = parameter(
+        tuple(singer.acceleration_sigma(g * STANDARD_GRAVITY, 0.05, 0.5) for g in (0.5, 2.0, 5.0)), above=0.0
+    )
+    """Standard deviation of the acceleration of each class, m/s^2 (ours: Singer's rule with P_max = 0.05,
+    P_0 = 0.5 and at most 0.5, 2 and 5 g: transport, ordinary, agile. With one sigma for all, the printed
+    ``manoeuvrability`` alone cannot tell the classes apart)."""
+    process_noise: str = parameter("singer", choices=("singer", "acceleration"))
+    """"singer": the exact noise of the exponentially correlated acceleration. "acceleration": its variance
+    on the acceleration only, the other reading of the paper's unstated covariance."""
+    range_sigma: float = parameter(3000.0, above=0.0)
+    """Radar error of the range, m (paper)."""
+    range_rate_sigma: float = parameter(20.0, above=0.0)
+    """Radar error of the radial velocity, m/s (paper)."""
+    radar_bearing_sigma: float = parameter(15.0, above=0.0)
+    """Radar error of the bearing, degrees (as the paper prints it; 1.5 is believable and matters only where
+    there is a second emitter)."""
+    esm_bearing_sigma: float = parameter(3.0, above=0.0)
+    """ESM error of the bearing, degrees (paper)."""
+    association_error: float = parameter(0.1, above=0.0, below=1.0)
+    """Probability that the gate (6), (7) refuses two bearings of one target (paper)."""
+    recognition: tuple[tuple[float, ...], ...] = parameter(
+        tuple(tuple(0.9 if i == j else 0.1 / 3.0 for j in range(4)) for i in range(4)),
+        at_least=0.0, at_most=1.0, stochastic=True,
+    )  # fmt: skip
+    """Probability of every ESM decision (column) for every emitter type (row): advanced fighter, fighter,
+    airborne early warning, missile with active seeker (paper: 0.9 on the diagonal; ours: the rest shared
+    equally)."""
+    composition: tuple[tuple[float, ...], ...] = parameter(
+        ((0.05, 0.05, 0.85, 0.05), (0.15, 0.70, 0.10, 0.05), (0.45, 0.15, 0.05, 0.35)),
+        at_least=0.0, at_most=1.0, stochastic=True,
+    )  # fmt: skip
+    """Probability of every emitter type (column) in every class (row) (ours: the paper calls it known and
+    does not give it)."""
+    prior: tuple[float, ...] = parameter(
+        (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0), at_least=0.0, at_most=1.0, stochastic=True
+    )
+    """Class probabilities before any data; a random true class is drawn from them (ours: uniform)."""
+    class_transition: tuple[tuple[float, ...], ...] = parameter(
+        ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), at_least=0.0, at_most=1.0, stochastic=True
+    )
+    """Class transition probabilities q that the *bank* assumes, row = from, column = to (paper (2): a
+    constant class). Anything but the identity makes the filters mix on the weights."""
+    evidence_scale: float = parameter(4.0, above=0.0)
+    """Nats that an evidence of one adds to a class's log-posterior (ours)."""
+    averaging_measurements: float = parameter(10.0, at_least=1.0)
+    """Time constant of the exponential averages in the observation, scans (ours)."""
+    range_scale: float = parameter(3000.0, above=0.0)
+    """Error of the range that costs one, m (ours: the paper's radar error)."""
+    range_rate_scale: float = parameter(20.0, above=0.0)
+    """Error of the range rate that costs one, m/s (ours: the paper's radar error)."""
+    acceleration_scale: float = parameter(10.0, above=0.0)
+    """Error of the acceleration that costs one, m/s^2 (ours)."""
+    initial_range: tuple[float, float] = parameter((100e3, 100e3), above=0.0, ascending=True)
+    """Limits of the range at the start, m (paper: 100 km)."""
+    closing_speed: tuple[float, float] = parameter((500.0, 500.0), ascending=True)
+    """Limits of the closing speed at the start, m/s (paper: 500)."""
+    true_class: str = "random"
+    """"random": drawn from ``prior``; or the class of every target, "S0", "S1", ..."""
+    emitter: str = parameter("redrawn", choices=("redrawn", "fixed"))
+    """"redrawn": the type is drawn anew for every decision, as (8) assumes. "fixed": one type a target."""
+    class_change: tuple[float, float] | None = parameter(None, ascending=True)
+    """Limits of the time at which the class changes once, s, later than the first scan; None: never (ours)."""
+    silence_start: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability, at each ESM look, that a radiating target falls silent (ours)."""
+    silence_end: float = parameter(1.0, at_least=0.0, at_most=1.0)
+    """Probability, at each ESM look, that a silent target radiates again (ours)."""
+    second_emitter_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability that the ESM hears a second emitter, of another class, instead of the target (ours)."""
+    second_emitter_separation: tuple[float, float] = parameter(
+        (2.0, 20.0), above=0.0, at_most=180.0, ascending=True
+    )
+    """Limits of its distance in bearing, degrees, to either side (ours)."""
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return tuple(f"S{s}" for s in range(len(self.manoeuvrability)))
+
+    def check(self) -> None:
+        """Check what concerns several fields together."""
+        classes, types = len(self.manoeuvrability), len(self.recognition)
+        if classes < 2:
+            raise ValueError(f"manoeuvrability must name at least two classes, got {self.manoeuvrability!r}")
+        sized("acceleration_sigma", self.acceleration_sigma, classes)
+        if not types:
+            raise ValueError("recognition must have a row for each emitter type, got none")
+        square_matrix("recognition", self.recognition, types)
+        sized("composition", self.composition, classes, "rows, one for each class")
+        for s, row in enumerate(self.composition):
+            sized(f"composition[{s}]", row, types)
+        sized("prior", self.prior, classes)
+        square_matrix("class_transition", self.class_transition, classes)
+        check("true_class", self.true_class, str, Limits(choices=("random", *self.class_names)))
+        # The class at scan 0 must have governed one motion before it can change.
+        after_a_scan = Limits(above=self.sampling_interval)
+        check("class_change", self.class_change, tuple[float, float] | None, after_a_scan)
+        if self.silence_start + self.silence_end == 0.0:
+            raise ValueError(
+                "silence_start and silence_end must not both be 0: who radiates would be undefined"
+            )

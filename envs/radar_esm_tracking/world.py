@@ -1,0 +1,241 @@
+"""The target of RadarEsmTracking, the radar that measures it and the ESM station that listens to it."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy
+
+from ...filters import class_fusion
+from ...filters.ordered_sums import ordered_sum
+from ..draws import Draws, category
+from ..observation import Array
+from ..task import World
+from .parameters import RadarEsmTrackingParameters
+
+if TYPE_CHECKING:
+    from .task import RadarEsmTracking
+
+
+class Truth(NamedTuple):
+    """The target and what radiates around it."""
+
+    scan: Array
+    """Number of the current scan, integer, ``(N,)``; 0 starts the track."""
+    motion: Array
+    """Range (m), range rate (m/s), range acceleration (m/s^2), ``(3, N)``."""
+    target_class: Array
+    """Index of the class now, ``(N,)``."""
+    emitter_type: Array
+    """Index of the type now, ``(N,)``; of no effect where types are redrawn."""
+    change_scan: Array
+    """Scan from which the next class governs, ``(N,)``."""
+    next_class: Array
+    """``(N,)``."""
+    next_type: Array
+    """``(N,)``."""
+    radiating: Array
+    """Whether the target is heard at ESM looks, ``(N,)`` of booleans."""
+    other_class: Array
+    """Class of the second emitter, ``(N,)``."""
+    other_type: Array
+    """``(N,)``."""
+    separation: Array
+    """Its bearing minus the target's, degrees, ``(N,)``."""
+
+
+class Measurement(NamedTuple):
+    """What radar and ESM say at one scan; the radar measures at every scan."""
+
+    scan: Array
+    """Scans since the start of the track, integer, ``(N,)``; one scan is ``sampling_interval`` seconds."""
+    radar: Array
+    """Range (m) and range rate (m/s), ``(2, N)``; errors of ``range_sigma`` and ``range_rate_sigma``."""
+    looked: Array
+    """Whether the ESM listened at this scan, ``(N,)`` of booleans; it may have heard nothing."""
+    decision: Array
+    """Index of the emitter type that the ESM decides for, or the number of types where it heard nothing or did not
+    listen, ``(N,)``."""
+    bearing_difference: Array
+    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180); 0 where there is no decision, ``(N,)``.
+    Reading: the difference and not the two bearings, because the zero of each is the true one here."""
+
+
+class Start(NamedTuple):
+    """What everyone is told of the start of the track."""
+
+    mean: Array
+    """Range (m) and range rate (m/s) as first measured, acceleration 0, ``(3, N)``."""
+    covariance: Array
+    """``(3, 3, N)``: of the radar, and of the acceleration of a target of unknown class."""
+    first: Measurement
+    """The measurement of scan 0; its ESM decision is not yet taken in."""
+
+
+class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
+    """A target of one class on one range channel, seen by a radar and heard by an ESM station."""
+
+    parameters: RadarEsmTrackingParameters
+    initial_normals = 5
+    normals = 7
+    row_uniforms = 4
+
+    def __init__(self, task: "RadarEsmTracking") -> None:
+        super().__init__(task)
+        p, constant = self.parameters, task.constant
+        models, start = task.design_models(p)
+        # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
+        root = numpy.sqrt if p.process_noise == "acceleration" else numpy.linalg.cholesky
+        roots = numpy.stack([root(Q) for Q in numpy.moveaxis(models.Q, -1, 0)], axis=-1)
+        lower = [roots[i, j] for i in range(3) for j in range(i + 1)]
+        self.motion_table = constant(numpy.stack([*models.Phi[:, 2], *lower]))
+        """Response to the acceleration and root of the noise, a column for each class."""
+        self.acceleration_sigma = constant(p.acceleration_sigma)
+        self.start_covariance = constant(start @ numpy.array(p.prior))[..., None]
+        self.cost_factors = constant(
+            [[1.0 / scale] for scale in (p.range_scale, p.range_rate_scale, p.acceleration_scale)]
+        )
+        # Thresholds of category, a column for each class or type that lanes look up.
+        known = numpy.eye(task.classes)
+        share = p.prior if p.true_class == "random" else known[p.class_names.index(p.true_class)]
+        self.class_thresholds = _thresholds([share])[:, 0].tolist()
+        self.type_thresholds = constant(_thresholds(p.composition))
+        self.decision_thresholds = constant(_thresholds(p.recognition))
+        never = (p.horizon + 2) * p.sampling_interval
+        self.class_change = p.class_change or (never, never)
+
+    # --- the target and its emissions
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Start]:
+        """Draw the target and its surroundings, measure it and listen to it once."""
+        xp, p = self.xp, self.parameters
+        distance = draws.uniform("initial_range", p.initial_range)
+        closing_speed = draws.uniform("closing_speed", p.closing_speed)
+        target_class = draws.category("target_class", self.class_thresholds)
+        emitter_type = draws.category("emitter_type", self._types_of(target_class))
+        next_class = self._another_class(draws, "next_class", target_class)
+        next_type = draws.category("next_type", self._types_of(next_class))
+        change = draws.uniform("class_change", self.class_change)
+        other_class = self._another_class(draws, "other_class", target_class)
+        other_type = draws.category("other_type", self._types_of(other_class))
+        separation = draws.uniform("separation", p.second_emitter_separation)
+        side = xp.where(draws.event("other_side", 0.5), -1.0, 1.0)
+        radiating = draws.unit("radiating") * (p.silence_start + p.silence_end) < p.silence_end
+        acceleration = xp.take(self.acceleration_sigma, target_class, axis=0) * normals[0]
+        truth = Truth(
+            scan=xp.zeros_like(target_class),
+            motion=xp.stack([distance, -closing_speed, acceleration]),
+            target_class=target_class,
+            emitter_type=emitter_type,
+            change_scan=xp.astype(xp.ceil(change / p.sampling_interval), xp.int64),
+            next_class=next_class,
+            next_type=next_type,
+            radiating=radiating,
+            other_class=other_class,
+            other_type=other_type,
+            separation=side * separation,
+        )
+        first = self._measured(truth, normals[1:], draws.unit("first_intercept", 3))
+        zero = 0.0 * distance
+        mean = xp.stack([first.radar[0], first.radar[1], zero])
+        return truth, Start(mean, self.start_covariance + zero, first)
+
+    def _types_of(self, target_class: Array) -> Array:
+        """Thresholds of the emitter types of a class."""
+        return self.xp.take(self.type_thresholds, target_class, axis=1)
+
+    def _another_class(self, draws: Draws, name: str, target_class: Array) -> Array:
+        """A class other than the given one, all equally probable."""
+        step = draws.integer(name, (1, self.task.classes - 1))
+        return (target_class + self.xp.astype(step, self.xp.int64)) % self.task.classes
+
+    def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
+        """Fly one scan under the class at the previous one, let the class change and fall silent, and measure.
+
+        A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings; uniform ones for
+        the type, the decision, the source, and falling silent.
+        """
+        xp, p = self.xp, self.parameters
+        scan = truth.scan + 1
+        f = xp.take(self.motion_table, truth.target_class, axis=1)
+        x, w = truth.motion, noise
+        motion = xp.stack(
+            [
+                x[0] + p.sampling_interval * x[1] + f[0] * x[2] + f[3] * w[0],
+                x[1] + f[1] * x[2] + f[4] * w[0] + f[5] * w[1],
+                f[2] * x[2] + f[6] * w[0] + f[7] * w[1] + f[8] * w[2],
+            ]
+        )
+        truth = truth._replace(scan=scan, motion=motion)
+        if p.class_change:
+            changed = scan >= truth.change_scan
+            truth = truth._replace(
+                target_class=xp.where(changed, truth.next_class, truth.target_class),
+                emitter_type=xp.where(changed, truth.next_type, truth.emitter_type),
+            )
+        if p.silence_start > 0.0:
+            on = xp.where(truth.radiating, noise[10] >= p.silence_start, noise[10] < p.silence_end)
+            truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
+        return truth, self._measured(truth, noise[3:7], noise[7:10])
+
+    # --- the sensors
+
+    def _looks(self, scan: Array) -> Array:
+        return scan % self.parameters.esm_period == 0
+
+    def _measured(self, truth: Truth, normals: Array, uniforms: Array) -> Measurement:
+        """Measure and listen.
+
+        Args:
+            truth: at this scan.
+            normals: errors of the radar's range and range rate, of its bearing and of the ESM's, ``(4, N)``.
+            uniforms: for the type, the decision and the source, ``(3, N)``.
+        """
+        xp, p = self.xp, self.parameters
+        radar = xp.stack(
+            [truth.motion[0] + p.range_sigma * normals[0], truth.motion[1] + p.range_rate_sigma * normals[1]]
+        )
+        heard_class, heard_type, heard = truth.target_class, truth.emitter_type, truth.radiating
+        esm_bearing = p.esm_bearing_sigma * normals[3]
+        if p.second_emitter_probability > 0.0:
+            other = uniforms[2] < p.second_emitter_probability
+            heard_class = xp.where(other, truth.other_class, heard_class)
+            heard_type = xp.where(other, truth.other_type, heard_type)
+            heard = other | heard
+            esm_bearing = esm_bearing + xp.where(other, truth.separation, 0.0)
+        if p.emitter == "redrawn":
+            heard_type = category(uniforms[0], self._types_of(heard_class), xp)
+        looked = self._looks(truth.scan)
+        heard = heard & looked
+        decision = category(uniforms[1], xp.take(self.decision_thresholds, heard_type, axis=1), xp)
+        difference = class_fusion.bearing_difference(p.radar_bearing_sigma * normals[2], esm_bearing)
+        return Measurement(
+            scan=truth.scan,
+            radar=radar,
+            looked=looked,
+            decision=xp.where(heard, decision, self.task.types),
+            bearing_difference=xp.where(heard, difference, 0.0),
+        )
+
+    # --- how good an estimate is
+
+    def state(self, truth: Truth) -> Array:
+        """Range, range rate and acceleration, ``(3, N)``."""
+        return truth.motion
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Mean of the three squared errors over their scales."""
+        scaled = (mean - truth.motion) * self.cost_factors
+        return ordered_sum(scaled * scaled) * (1.0 / 3.0)
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """True class and type, and the time."""
+        xp = self.xp
+        return {
+            "true_class": xp.astype(truth.target_class, xp.float64),
+            "true_type": xp.astype(truth.emitter_type, xp.float64),
+            "seconds": xp.astype(truth.scan, xp.float64) * self.parameters.sampling_interval,
+        }
+
+
+def _thresholds(rows: object) -> numpy.ndarray:
+    """Cumulative probabilities that a uniform number is compared with, ``(columns - 1, rows)``."""
+    return numpy.cumsum(numpy.array(rows), axis=1)[:, :-1].T
