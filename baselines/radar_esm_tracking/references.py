@@ -22,7 +22,6 @@ class Track(NamedTuple):
 class _KnownClass:
     """Models that the true class chooses scan by scan."""
 
-    kind = "reference"
     knows = "the true class at every scan"
 
     def __init__(self, task: RadarEsmTracking) -> None:
@@ -41,6 +40,8 @@ class _KnownClass:
 class Ideal(_KnownClass):
     """The Kalman filter of the true class; where the class changes it switches its model at that scan."""
 
+    kind = "reference"
+
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Array, Track]:
         """Predict under the class that governed the motion, and update."""
         models, governed = self.task.models, memory.target_class
@@ -53,6 +54,8 @@ class Ideal(_KnownClass):
 
 class KnownClassBound(_KnownClass):
     """Exact mean square error of the ideal filter, by its covariance recursion: no estimator does better."""
+
+    kind = "bound"
 
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
         """Bound after this scan: the diagonal of the covariance."""
