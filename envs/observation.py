@@ -171,6 +171,10 @@ class Blocks:
             first += width
         return slices
 
+    @functools.cached_property
+    def _inverses(self) -> dict[str, Callable[[numpy.ndarray], numpy.ndarray] | None]:
+        return {block.name: block.shown.inverse for block in self.blocks}
+
     def reader(self, name: str) -> Reader:
         """Return what reads a block, uncompressed, or a quantity from observations.
 
@@ -178,10 +182,7 @@ class Blocks:
             ValueError: for a name that is neither.
         """
         if name in self._slices:
-            part, inverse = self._slices[name], {b.name: b.shown.inverse for b in self.blocks}[name]
-            if inverse is None:
-                return lambda observation: observation[:, part]
-            return lambda observation: inverse(observation[:, part])
+            return functools.partial(_read, part=self._slices[name], inverse=self._inverses[name])
         if name in self.quantities:
             value = self.quantities[name].value
             return lambda observation: value(lambda other: self.reader(other)(observation))
@@ -193,3 +194,10 @@ class Blocks:
 
 def _field_names(block: Block) -> list[str]:
     return [f"{block.name}_{part}" for part in block.parts] if block.parts else [block.name]
+
+
+def _read(
+    observation: numpy.ndarray, part: slice, inverse: Callable[[numpy.ndarray], numpy.ndarray] | None
+) -> numpy.ndarray:
+    shown = observation[:, part]
+    return shown if inverse is None else inverse(shown)

@@ -58,7 +58,8 @@ class TaskParameters:
         Raises:
             ValueError: with the name of the field, its value and what was expected.
         """
-        for name, (hint, limits) in declared(type(self)).items():
+        cls: Any = type(self)
+        for name, (hint, limits) in declared(cls).items():
             value = frozen(getattr(self, name))
             object.__setattr__(self, name, value)
             check(name, value, hint, limits)
