@@ -4,13 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := filtergym filters envs evaluation baselines agents tests benchmarks
 
-.PHONY: benchmark test check format docs clean
+.PHONY: benchmark test coverage check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark
 
 test: $(VENV)/.dev  ## run the whole test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+coverage: $(VENV)/.dev  ## the same, and show the lines that no test reaches
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --cov --cov-report=term
 
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)

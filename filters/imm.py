@@ -12,6 +12,7 @@ Reading: (9) is lost in the scan and restored with the spread of the means, as i
 Reading: (10), (12)-(14) are damaged; the sums run over the first index of ``p_ij``.
 """
 
+import math
 from typing import NamedTuple
 
 from .array_namespace import Array, namespace
@@ -84,7 +85,12 @@ def combine(mean: Array, covariance: Array, weights: Array) -> tuple[Array, Arra
 
 def log_probabilities(probabilities: Array) -> Array:
     """Logarithm of probabilities, with a floor of 1e-300 in place of minus infinity."""
-    return namespace(probabilities).log(namespace(probabilities).clip(probabilities, 1e-300, None))
+    xp = namespace(probabilities)
+    if probabilities.dtype == xp.float64:
+        return xp.log(xp.clip(probabilities, 1e-300, None))
+    # In single precision, in which weights may arrive as actions, the floor is zero but its logarithm is not.
+    possible = probabilities > 0.0
+    return xp.where(possible, xp.log(xp.where(possible, probabilities, 1.0)), math.log(1e-300))
 
 
 def normalised_exponential(logarithms: Array) -> Array:

@@ -7,9 +7,14 @@ every control of every environment. A new environment is covered without an edit
 import importlib
 
 import gymnasium as gym
+import hypothesis
 import numpy as np
 import pytest
 from filtergym.envs.catalogue import catalogue, make_task
+
+# The same examples in every run, and no stored ones: a run can be repeated anywhere.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("repeatable")
 
 DECISIONS = 5
 """Length of the short episodes, in decisions."""

@@ -284,13 +284,13 @@ def test_policies_forget_at_the_start_of_an_episode(env_id):
 
 
 def test_stable_baselines3_evaluates_a_baseline(env_id, short):
-    evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
+    pytest.importorskip("stable_baselines3")
+    from stable_baselines3.common.evaluation import evaluate_policy
+
     known = baselines_of(env_id)
     policy_class = known.policies[known.score_paper]
     env = gym.make(env_id, control=policy_class.control, **short)
-    mean, deviation = evaluation.evaluate_policy(
-        policy_class(env.unwrapped.task), env, n_eval_episodes=3, warn=False
-    )
+    mean, deviation = evaluate_policy(policy_class(env.unwrapped.task), env, n_eval_episodes=3, warn=False)
     assert np.isfinite([mean, deviation]).all()
 
 

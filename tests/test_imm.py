@@ -168,6 +168,14 @@ def test_impossible_mode_keeps_its_estimate_and_makes_no_nan():
     np.testing.assert_allclose(posterior, weights, rtol=0, atol=1e-30)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_logarithm_of_no_probability_is_that_of_the_floor(dtype):
+    logarithm = imm.log_probabilities(np.array([0.0, 1e-30, 0.25, 1.0], dtype=dtype))
+    assert logarithm.dtype == dtype
+    rounding = 2 * np.finfo(dtype).eps
+    np.testing.assert_allclose(logarithm, np.log([1e-300, 1e-30, 0.25, 1.0]), rtol=rounding, atol=0)
+
+
 def test_posterior_survives_likelihoods_that_underflow():
     # 500 and 510 sigma: both likelihoods are 0 in linear scale, their ratio is exp(-5050).
     log_likelihood = np.array([[-0.5 * 500.0**2], [-0.5 * 510.0**2]])
