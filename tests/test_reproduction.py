@@ -1,5 +1,6 @@
 """What every reproduction of a paper shares: finding it, writing its page, saving it whole or not at all."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -26,8 +27,7 @@ def example() -> Reproduction:
         "A paper",
         [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
         [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
-        {"figure_1": figure, "figure_2": figure},
-        {"figure_1": "The error."},
+        {"figure_1": (figure, "The error."), "figure_2": (figure, "The same again.")},
     )
 
 
@@ -61,7 +61,7 @@ def test_the_page_holds_claims_tables_and_figures() -> None:
     table = lines[lines.index("## Errors") + 2 :][:4]
     assert table == ["| run | m |", "|---|---|", "| first | 3.0 |", "| second | 3.2 |"]
     assert "![The error.](figure_1.png)" in lines
-    assert "![figure 2](figure_2.png)" in lines
+    assert "![The same again.](figure_2.png)" in lines
 
 
 def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
 
     (tmp_path / "report.md").write_text("the last one", encoding="utf-8")
     result = example()
-    result.figures["figure_2"] = Unpaintable()
+    result = replace(result, figures={**result.figures, "figure_2": (Unpaintable(), "Nothing.")})
     with pytest.raises(RuntimeError, match="no ink"):
         save_reproduction(result, tmp_path, write_text)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]

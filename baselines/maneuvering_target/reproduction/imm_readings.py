@@ -7,15 +7,12 @@ on the measurements of the environment's own episodes, so that all of them face 
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy
 
-from ...envs.catalogue import make_task
-from ...filters import alpha_beta, imm, kalman
-from ...filters.gaussian import log_density
-from ..rollout import started_lanes
-from ..seeds import episode_seeds
+from ....filters import alpha_beta, imm, kalman
+from ....filters.gaussian import log_density
 
 
 class Recording(NamedTuple):
@@ -33,39 +30,6 @@ class Recording(NamedTuple):
     """x, y, vx, vy, ``(K, 4, N)``."""
     interval: float
     """T, s."""
-
-
-def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
-    """Record the measurements of test episodes of ManeuveringTarget.
-
-    Args:
-        episodes: N; the same episodes that ``evaluate`` runs.
-        seed: number of the experiment.
-        scenario: name of a scenario.
-        **keywords: parameters of the task.
-    """
-    task: Any = make_task("filtergym/ManeuveringTarget-v0", "gain", scenario, **keywords)
-    lanes = started_lanes(task, episode_seeds("test", seed, episodes))
-    # The filter has just predicted to the first scan; taking that step back gives the start.
-    predicted = lanes.state.estimator
-    start = numpy.concatenate([predicted.position - task.T * predicted.velocity, predicted.velocity])
-    start_variance = 0.5 * task.T**2 * predicted.covariance.velocity
-    action = lanes.widened(numpy.zeros((episodes, 1)))
-    measurement, variance, truth = [], [], []
-    for _ in range(lanes.decisions_per_episode):
-        state = lanes.state
-        measurement.append(state.measurement[:, :episodes])
-        variance.append(state.variance[:, :episodes])
-        truth.append(numpy.concatenate([state.position, state.velocity])[:, :episodes])
-        lanes.step(lambda state: task.act(state, action))
-    return Recording(
-        start[:, :episodes],
-        start_variance[:, :episodes],
-        numpy.stack(measurement),
-        numpy.stack(variance),
-        numpy.stack(truth),
-        task.T,
-    )
 
 
 Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady"]
