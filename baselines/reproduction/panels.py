@@ -38,7 +38,8 @@ def finish(axis: Any, x: str = "", y: str = "", title: str = "", *, legend: str 
     """Name an axis; ``log`` names the logarithmic ones ("xy"), ``legend`` its place."""
     for name in log:
         getattr(axis, f"set_{name}scale")("log")
-        getattr(axis, f"{name}axis").set_major_formatter("{x:g}")
+        if getattr(axis, f"get_{name}lim")()[0] > 5e-4:  # smaller numbers are shorter as powers of ten
+            getattr(axis, f"{name}axis").set_major_formatter("{x:g}")
     if x:
         axis.set_xlabel(x)
     if y:

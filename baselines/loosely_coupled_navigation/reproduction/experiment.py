@@ -123,7 +123,7 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
     return {field: values[0] for field, values in series.items()}
 
 
-def _model() -> tuple[Any, ...]:
+def _model() -> tuple[Any, Any, Any, Any, Any]:
     """Return A, Q, C, R and the covariance at the start of the augmented model."""
     dynamics, growth, start = ins_gnss.error_model(*LEVELS)
     return dynamics, growth, [[1.0, 0.0, 0.0]], [[PARAMETERS.receiver_intensity]], start
@@ -196,7 +196,9 @@ def riccati_agreement() -> Agreement:
     times = numpy.linspace(0.01, 5.0, 50)
     solvers = (kalman_bucy.riccati_hamiltonian, kalman_bucy.riccati_ode)
     scalar = [solve(A, INTENSITY, 1.0, RECEIVER, 0.0, times)[:, 0, 0] for solve in solvers]
-    pair = [solve(*_model(), times) for solve in solvers]
+    exponential, integrated = (solve(*_model(), times) for solve in solvers)
+    hamiltonian, ode = (float(numpy.abs(solution / closed_form(times) - 1.0).max()) for solution in scalar)
+    matrix = float(numpy.abs(exponential - integrated).max() / numpy.abs(exponential).max())
     offsets = []
     for step in (0.01, 0.005):
         sampled = kalman_bucy.sampled_covariance(A, INTENSITY, 1, RECEIVER, 0, step, 1.0)
@@ -207,12 +209,7 @@ def riccati_agreement() -> Agreement:
         refusal = "no refusal"
     except ValueError as error:
         refusal = str(error)
-    return Agreement(
-        *(float(numpy.abs(solution / closed_form(times) - 1.0).max()) for solution in scalar),
-        float(numpy.abs(pair[0] - pair[1]).max() / numpy.abs(pair[0]).max()),
-        math.log2(offsets[0] / offsets[1]),
-        refusal,
-    )
+    return Agreement(hamiltonian, ode, matrix, math.log2(offsets[0] / offsets[1]), refusal)
 
 
 # --- everything

@@ -72,8 +72,10 @@ def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] 
 def compared(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
     """Compare the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
     windows = (SECTION, WINDOWS["turn"], WINDOWS["recovery"])
-    moved = [changes(ours, theirs, (first + later, last + later)) for first, last in windows]
-    return Comparison(*moved, changes(ours, theirs, None))
+    section, turn, recovery = (
+        changes(ours, theirs, (first + later, last + later)) for first, last in windows
+    )
+    return Comparison(section, turn, recovery, changes(ours, theirs, None))
 
 
 def comparisons(r: Results) -> dict[str, Comparison]:

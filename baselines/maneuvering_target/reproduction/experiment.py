@@ -113,8 +113,8 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
         truth = numpy.concatenate([state.position, state.velocity])
         kept.append([values[:, :episodes] for values in (state.measurement, state.variance, truth)])
         lanes.step(lambda state: task.act(state, action))
-    series = (numpy.stack(values) for values in zip(*kept, strict=True))
-    return Recording(start[:, :episodes], start_variance[:, :episodes], *series, task.T)
+    measurement, variance, truth = (numpy.stack(values) for values in zip(*kept, strict=True))
+    return Recording(start[:, :episodes], start_variance[:, :episodes], measurement, variance, truth, task.T)
 
 
 def variant(recording: Recording, reading: Reading) -> numpy.ndarray:
