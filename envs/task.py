@@ -345,6 +345,7 @@ class Task(ABC):
         self.set_up()
         self.world = self.World(self)
         self.bank = self.banks[control](self)
+        self._outside = OutsideBank(self)
         self.noise = self._noise_layout()
         self._blocks = Blocks(self.bank.blocks, self.bank.quantities, xp)
         self.fields = self._blocks.fields
@@ -395,10 +396,14 @@ class Task(ABC):
         return self._blocks.reader(name)
 
     def estimated_outside(self) -> "Task":
-        """Return this task with an :class:`OutsideBank` in place of its bank."""
+        """Return this task with an :class:`OutsideBank` in place of its bank, and nothing to observe."""
         other = copy.copy(self)
-        other.bank = OutsideBank(self)
+        other.bank = self._outside
+        other._blocks, other.fields = Blocks((), (), self.xp), ()
         return other
+
+    def _estimating(self, episode: Episode) -> Bank:
+        return self._outside if isinstance(episode.bank, Outside) else self.bank
 
     # --- what the engine calls
 
@@ -427,24 +432,27 @@ class Task(ABC):
         return episode._replace(bank=self.bank.act(episode.bank, episode.measurement, action))
 
     def mean(self, episode: Episode) -> Array:
-        """Estimate, ``(len(components), N)``, in the units of ``components``."""
-        return self.bank.mean(episode.bank)
+        """Estimate, ``(len(components), N)``, in the units of ``components``.
+
+        This and what follows also take an episode that somebody else estimates, see :class:`Outside`.
+        """
+        return self._estimating(episode).mean(episode.bank)
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""
-        return self.world.cost(episode.truth, self.bank.mean(episode.bank))
+        return self.world.cost(episode.truth, self._estimating(episode).mean(episode.bank))
 
     def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
-        return self.bank.mean(episode.bank) - self.world.state(episode.truth)
+        return self._estimating(episode).mean(episode.bank) - self.world.state(episode.truth)
 
     def covariance(self, episode: Episode) -> Array:
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
-        return self.bank.covariance(episode.bank)
+        return self._estimating(episode).covariance(episode.bank)
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""
-        own = self.bank.records(episode.bank, episode.measurement)
+        own = self._estimating(episode).records(episode.bank, episode.measurement)
         return {**own, **self.world.records(episode.truth)}
 
 

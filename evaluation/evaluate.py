@@ -48,15 +48,13 @@ def _run_chunk(
     def keep(name: str, values: numpy.ndarray) -> None:
         series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
-    judge = task.estimated_outside() if kind == "reference" else task
-
     def record(state: Any) -> None:
-        error, covariance = judge.error(state), judge.covariance(state)
+        error, covariance = task.error(state), task.covariance(state)
         keep("error", error)
-        keep("cost", judge.cost(state))
-        keep("capped_cost", capped_cost(judge, state))
+        keep("cost", task.cost(state))
+        keep("capped_cost", capped_cost(task, state))
         keep("nees", log_density(error, covariance)[1])
-        for name, values in judge.records(state).items():
+        for name, values in task.records(state).items():
             keep(name, values)
 
     if kind == "policy":

@@ -59,10 +59,7 @@ def run_policy(
 def run_reference(
     task: Task, reference: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
 ) -> None:
-    """Run a reference in place of actions; arguments as in :func:`run_policy`.
-
-    The task that ``record`` is told of is ``task.estimated_outside()``.
-    """
+    """Run a reference in place of actions; arguments as in :func:`run_policy`."""
     task = task.estimated_outside()
     memory: Any = None
 

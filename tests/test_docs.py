@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, parameter_names
+
 from filtergym.reports.environment_page import environment_tables, put_tables
 
 DOCS = Path(__file__).parent.parent / "docs"

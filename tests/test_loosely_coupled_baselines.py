@@ -8,6 +8,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation import reproduction as paper
 from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
+from filtergym.baselines.loosely_coupled_navigation.reproduction import experiment
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.lanes import _replace_lanes
@@ -54,7 +55,7 @@ def steered(name, scenario, seeds, **keywords):
 
 
 def test_reference_table(on_paper):
-    theory = paper.exact_root_mean_squares()
+    theory = experiment.exact_root_mean_squares()
     assert set(theory) == set(KNOWN.policies) - {"augmented-gain", "innovation-adaptive", "random"} | {
         "matched"
     }
@@ -67,7 +68,7 @@ def test_reference_table(on_paper):
 
 
 def test_settled_gain_beats_the_riccati_gain_where_the_model_leaves_out_the_drift():
-    theory = paper.exact_root_mean_squares()
+    theory = experiment.exact_root_mean_squares()
     assert theory["plain-white"] == pytest.approx(0.4988, abs=6e-5)
     assert theory["plain-white"] < theory["time-varying-white"]
     assert theory["best-constant"] < theory["plain-reduced"]
@@ -303,15 +304,16 @@ def test_reproduction_runs_and_judges():
     verdicts = {claim.key: claim.verdict for claim in result.claims}
     assert [verdicts[key] for key in "134"] == ["reproduced", "reproduced in part", "reproduced"]
     assert all(verdicts[key] == "paper is silent" for key in "5678")
-    assert set(result.figures) == set(result.captions) == {"figure_2", "figure_4", "figure_5", "drift"}
+    assert set(result.figures) == {"figure_2", "figure_4", "figure_5", "drift"}
+    assert all(caption for _, caption in result.figures.values())
 
 
 def test_example_a_against_its_theory():
-    example = paper.first_order(3000)
+    example = experiment.first_order(3000)
     for name, expected in example.theory.items():
         values = example.squares[name]
         assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(len(values)), name
-    agreement = paper.riccati_agreement()
+    agreement = experiment.riccati_agreement()
     assert agreement.hamiltonian < 1e-12
     assert agreement.ode < 1e-8
     assert agreement.matrix < 1e-9

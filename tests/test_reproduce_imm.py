@@ -7,20 +7,21 @@ from typing import Any
 import numpy
 import pytest
 from filtergym.baselines.maneuvering_target import reproduction as paper
-from filtergym.baselines.maneuvering_target.gain_schedules import (
+from filtergym.baselines.maneuvering_target.reproduction import claims, experiment, figures
+from filtergym.baselines.maneuvering_target.reproduction.experiment import recorded
+from filtergym.baselines.maneuvering_target.reproduction.gain_schedules import (
     best_schedule,
     maneuver_flight,
     mean_square_errors,
     ramp_schedule,
 )
-from filtergym.baselines.maneuvering_target.imm_readings import (
+from filtergym.baselines.maneuvering_target.reproduction.imm_readings import (
     Reading,
     Recording,
     interacting_multiple_model,
-    recorded,
 )
+from filtergym.baselines.reproduction.measured import Measured
 from filtergym.envs.catalogue import make_task
-from filtergym.evaluation.bootstrap import Bootstrap, Estimate
 
 from filtergym import evaluate
 
@@ -35,7 +36,7 @@ def recording() -> Recording:
 @pytest.fixture(scope="module")
 def results() -> SimpleNamespace:
     done: list[float] = []
-    return SimpleNamespace(of=paper.run_everything(done.append, 40), done=done)
+    return SimpleNamespace(of=experiment.run_everything(done.append, 40), done=done)
 
 
 def naive_prediction_variance(alpha: float) -> float:
@@ -96,7 +97,7 @@ def naive_imm(recording: Recording, episode: int, reading: Reading, axes: list[i
 
 
 @pytest.mark.parametrize("per_axis", [False, True])
-@pytest.mark.parametrize("likelihood", paper.LIKELIHOODS)
+@pytest.mark.parametrize("likelihood", experiment.LIKELIHOODS)
 def test_every_reading_equals_a_naive_filter(recording: Recording, likelihood: Any, per_axis: bool) -> None:
     reading = Reading((0.25, 0.8), 0.93, likelihood, per_axis)
     error = interacting_multiple_model(recording, reading)
@@ -166,8 +167,8 @@ def test_no_nearby_schedule_is_better_than_the_best() -> None:
     assert numpy.sqrt(least / 100) == pytest.approx(45.6, abs=0.05)
 
 
-def estimate(value: float, half: float = 0.01) -> Estimate:
-    return Estimate(value, value - half, value + half)
+def estimate(value: float, half: float = 0.01) -> Measured:
+    return Measured(value, value - half, value + half)
 
 
 @pytest.mark.parametrize(
@@ -182,22 +183,20 @@ def estimate(value: float, half: float = 0.01) -> Estimate:
     ],
 )
 def test_verdict_on_the_improvement(section: Any, parts: Any, verdict: str) -> None:
-    assert paper.improvement_verdict([estimate(v) for v in section], [estimate(v) for v in parts]) == verdict
+    assert claims.improvement_verdict([estimate(v) for v in section], [estimate(v) for v in parts]) == verdict
 
 
 def bowl(low: float, high: float, width: float) -> numpy.ndarray:
     """Errors ``(101, 6, 8)`` with a smooth minimum at two gains and a little noise in the samples."""
-    a, b = numpy.meshgrid(paper.LOW_GAINS, paper.HIGH_GAINS, indexing="ij")
+    a, b = numpy.meshgrid(experiment.LOW_GAINS, experiment.HIGH_GAINS, indexing="ij")
     errors = 60.0 * (1.0 + ((a - low) / width) ** 2 + ((b - high) / width) ** 2)
     noise = numpy.random.default_rng(0).standard_normal((101, 1, 1))
     return errors * (1.0 + 0.01 * noise)
 
 
 def test_verdict_on_the_box_follows_the_minimum() -> None:
-    bootstrap = Bootstrap(10, 100)
-
-    def finding(low: float, high: float, width: float) -> paper.GridFinding:
-        return paper.grid_finding(bowl(low, high, width), bootstrap)
+    def finding(low: float, high: float, width: float) -> claims.GridFinding:
+        return claims.grid_finding(bowl(low, high, width))
 
     inside, flat, outside = finding(0.35, 0.8, 0.3), finding(0.3, 0.8, 0.5), finding(0.2, 0.6, 0.3)
     assert inside.gains == (0.35, 0.8)
@@ -205,16 +204,16 @@ def test_verdict_on_the_box_follows_the_minimum() -> None:
     assert inside.inside_excess.value == 0.0
     # Nearest cell of the box to (0.2, 0.6) is (0.3, 0.7): both axes off by a third of the width.
     assert outside.inside_excess.value == pytest.approx(2 / 9)
-    assert paper.box_verdict([inside, inside]) == "reproduced"
+    assert claims.box_verdict([inside, inside]) == "reproduced"
     # The neighbour at 0.25 is only 1 % worse than the minimum at 0.3.
     assert flat.near > flat.near_inside
-    assert paper.box_verdict([inside, flat]) == "reproduced in part"
-    assert paper.box_verdict([inside, outside]) == "reproduced in part"
-    assert paper.box_verdict([outside, outside]) == "not reproduced"
+    assert claims.box_verdict([inside, flat]) == "reproduced in part"
+    assert claims.box_verdict([inside, outside]) == "reproduced in part"
+    assert claims.box_verdict([outside, outside]) == "not reproduced"
 
 
 def test_the_box_is_the_papers() -> None:
-    inside = paper.inside_box()
+    inside = claims.inside_box()
     assert inside.shape == (6, 8)
     assert inside[2:, 2:].all()
     assert inside.sum() == 24
@@ -229,27 +228,25 @@ def test_the_box_is_the_papers() -> None:
     ],
 )
 def test_verdict_on_the_modes(straight: Any, turn: float, verdict: str) -> None:
-    assert paper.dominance_verdict([estimate(v) for v in straight], estimate(turn)) == verdict
+    assert claims.dominance_verdict([estimate(v) for v in straight], estimate(turn)) == verdict
 
 
 def test_comparison_of_known_errors() -> None:
-    bootstrap = Bootstrap(8, 50)
     error = numpy.ones((8, 100, 4))
-    ours, theirs = paper.curves_of(0.8 * error, bootstrap), paper.curves_of(error, bootstrap)
-    better = paper.compared(ours, theirs, bootstrap)
+    ours, theirs = experiment.mean_squares(0.8 * error), experiment.mean_squares(error)
+    better = claims.compared(ours, theirs)
     assert better.section[0].value == pytest.approx(-0.2)
     assert better.peak[1].value == pytest.approx(-0.2)
     assert better.verdict == "reproduced"
-    assert paper.compared(theirs, ours, bootstrap).verdict == "not reproduced"
+    assert claims.compared(theirs, ours).verdict == "not reproduced"
 
 
 def test_a_window_moves_with_the_turn() -> None:
-    bootstrap = Bootstrap(4, 20)
     error = numpy.ones((4, 100, 4))
     error[:, 49] = 10.0  # the scan that only the earlier window holds
-    ours, theirs = paper.curves_of(error, bootstrap), paper.curves_of(numpy.ones_like(error), bootstrap)
-    assert paper.compared(ours, theirs, bootstrap).turn[0].value > 1.0
-    assert paper.compared(ours, theirs, bootstrap, later=1).turn[0].value == pytest.approx(0.0)
+    ours, theirs = experiment.mean_squares(error), experiment.mean_squares(numpy.ones_like(error))
+    assert claims.compared(ours, theirs).turn[0].value > 1.0
+    assert claims.compared(ours, theirs, later=1).turn[0].value == pytest.approx(0.0)
 
 
 def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
@@ -257,19 +254,19 @@ def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
 
 
 def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
-    claims = paper.claims(results.of)
-    keys = [claim.key for claim in claims]
+    stated = claims.claims(results.of)
+    keys = [claim.key for claim in stated]
     assert keys[:2] == ["C1", "C1 re-arming"]
     assert {"C2", "C3", "Straight legs", "Detection"} <= set(keys)
     assert len(set(keys)) == len(keys)
-    assert all(claim.measured and claim.method for claim in claims)
-    for table in paper.tables(results.of):
+    assert all(claim.measured and claim.method for claim in stated)
+    for table in claims.tables(results.of):
         assert all(len(row) == len(table.header) for row in table.rows)
         assert not any("nan" in cell for row in table.rows for cell in row)
 
 
 def test_verdicts_of_forty_episodes(results: SimpleNamespace) -> None:
-    verdicts = {claim.key: claim.verdict for claim in paper.claims(results.of)}
+    verdicts = {claim.key: claim.verdict for claim in claims.claims(results.of)}
     # With 40 episodes the size of the improvement is not certain, its direction and C3 are.
     assert verdicts["C1"] != "not reproduced"
     assert verdicts["C1 re-arming"] == "not reproduced"
@@ -280,33 +277,30 @@ def test_verdicts_follow_the_data(results: SimpleNamespace) -> None:
     main = results.of.main
     imm, adaptive = main["imm"], main["adaptive"]
     exchanged = main | {
-        "imm": imm._replace(curves=adaptive.curves, probability=1.0 - imm.probability),
-        "adaptive": adaptive._replace(curves=imm.curves),
+        "imm": imm._replace(squares=adaptive.squares, probability=1.0 - imm.probability),
+        "adaptive": adaptive._replace(squares=imm.squares),
     }
     # Two rows down, the smallest errors leave the box.
-    grids = {kind: grid[2:] + grid[:2] for kind, grid in results.of.grids.items()}
-    claims = paper.claims(results.of._replace(main=exchanged, grids=grids))
-    verdicts = {claim.key: claim.verdict for claim in claims}
+    grids = {kind: numpy.roll(grid, -2, axis=0) for kind, grid in results.of.grids.items()}
+    exchanged_results = results.of._replace(main=exchanged, grids=grids)
+    verdicts = {claim.key: claim.verdict for claim in claims.claims(exchanged_results)}
     assert verdicts["C1"] == "not reproduced"
     assert verdicts["C2"] == "not reproduced"
     assert verdicts["C3"] == "not reproduced"
 
 
 def test_figures_can_be_drawn_with_axes_named(results: SimpleNamespace) -> None:
-    for draw in (
-        paper.draw_trajectory,
-        paper.draw_gain,
-        paper.draw_errors,
-        paper.draw_probabilities,
-        paper.draw_gain_grid,
-    ):
-        axes = draw(results.of).axes
+    drawn = figures.figures(results.of)
+    assert len(drawn) == 5
+    for figure, caption in drawn.values():
+        assert caption
+        axes = figure.axes
         assert all(axis.get_ylabel() for axis in axes)
         assert any(axis.get_xlabel() for axis in axes)
 
 
 def test_readings_differ(recording: Recording) -> None:
-    readings = [Reading(likelihood=kind) for kind in paper.LIKELIHOODS]
+    readings = [Reading(likelihood=kind) for kind in experiment.LIKELIHOODS]
     readings += [replace(readings[0], per_axis=True), replace(readings[0], stay=0.8)]
     errors = [interacting_multiple_model(recording, reading) for reading in readings]
     for i, first in enumerate(errors):

@@ -1,7 +1,9 @@
 """What every reproduction of a paper shares: finding it, writing its page, saving it whole or not at all."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy
 import pytest
 from filtergym.baselines.reproduction import (
     Claim,
@@ -12,7 +14,9 @@ from filtergym.baselines.reproduction import (
     paper_module,
     papers,
     save_reproduction,
+    verdict_of,
 )
+from filtergym.baselines.reproduction.measured import Measured, mean, means, measured
 from filtergym.evaluation.figures import save
 from matplotlib.figure import Figure
 
@@ -24,8 +28,7 @@ def example() -> Reproduction:
         "A paper",
         [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
         [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
-        {"figure_1": figure, "figure_2": figure},
-        {"figure_1": "The error."},
+        {"figure_1": (figure, "The error."), "figure_2": (figure, "The same again.")},
     )
 
 
@@ -59,7 +62,7 @@ def test_the_page_holds_claims_tables_and_figures() -> None:
     table = lines[lines.index("## Errors") + 2 :][:4]
     assert table == ["| run | m |", "|---|---|", "| first | 3.0 |", "| second | 3.2 |"]
     assert "![The error.](figure_1.png)" in lines
-    assert "![figure 2](figure_2.png)" in lines
+    assert "![The same again.](figure_2.png)" in lines
 
 
 def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path) -> None:
@@ -76,7 +79,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
 
     (tmp_path / "report.md").write_text("the last one", encoding="utf-8")
     result = example()
-    result.figures["figure_2"] = Unpaintable()
+    result = replace(result, figures={**result.figures, "figure_2": (Unpaintable(), "Nothing.")})
     with pytest.raises(RuntimeError, match="no ink"):
         save_reproduction(result, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
@@ -94,3 +97,32 @@ def test_a_figure_that_fails_halfway_leaves_the_one_before(tmp_path: Path) -> No
         save(HalfPainted(), tmp_path / "figure.png")
     assert [p.name for p in tmp_path.iterdir()] == ["figure.png"]
     assert (tmp_path / "figure.png").read_bytes() == b"the last one"
+
+
+def test_a_measured_number_is_written_with_its_standard_error() -> None:
+    number = Measured(0.07512, 0.069, 0.081, 0.0031)
+    assert f"{number}" == "0.0751 ± 0.0031"
+    assert f"{number:.3f}" == "0.075 ± 0.003"
+    assert f"{number:+.1%}" == "+7.5 ± 0.3 %"
+    # Without error digits to go by, an exact number is written alone, and a certain one with four.
+    assert f"{Measured(45.9, 45.9, 45.9):.2f}" == "45.90"
+    assert f"{Measured(1.0, 1.0, 1.0, 0.0)}" == "1.0000 ± 0.0000"
+
+
+def test_uncertainty_comes_from_the_runs_and_is_paired() -> None:
+    values = 5.0 + numpy.random.default_rng(0).standard_normal(400)
+    found = mean(values)
+    assert found.value == pytest.approx(values.mean(), rel=1e-12)
+    # 500 bootstrap samples give a standard error to 3 %; four of those.
+    assert found.error == pytest.approx(values.std() / 20.0, rel=0.13)
+    assert found.low == pytest.approx(found.value - 1.96 * found.error, abs=0.3 * found.error)
+    assert found.high == pytest.approx(found.value + 1.96 * found.error, abs=0.3 * found.error)
+    ratio = measured(means(3.0 * values) / means(values))
+    assert (ratio.value, ratio.error) == pytest.approx((3.0, 0.0), abs=1e-14)
+    assert numpy.isnan(measured(numpy.array([2.0])).error)
+
+
+def test_a_claim_of_several_parts() -> None:
+    assert verdict_of([True, True]) == "reproduced"
+    assert verdict_of([True, False]) == "reproduced in part"
+    assert verdict_of(iter([False, False])) == "not reproduced"

@@ -4,14 +4,17 @@ import math
 
 import numpy
 import pytest
+from filtergym.baselines import evaluate, tidy_records
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.reproduction import save_reproduction
+from filtergym.baselines.reproduction.measured import Measured
 from filtergym.baselines.tightly_coupled_navigation import policies as policies
 from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
+from filtergym.baselines.tightly_coupled_navigation.reproduction import claims, experiment
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER
-from filtergym.evaluation.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import run_bound, run_policy
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
@@ -264,18 +267,18 @@ def test_loss_of_track_is_found_and_timed():
 
 
 def test_filters_side_by_side_are_the_filters_alone():
-    runs = paper.simulate("paper", {"adaptive": 4, "Singer": 3}, horizon=40, leg_steps=(10, 25))
-    known = paper.simulate("paper", {"known mode": 3}, horizon=40, leg_steps=(10, 25))["known mode"]
+    runs = experiment.simulate("paper", {"adaptive": 4, "Singer": 3}, horizon=40, leg_steps=(10, 25))
+    known = experiment.simulate("paper", {"known mode": 3}, horizon=40, leg_steps=(10, 25))["known mode"]
     dataset = evaluate(
         ID, ["multi-hypothesis", "singer", "known-mode"], "paper", episodes=4, horizon=40, leg_steps=(10, 25)
     )
     pairs = ((runs["adaptive"], "multi-hypothesis"), (runs["Singer"], "singer"), (known, "known-mode"))
     for run, name in pairs:
         error = dataset["error"].sel(policy=name).values[: len(run.nis)]
-        for c, part in enumerate(paper.PARTS):
+        for c, part in enumerate(experiment.PARTS):
             expected = (error[:, :, part] ** 2).sum(axis=2)
             # The weights pass through the observation's logarithms; the bank amplifies their rounding.
-            numpy.testing.assert_allclose(run.squares[c], expected, rtol=1e-5, atol=1e-9)
+            numpy.testing.assert_allclose(run.squares[:, :, c], expected, rtol=1e-5, atol=1e-9)
         nis = dataset["nis"].sel(policy=name).values / dataset["nis_degrees"].sel(policy=name).values
         numpy.testing.assert_allclose(run.nis, nis[: len(run.nis)], rtol=1e-5)
 
@@ -283,8 +286,10 @@ def test_filters_side_by_side_are_the_filters_alone():
 def test_slower_adaptation_without_rates():
     keywords = {"horizon": 300, "leg_steps": (200, 1000)}
     quick, slow = (
-        paper.waits_of(paper.simulate("paper", {"adaptive": 16}, **keywords, **more)["adaptive"], REST, LINE)
-        for more in ({}, {"rate_sigma": paper.NOTHING})
+        experiment.waits_of(
+            experiment.simulate("paper", {"adaptive": 16}, **keywords, **more)["adaptive"], REST, LINE
+        )
+        for more in ({}, {"rate_sigma": experiment.NOTHING})
     )
     assert 0.01 <= quick.mean <= 0.03
     assert slow.never == 0
@@ -301,8 +306,8 @@ def fake_run(episodes, steps, motion, lost):
     outside = numpy.zeros((episodes, steps), dtype=bool)
     if lost:
         outside[:, motion + 60 :] = True
-    return paper.Run(
-        rng.random((6, episodes, steps)) + 0.1, rng.random((episodes, steps)), probability, mode, outside,
+    return experiment.Run(
+        rng.random((episodes, steps, 6)) + 0.1, rng.random((episodes, steps)), probability, mode, outside,
         rng.random((episodes, steps)),
     )  # fmt: skip
 
@@ -316,8 +321,7 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
             for name, count in filters.items()
         }
 
-    monkeypatch.setattr(paper, "simulate", simulate)
-    monkeypatch.setattr(paper, "RESAMPLES", 20)
+    monkeypatch.setattr(experiment, "simulate", simulate)
     done = []
     result = paper.reproduce(done.append, 5)
     assert sum(done) == paper.STEPS
@@ -331,26 +335,26 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
 
 
 def near(value):
-    return Estimate(value, value - 0.01, value + 0.01)
+    return Measured(value, value - 0.01, value + 0.01)
 
 
 def test_verdicts_follow_the_data():
-    assert paper.matched_verdict([near(1.03)], [near(1.0)]) == "reproduced"
-    assert paper.matched_verdict([near(1.03)], [near(1.6)]) == "reproduced in part"
-    assert paper.matched_verdict([near(1.2)], [near(1.0)]) == "not reproduced"
-    exact = Estimate(1.0, 1.0, 1.0)
-    assert paper.weight_verdict([0.0, 0.06, 0.3], [exact, near(1.03), near(1.3)]) == "reproduced"
-    assert paper.weight_verdict([0.0, 0.3, 0.06], [exact, near(1.03), near(1.3)]) == "reproduced in part"
-    assert paper.weight_verdict([0.0, 0.06], [near(1.05), near(1.06)]) == "reproduced in part"
-    assert paper.weight_verdict([0.0, 0.06], [exact, near(1.0)]) == "not reproduced"
-    lost, late, kept = (paper.Loss(1.0, t, t, t) for t in (0.7, 1.4, 0.7))
+    assert claims.matched_verdict([near(1.03)], [near(1.0)]) == "reproduced"
+    assert claims.matched_verdict([near(1.03)], [near(1.6)]) == "reproduced in part"
+    assert claims.matched_verdict([near(1.2)], [near(1.0)]) == "not reproduced"
+    exact = Measured(1.0, 1.0, 1.0)
+    assert claims.weight_verdict([0.0, 0.06, 0.3], [exact, near(1.03), near(1.3)]) == "reproduced"
+    assert claims.weight_verdict([0.0, 0.3, 0.06], [exact, near(1.03), near(1.3)]) == "reproduced in part"
+    assert claims.weight_verdict([0.0, 0.06], [near(1.05), near(1.06)]) == "reproduced in part"
+    assert claims.weight_verdict([0.0, 0.06], [exact, near(1.0)]) == "not reproduced"
+    lost, late, kept = (experiment.Loss(1.0, t, t, t) for t in (0.7, 1.4, 0.7))
     kept = kept._replace(rate=0.0)
-    assert paper.loss_verdict(lost, lost) == "reproduced"
-    assert paper.loss_verdict(lost, kept) == "reproduced in part"
-    assert paper.loss_verdict(late, kept) == "not reproduced"
-    quick, middle, slow = (paper.Wait(t, 0.01, t, 0, numpy.array([t])) for t in (0.02, 0.4, 0.49))
-    assert paper.adaptation_verdict([quick, middle], slow) == "reproduced"
-    assert paper.adaptation_verdict([quick], slow) == "reproduced in part"
-    assert paper.adaptation_verdict([quick], quick) == "not reproduced"
-    assert paper.stability_verdict([kept]) == "reproduced"
-    assert paper.stability_verdict([kept, lost]) == "not reproduced"
+    assert claims.loss_verdict(lost, lost) == "reproduced"
+    assert claims.loss_verdict(lost, kept) == "reproduced in part"
+    assert claims.loss_verdict(late, kept) == "not reproduced"
+    quick, middle, slow = (experiment.Wait(t, 0.01, t, 0) for t in (0.02, 0.4, 0.49))
+    assert claims.adaptation_verdict([quick, middle], slow) == "reproduced"
+    assert claims.adaptation_verdict([quick], slow) == "reproduced in part"
+    assert claims.adaptation_verdict([quick], quick) == "not reproduced"
+    assert claims.stability_verdict([kept]) == "reproduced"
+    assert claims.stability_verdict([kept, lost]) == "not reproduced"

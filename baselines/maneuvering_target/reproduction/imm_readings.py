@@ -7,16 +7,12 @@ on the measurements of the environment's own episodes, so that all of them face 
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy
 
-from ...envs.catalogue import make_task
-from ...envs.task import Episode, Initial
-from ...evaluation.rollout import started_lanes
-from ...evaluation.seeds import episode_seeds
-from ...filters import alpha_beta, imm, kalman
-from ...filters.gaussian import log_density
+from ....filters import alpha_beta, imm, kalman
+from ....filters.gaussian import log_density
 
 
 class Recording(NamedTuple):
@@ -34,42 +30,6 @@ class Recording(NamedTuple):
     """x, y, vx, vy, ``(K, 4, N)``."""
     interval: float
     """T, s."""
-
-
-def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
-    """Record the measurements of test episodes of ManeuveringTarget.
-
-    Args:
-        episodes: N; the same episodes that ``evaluate`` runs.
-        seed: number of the experiment.
-        scenario: name of a scenario.
-        **keywords: parameters of the task.
-    """
-    task: Any = make_task("filtergym/ManeuveringTarget-v0", "gain", scenario, **keywords)
-    starts: list[Initial] = []
-    lanes = started_lanes(
-        task, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
-    )
-    action = lanes.widened(numpy.zeros((episodes, 1)))
-    measurement, variance, truth = [], [], []
-
-    def act(episode: Episode) -> Episode:
-        measurement.append(episode.measurement.position[:, :episodes])
-        variance.append(episode.measurement.variance[:, :episodes])
-        truth.append(task.world.state(episode.truth)[:, :episodes])
-        return task.act(episode, action)
-
-    for _ in range(lanes.decisions_per_episode):
-        lanes.step(act)
-    (initial,) = starts
-    return Recording(
-        initial.mean[:, :episodes],
-        numpy.stack([initial.covariance[i, i, :episodes] for i in range(2)]),
-        numpy.stack(measurement),
-        numpy.stack(variance),
-        numpy.stack(truth),
-        task.parameters.sampling_interval,
-    )
 
 
 Likelihood = Literal["gains used", "no spread", "Kalman", "R/(1-alpha)", "steady"]

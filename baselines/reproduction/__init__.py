@@ -1,24 +1,39 @@
 """What a reproduction of a paper consists of, and how it is found and saved.
 
-Every environment's folder beside this file names its ``PAPER`` and holds a module ``reproduction``, which
-defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
-``reproduce(progress, episodes=None) -> Reproduction``.
+Every environment's folder beside this one names its ``PAPER`` and holds a package ``reproduction``:
+``experiment`` (what is run and computed), ``claims`` (statements, verdicts, tables), ``figures``. It defines
+``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
+``reproduce(progress, episodes=None) -> Reproduction``, which runs the experiment (``episodes`` Monte Carlo
+runs instead of its own number) and judges the claims.
+
+There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. Pictures: :mod:`.panels`.
 """
 
 import importlib
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from ..envs.catalogue import nearest
-from ..evaluation.figures import save
-from ..evaluation.files import write_text
-from .catalogue import packages
+from ...envs.catalogue import nearest
+from ...evaluation.figures import save
+from ...evaluation.files import write_text
+from ..catalogue import packages
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
+Progress = Callable[[float], None]
+"""Told of units of work done."""
+UNCERTAINTY = (
+    '± is one standard error, by bootstrap over the runs; "certainly" means by a 95 % bootstrap interval.'
+)
+
+
+def verdict_of(holds: Iterable[bool]) -> Verdict:
+    """Verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
+    parts = list(holds)
+    return "reproduced" if all(parts) else "reproduced in part" if any(parts) else "not reproduced"
 
 
 @dataclass(frozen=True)
@@ -32,7 +47,7 @@ class Claim:
     """The figures, with their uncertainty."""
     method: str
     """Runs, windows, statistic."""
-    verdict: Verdict
+    verdict: Verdict = "paper is silent"
 
 
 @dataclass(frozen=True)
@@ -51,15 +66,13 @@ class Reproduction:
     title: str
     claims: Sequence[Claim]
     tables: Sequence[Grid] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
-    """File name without suffix -> Matplotlib figure."""
-    captions: dict[str, str] = field(default_factory=dict)
-    """One sentence for each figure."""
+    figures: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    """File name without suffix -> Matplotlib figure and its caption, one sentence."""
 
 
 def papers() -> dict[str, str]:
     """Return the package of every paper that can be reproduced, by its name on the command line."""
-    return {package.PAPER: package.__name__ for package in packages()}
+    return {package.PAPER: package.__name__ for package in packages() if hasattr(package, "PAPER")}
 
 
 def paper_module(name: str) -> ModuleType:
@@ -74,29 +87,28 @@ def paper_module(name: str) -> ModuleType:
     return importlib.import_module(f"{known[name]}.reproduction")
 
 
-def episode_count(episodes: int | None, default: int) -> int:
+def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
     """Return the number of Monte Carlo runs of a reproduction.
 
     Raises:
-        ValueError: for fewer than two, which have no interval.
+        ValueError: for fewer than ``least``; a single run has no interval.
     """
     count = default if episodes is None else episodes
-    if count < 2:
-        raise ValueError(f"episodes must be at least 2 for intervals over them, got {count}")
+    if count < least:
+        raise ValueError(f"episodes must be at least {least} for intervals over them, got {count}")
     return count
 
 
 def as_markdown(result: Reproduction) -> str:
     """Claims, tables and figures as one page."""
-    lines = [f"# {result.title}", "", "## Claims", ""]
+    lines = [f"# {result.title}", "", UNCERTAINTY, "", "## Claims", ""]
     lines += markdown_table(
         ("claim", "what was measured", "how", "verdict"),
         [(f"**{c.key}.** {c.statement}", c.measured, c.method, f"**{c.verdict}**") for c in result.claims],
     )
     for table in result.tables:
         lines += ["", f"## {table.title}", "", *markdown_table(table.header, table.rows)]
-    for name in result.figures:
-        caption = result.captions.get(name, name.replace("_", " "))
+    for name, (_, caption) in result.figures.items():
         lines += ["", f"![{caption}]({name}.png)", "", caption]
     return "\n".join(lines) + "\n"
 
@@ -113,7 +125,7 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list
 def save_reproduction(result: Reproduction, folder: Path) -> None:
     """Write ``report.md`` and the figures into an existing folder, all of them or none."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as waiting:
-        for name, figure in result.figures.items():
+        for name, (figure, _) in result.figures.items():
             save(figure, Path(waiting) / f"{name}.png")
         write_text(Path(waiting) / "report.md", as_markdown(result))
         for path in Path(waiting).iterdir():

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy
 
-from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
-from ...filters import alpha_beta, polar
+from ....envs.maneuvering_target.parameters import ManeuveringTargetParameters
+from ....filters import alpha_beta, polar
 
 
 class Flight(NamedTuple):
