@@ -1,4 +1,4 @@
-"""Policies, the reference estimator and the bound of LooselyCoupledNavigation.
+"""Policies of LooselyCoupledNavigation, and the table of all it is compared with.
 
 Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
@@ -11,17 +11,21 @@ import numpy
 import xarray
 
 from ...envs.catalogue import task_class
-from ...envs.controls import signed_exponential
-from ...envs.loosely_coupled_navigation.task import (
-    LooselyCoupledNavigation,
-    LooselyCoupledNavigationState,
-    within,
-)
-from ...envs.task import Array
+from ...envs.loosely_coupled_navigation.banks import GainBank
+from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.task import Task
 from ...filters import loosely_coupled as ins_gnss
 from ..bootstrap import Bootstrap
 from ..metrics import Measure, mean_of_present
 from ..policy import Baselines, ConstantPolicy, Policy, RandomPolicy, Tunable
+from .references import Matched, MatchedCovariance
+
+
+def gain_bank(task: Task) -> GainBank:
+    """Bank of a task under control ``gain``."""
+    assert isinstance(task.bank, GainBank)
+    return task.bank
+
 
 # --- the plain scheme with a constant gain
 
@@ -33,7 +37,7 @@ class FixedGain(ConstantPolicy):
 
     def __init__(self, task: LooselyCoupledNavigation, gain: float) -> None:
         super().__init__(task)
-        self.action = (task.action_of_gain(gain),) * task.parameters.axes
+        self.action = (float(gain_bank(task).action_for_gain(gain)),) * task.parameters.axes
 
 
 class InsOnly(FixedGain):
@@ -54,7 +58,7 @@ class PlainWhite(FixedGain):
     """Settled gain for the white part of the INS noise only, ``Ge = G``."""
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task, task.settled_gains[0])
+        super().__init__(task, task.parameters.settled_gains[0])
 
 
 class PlainReduced(ConstantPolicy):
@@ -75,7 +79,8 @@ class BestConstant(FixedGain):
             p = task.parameters
             levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
             K = ins_gnss.best_constant_gain(*levels)
-            gain = float(ins_gnss.settled_gain(K * K * p.receiver_intensity * p.step, p.receiver_variance))
+            growth = K * K * p.receiver_intensity * p.sampling_interval
+            gain = float(ins_gnss.settled_gain(growth, p.receiver_variance))
         super().__init__(task, gain)
 
 
@@ -106,11 +111,10 @@ class TimeVarying(Policy):
         super().__init__(task)
         p = task.parameters
         self.loose = task
-        self.growth = (p.equivalent_intensities[1] if intensity is None else intensity) * p.step
-        self.available = task.columns(["available"])[0]
-        self.reported = task.columns(["reported_noise"])[0]
-        suffixes = ("",) if p.axes == 1 else tuple(f"_{c.name[-1]}" for c in task.components)
-        self.innovation = task.columns([f"innovation_over_reported{s}" for s in suffixes])
+        self.growth = (p.equivalent_intensities[1] if intensity is None else intensity) * p.sampling_interval
+        self.available = task.reader("available")
+        self.reported_variance = task.reader("reported_variance")
+        self.innovation = task.reader("innovation_in_metres")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Set the gain ``P / (P + R)``."""
@@ -124,12 +128,11 @@ class TimeVarying(Policy):
             numpy.where(fresh, 0.0, state.squares),
             numpy.where(start, 0.0, state.weight),
         )
-        reported = self.loose.parameters.receiver_variance * numpy.exp(2.0 * observation[:, self.reported])
-        available = observation[:, self.available] > 0.5
+        available = self.available(observation) > 0.5
         P = memory.P + self.growth
-        memory, R = self.noise(memory, P, reported[:, None], available, observation)
-        gain = numpy.where(available[:, None], P / (P + R), 0.0)
-        return self.loose.actions_of_gains(gain), memory._replace(P=(1.0 - gain) * P)
+        memory, R = self.noise(memory, P, self.reported_variance(observation), available, observation)
+        gain = numpy.where(available, P / (P + R), 0.0)
+        return gain_bank(self.task).action_for_gain(gain), memory._replace(P=(1.0 - gain) * P)
 
     def noise(
         self,
@@ -161,7 +164,7 @@ class InnovationAdaptive(TimeVarying):
         self, task: LooselyCoupledNavigation, intensity: float | None = None, window: float = 0.25
     ) -> None:
         super().__init__(task, intensity)
-        self.rate = -math.expm1(-task.parameters.step / window)
+        self.rate = -math.expm1(-task.parameters.sampling_interval / window)
 
     def noise(
         self,
@@ -174,8 +177,8 @@ class InnovationAdaptive(TimeVarying):
         """Average the squared innovations; R is at least a tenth of what that average leaves of it."""
         first = (memory.weight == 0)[:, None]
         before = numpy.where(first, P + reported, memory.squares)
-        innovation = signed_exponential(observation[:, self.innovation], numpy) * numpy.sqrt(reported)
-        squares = before + numpy.where(available[:, None], self.rate, 0.0) * (innovation**2 - before)
+        innovation = self.innovation(observation)
+        squares = before + numpy.where(available, self.rate, 0.0) * (innovation**2 - before)
         R = numpy.maximum(squares - P, 0.1 * squares)
         return memory._replace(squares=squares, weight=memory.weight + 1.0), R
 
@@ -204,8 +207,8 @@ class AugmentedGain(TimeVarying):
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
-        task, p = self.loose, self.loose.parameters
-        s = task.sampling
+        p = self.loose.parameters
+        s = p.sampling
         none = numpy.zeros((p.axes, len(observation)))
         zero = none[0]
         first = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
@@ -216,12 +219,12 @@ class AugmentedGain(TimeVarying):
             )
             offset, drift, coloured = (numpy.where(start, 0.0, row) for row in state[:3])
             memory = _Offset(offset, drift, coloured, covariance)
-        R = p.receiver_variance * numpy.exp(2.0 * observation[:, self.reported])
-        available = numpy.where(observation[:, self.available] > 0.5, 1.0, 0.0)
-        innovation = signed_exponential(observation[:, self.innovation].T, numpy) * numpy.sqrt(R)
+        R = self.reported_variance(observation)[:, 0]
+        available = numpy.where(self.available(observation)[:, 0] > 0.5, 1.0, 0.0)
+        innovation = self.innovation(observation).T
 
         offset = memory.offset - (s.step * memory.drift + s.drive * memory.coloured)
-        P = ins_gnss.predict_augmented(memory.covariance, s, *task.modelled_growth)
+        P = ins_gnss.predict_augmented(memory.covariance, s, *p.modelled_growth)
         K, P = ins_gnss.update_augmented(P, R, available)
         own = available * (innovation - offset)
         wanted = offset + K.position * own
@@ -235,7 +238,7 @@ class AugmentedGain(TimeVarying):
             s.decay * memory.coloured - K.coloured * own,
             P,
         )
-        return task.actions_of_gains(gain.T), after
+        return gain_bank(self.task).action_for_gain(gain.T), after
 
 
 # --- the bank
@@ -249,103 +252,6 @@ class Augmented(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Name the third filter of the bank."""
         return numpy.full(len(observation), 2), None
-
-
-# --- reference and bound
-
-
-class ErrorState(NamedTuple):
-    """Memory of the filter that is told the true noise levels."""
-
-    error: tuple[Array, Array, Array]
-    """Estimates of delta (m), beta and eta (m/s), ``(axes, N)`` each."""
-    covariance: ins_gnss.AugmentedCovariance
-    """``(N,)`` each, the same for every axis."""
-
-
-class Step(NamedTuple):
-    """One measurement of that filter."""
-
-    memory: ErrorState
-    gain: Array
-    """Of the position, ``(N,)``."""
-    normalised: Array
-    """Innovation over its standard deviation, ``(axes, N)``."""
-
-
-class Matched:
-    """The augmented filter told the true noise levels, sample by sample, and which samples are spoofed.
-
-    The noise of every episode is Gaussian once its levels are known, so this is the filter of least mean
-    square error. Spoofed measurements it leaves out, like those of an outage.
-    """
-
-    knows = (
-        "the true intensities of all noises, every change of the receiver's, and which samples are spoofed"
-    )
-
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        self.task = task
-
-    def start(self, state: LooselyCoupledNavigationState) -> ErrorState:
-        """Start where INS and reference agree, with the true prior of the rate errors."""
-        zero = 0.0 * state.clock
-        coloured = state.coloured_step / self.task.sampling.coloured
-        P = ins_gnss.AugmentedCovariance(
-            zero, zero, zero, state.drift_deviation**2 + zero, zero, coloured * coloured
-        )
-        still = 0.0 * state.reference
-        return ErrorState((still, still, still), P)
-
-    def step(self, state: LooselyCoupledNavigationState, memory: ErrorState) -> Step:
-        """Predict with the true noise levels and update with the true variance of the measurement."""
-        xp, s = self.task.xp, self.task.sampling
-        delta, beta, eta = memory.error
-        delta, eta = delta + s.step * beta + s.drive * eta, s.decay * eta
-        P = ins_gnss.predict_augmented(memory.covariance, s, state.coloured_step**2, state.white_step**2)
-        used = xp.where(within(state.clock, state.spoofing), 0.0, state.available)
-        R = state.deviation**2
-        innovation = used * ((state.ins - state.measurement) - delta)
-        normalised = innovation / xp.sqrt(P.position + R)
-        # No innovation where no measurement is used, so no NIS either.
-        normalised = xp.where(used > 0.0, normalised, math.nan)
-        gain, P = ins_gnss.update_augmented(P, R, used)
-        error = (
-            delta + gain.position * innovation,
-            beta + gain.drift * innovation,
-            eta + gain.coloured * innovation,
-        )
-        return Step(ErrorState(error, P), gain.position, normalised)
-
-    def update(
-        self, state: LooselyCoupledNavigationState, memory: ErrorState
-    ) -> tuple[LooselyCoupledNavigationState, ErrorState]:
-        """Report the INS less its estimated error."""
-        result = self.step(state, memory)
-        estimate = state.ins - result.memory.error[0]
-        variance = result.memory.covariance.position
-        return (
-            state._replace(
-                position=estimate[None],
-                variance=(variance + 0.0 * estimate)[None],
-                normalised=result.normalised[None],
-                estimate=estimate,
-                estimate_covariance=self.task.diagonal(variance + 0.0 * estimate),
-                gain=result.gain + 0.0 * estimate,
-            ),
-            result.memory,
-        )
-
-
-class MatchedCovariance(Matched):
-    """The variance of ``matched``: least mean square error of an estimator with the data it uses."""
-
-    def update(  # a bound gives mean squares in place of a state
-        self, state: LooselyCoupledNavigationState, memory: ErrorState
-    ) -> tuple[Array, ErrorState]:
-        """Variance of every axis, ``(axes, N)``."""
-        memory = self.step(state, memory).memory
-        return memory.covariance.position + 0.0 * state.reference, memory
 
 
 # --- metrics of one's own
@@ -397,7 +303,7 @@ def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **run.attrs["keywords"]})
     size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
     limit = RECOVERED * math.sqrt(parameters.receiver_variance * parameters.axes)
-    held, longest = (max(round(t / parameters.step), 1) for t in (HELD, LONGEST))
+    held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))
     times = recovery_times(size, run["available"].values, limit, held, longest)
     if numpy.isnan(times).all():
         return []
@@ -407,7 +313,7 @@ def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
             "recovery_time",
             "position",
             "all",
-            mean_of_present(times[:, None] * parameters.step, bootstrap),
+            mean_of_present(times[:, None] * parameters.sampling_interval, bootstrap),
             "s",
         ),
         Measure("not_recovered", "position", "all", mean_of_present(lost[:, None], bootstrap), "1"),

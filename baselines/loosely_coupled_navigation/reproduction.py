@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.catalogue import make_task
-from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation, LooselyCoupledNavigationState
+from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.task import Episode
 from ...filters import kalman_bucy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.linear_systems import steady_kalman_bucy, van_loan
@@ -162,8 +163,9 @@ def example_run(name: str) -> Run:
     task: Any = make_task(ENV, maker.control, "paper", fixed_drift=DRIFT)
     rows: list[list[float]] = []
 
-    def record(state: LooselyCoupledNavigationState) -> None:
-        rows.append([float(x[0, 0]) for x in (state.reference, state.ins, state.measurement, state.estimate)])
+    def record(state: Episode) -> None:
+        said = state.measurement
+        rows.append([float(x[0, 0]) for x in (state.truth.reference, said.ins, said.fix, task.mean(state))])
 
     run_policy(task, maker(task), episode_seeds("test", SEED, 1), record, lambda _: None)
     return Run(*numpy.array(rows).T)
@@ -172,12 +174,13 @@ def example_run(name: str) -> Run:
 def exact_plain(intensity: float, riccati: bool) -> float:
     """Exact root mean square error from 2.5 to 5 s of the plain scheme, m."""
     p = LooselyCoupledNavigation.Parameters()
+    T = p.sampling_interval
     dynamics, growth, start = ins_gnss.error_model(p.drift, p.coloured, p.correlation_time, p.white_intensity)
-    Phi, Qd = van_loan(dynamics, growth, p.step)
-    R, settled = p.receiver_variance, ins_gnss.settled_gain(intensity * p.step, p.receiver_variance)
+    Phi, Qd = van_loan(dynamics, growth, T)
+    R, settled = p.receiver_variance, ins_gnss.settled_gain(intensity * T, p.receiver_variance)
     variance, P, squares = 0.0, start, []
     for _ in range(p.horizon):
-        variance += intensity * p.step
+        variance += intensity * T
         gain = variance / (variance + R) if riccati else settled
         variance *= 1.0 - gain
         rest = numpy.eye(3) - gain * numpy.diag([1.0, 0.0, 0.0])
@@ -189,9 +192,10 @@ def exact_plain(intensity: float, riccati: bool) -> float:
 def exact_root_mean_squares() -> dict[str, float]:
     """Exact root mean square error from 2.5 to 5 s, m, of every policy in ``TABLE`` that has a theory."""
     p = LooselyCoupledNavigation.Parameters()
+    T = p.sampling_interval
     levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity)
     dynamics, growth, start = ins_gnss.error_model(*levels)
-    model = (dynamics, growth, [[1.0, 0.0, 0.0]], [[p.receiver_intensity]], start, p.step, p.horizon * p.step)
+    model = (dynamics, growth, [[1.0, 0.0, 0.0]], [[p.receiver_intensity]], start, T, p.horizon * T)
     late = slice(LATE[0] - 1, LATE[1])
 
     def root(gain: list[float] | None) -> float:
@@ -505,7 +509,7 @@ def reproduce(progress: Callable[..., None], episodes: int | None = None) -> Rep
         ("numerical integration / closed form, example (a)", f"{agreement.ode:.1e}"),
         ("exponential / numerical integration, augmented model", f"{agreement.matrix:.1e}"),
     ]
-    time = p.step * numpy.arange(1, p.horizon + 1)
+    time = p.sampling_interval * numpy.arange(1, p.horizon + 1)
     return Reproduction(
         TITLE,
         claims,
@@ -526,7 +530,7 @@ def reproduce(progress: Callable[..., None], episodes: int | None = None) -> Rep
             "figure_2": figure_2(example),
             "figure_4": figure_4(paths["plain-reduced"], time),
             "figure_5": figure_5(paths, time),
-            "drift": figure_drift(means, gains, p.step * numpy.arange(1, LONG + 1)),
+            "drift": figure_drift(means, gains, p.sampling_interval * numpy.arange(1, LONG + 1)),
         },
         {
             "figure_2": "Fig. 2: one run of example (a), and exact standard deviations; the estimate is near the "
