@@ -97,6 +97,17 @@ def test_matched_is_consistent_with_its_bound(scenario):
         assert loss.mean() > -3 * loss.std() / runs
 
 
+@pytest.mark.parametrize(
+    "name", ["plain-reduced", "plain-white", "time-varying-white", "ins-only", "gnss-only"]
+)
+def test_the_covariance_is_that_of_the_gain_in_use_where_the_noises_are_as_modelled(on_paper, name):
+    """The plain scheme's own Riccati equation, which knows of no drift, would give 9 for ``time-varying-white``."""
+    nees = on_paper["nees"].sel(policy=name).values
+    for window in (slice(0, 100), slice(249, 500)):
+        mean = nees[:, window].mean(axis=1)
+        assert abs(mean.mean() - 1.0) < 4 * mean.std() / math.sqrt(len(mean)), window
+
+
 @pytest.mark.parametrize("scenario", ["random", "quiet", "jamming", "outage", "spoof-ramp"])
 def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
     task = make_task(ID, "gain", scenario)

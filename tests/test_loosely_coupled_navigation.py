@@ -228,7 +228,8 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
     lanes, steps = 5, 200
     task = make("random", outage_probability=1.0)
     actions = random_actions(task, lanes, steps, 1)
-    x = v = 0.0
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
+    x, v, P = 0.0, 0.0, np.tile(START, (lanes, 1, 1))
     for k, (seen, state) in enumerate(
         states(task, numbers(task, lanes, steps, 1), lambda k, seen: actions[k])
     ):
@@ -239,7 +240,13 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
         v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
         np.testing.assert_allclose(task.mean(state)[0], x, atol=1e-12)
-        np.testing.assert_allclose(task.covariance(state)[0, 0], v, rtol=1e-12)
+        rest = np.tile(np.eye(3), (lanes, 1, 1))
+        rest[:, 0, 0] = 1 - gain
+        P = rest @ (Phi @ P @ Phi.T + Qd) @ rest
+        P[:, 0, 0] += gain**2 * said.reported_deviation**2
+        # What the innovations are scaled by, and what is reported: rounding over 200 steps.
+        np.testing.assert_allclose(state.bank.variance.assumed[0], v, rtol=1e-12)
+        np.testing.assert_allclose(task.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
     drawn = numbers(task, lanes, steps, 2)
     for _, state in states(task, drawn, constant(task, -1.0, lanes)):
         np.testing.assert_array_equal(task.mean(state), state.measurement.ins)
@@ -268,7 +275,9 @@ def test_averages_are_those_of_the_definition():
     for seen, _ in states(task, numbers(task, 1, 400, 4), constant(task, 0.4, 1)):
         said, bank = seen.measurement, seen.bank
         if said.available[0]:
-            n = bank.seen.innovation[0, 0] / math.sqrt(bank.variance[0, 0] + said.reported_deviation[0] ** 2)
+            n = bank.seen.innovation[0, 0] / math.sqrt(
+                bank.variance.assumed[0, 0] + said.reported_deviation[0] ** 2
+            )
             mean += weight * (n - mean)
             square += weight * (n * n - square)
             product += weight * (n * last - product)

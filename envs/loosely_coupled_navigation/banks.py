@@ -45,8 +45,9 @@ class Steered(NamedTuple):
 
     position: Array
     """Xh, predicted to the measurement or updated by it, m, ``(A, N)``."""
-    variance: Array
-    """Of its error, by the plain scheme with the coloured noise reduced to white, m^2, ``(A, N)``."""
+    variance: ins_gnss.PlainVariance
+    """Of its error with the gains used, m^2, ``(A, N)`` each. ``assumed``, with the coloured noise reduced to white
+    and no drift, is the scale of the innovations that are shown; ``modelled`` is reported."""
     seen: Innovations
     action: Array
     """Last action, ``(A, N)``."""
@@ -206,7 +207,8 @@ class GainBank(_KalmanBucyBank):
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
-        self.growth = self.parameters.plain_growth[1]
+        p = self.parameters
+        self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -220,13 +222,14 @@ class GainBank(_KalmanBucyBank):
     def start(self, initial: Initial) -> Steered:
         """Start where INS and reference agree."""
         zero = 0.0 * initial.mean
-        return Steered(initial.mean, zero, self.none_seen(zero), zero, zero)
+        variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
+        return Steered(initial.mean, variance, self.none_seen(zero), zero, zero)
 
     def predict(self, state: Steered, measurement: Measurement) -> Steered:
         """Predict by the increment of the INS."""
         position = state.position + measurement.increment
-        variance = state.variance + self.growth
-        seen = self.compared(state.seen, measurement, position, variance)
+        variance = ins_gnss.predict_plain(state.variance, *self.error_model)
+        seen = self.compared(state.seen, measurement, position, variance.assumed)
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
@@ -254,7 +257,7 @@ class GainBank(_KalmanBucyBank):
         R = measurement.reported_deviation * measurement.reported_deviation
         return state._replace(
             position=state.position + gain * state.seen.innovation,
-            variance=ins_gnss.update_variance(state.variance, R, gain),
+            variance=ins_gnss.update_plain(state.variance, R, gain),
             action=action,
             gain=gain,
         )
@@ -264,8 +267,11 @@ class GainBank(_KalmanBucyBank):
         return state.position
 
     def covariance(self, state: Steered) -> Array:
-        """Reported covariance, ``(A, A, N)``, m^2; blind to a constant drift."""
-        return self.eye * state.variance
+        """Covariance that belongs to the gains used, ``(A, A, N)``, m^2.
+
+        It holds for the modelled noises, and for gains that do not depend on the innovations.
+        """
+        return self.eye * state.variance.modelled
 
     def records(self, state: Steered, measurement: Measurement) -> dict[str, Array]:
         """NIS (NaN without a measurement), gain and K."""
