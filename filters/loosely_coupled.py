@@ -98,6 +98,60 @@ def update_variance(P: Array, R: Array, gain: Array) -> Array:
     return rest * rest * P + gain * gain * R
 
 
+class PlainVariance(NamedTuple):
+    """Variance of the plain scheme's error under any gain, by two error models; four arrays of one shape, m^2."""
+
+    assumed: Array
+    """By the scheme's own model: white noise of an equivalent intensity, and nothing else."""
+    modelled: Array
+    """With every rate error of :func:`error_model`."""
+    with_drift: Array
+    """Covariance of the error with the displacement ``step beta``."""
+    with_coloured: Array
+    """And with the displacement ``drive eta``."""
+
+
+def predict_plain(
+    P: PlainVariance, s: Sampling, growth: float, drift: float, coloured: float, white_intensity: float
+) -> PlainVariance:
+    """Variances after one step without a measurement.
+
+    The rate errors keep their variances, because the plain scheme learns nothing of them.
+
+    Args:
+        P: after the previous measurement.
+        s: sampling of the INS error.
+        growth: variance that the error gains in a step by the scheme's own model, ``Ge step``, m^2.
+        drift: standard deviation of the constant rate error, m/s.
+        coloured: stationary standard deviation of the coloured rate error, m/s.
+        white_intensity: G, m^2/s.
+    """
+    by_drift, by_coloured = (s.step * drift) ** 2, (s.drive * coloured) ** 2
+    coupled = s.coupling * (s.coloured * coloured) ** 2
+    apart = white_intensity * s.step + s.residual * coloured**2 + s.coupling * coupled
+    return PlainVariance(
+        P.assumed + growth,
+        P.modelled + 2.0 * (P.with_drift + P.with_coloured) + (by_drift + by_coloured + apart),
+        P.with_drift + by_drift,
+        s.decay * P.with_coloured + (s.decay * by_coloured + s.drive * coupled),
+    )
+
+
+def update_plain(P: PlainVariance, R: Array, gain: Array) -> PlainVariance:
+    """Variances after an update with any gain that does not depend on the innovations (Joseph form).
+
+    Args:
+        P: of the prediction.
+        R: variance of the measurement, m^2.
+        gain: zero where there is no measurement.
+    """
+    rest = 1.0 - gain
+    kept, noise = rest * rest, gain * gain * R
+    return PlainVariance(
+        kept * P.assumed + noise, kept * P.modelled + noise, rest * P.with_drift, rest * P.with_coloured
+    )
+
+
 def best_constant_gain(
     drift: float, coloured: float, correlation_time: float, white_intensity: float, receiver_intensity: float
 ) -> float:

@@ -5,7 +5,10 @@ from collections import deque
 
 import numpy as np
 import pytest
-from filtergym.envs.loosely_coupled_navigation.task import TASK, LooselyCoupledNavigationParameters
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.draws import Draws
+from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
+from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
 
 PAPER = LooselyCoupledNavigationParameters()
@@ -37,6 +40,18 @@ def states(task, drawn, policy):
         seen = task.measure(state, row)
         state = task.act(seen, policy(k, seen))
         yield seen, state
+
+
+def arrays(values):
+    """The arrays of nested tuples."""
+    return [x for part in values for x in arrays(part)] if isinstance(values, tuple) else [values]
+
+
+def chosen(condition, one, other):
+    """``numpy.where`` for nested tuples."""
+    if isinstance(one, tuple):
+        return type(one)(*(chosen(condition, a, b) for a, b in zip(one, other, strict=True)))
+    return np.where(condition, one, other)
 
 
 def constant(task, action, lanes):
@@ -91,7 +106,7 @@ def test_reference_table(control, action, printed, theory):
     runs = 4000
     task = make("paper", control)
     if control == "gain":
-        action = task.action_of_gain(action)
+        action = float(task.bank.action_for_gain(action))
     squares, nees, nis = np.zeros(runs), np.zeros(runs), np.zeros(runs)
     for k, (_, state) in enumerate(states(task, numbers(task, runs, 500, 3), constant(task, action, runs))):
         if k >= 249:
@@ -110,13 +125,14 @@ def test_reference_table(control, action, printed, theory):
 
 def augmented_nees(state):
     """Normalised squared error of (delta, beta, eta) over its dimension."""
-    a, b, c, d, e = state.rest
-    P = np.array([[state.variance[2, 0], a, b], [a, c, d], [b, d, e]]).transpose(2, 0, 1)
+    truth, bank = state.truth, state.bank
+    a, b, c, d, e, f = bank.covariance
+    P = np.array([[a, b, c], [b, d, e], [c, e, f]]).transpose(2, 0, 1)
     error = np.stack(
         [
-            state.reference[0] - state.position[2, 0],
-            state.rate[0, 0] - state.drift[0],
-            state.rate[1, 0] - state.coloured[0],
+            truth.reference[0] - bank.position[2, 0],
+            bank.drift[0] - truth.drift[0],
+            bank.coloured[0] - truth.coloured[0],
         ],
         axis=-1,
     )
@@ -178,30 +194,34 @@ def test_the_bank_equals_naive_filters(seed):
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     for lane in range(lanes):
         for axis in range(2):
-            x = np.full(2, run[0][0].ins[axis, lane] - run[0][0].increment[axis, lane])
+            first = run[0][0].measurement
+            x = np.full(2, first.ins[axis, lane] - first.increment[axis, lane])
             v, error, P = np.zeros(2), np.zeros(3), START
             for k, (seen, state) in enumerate(run):
-                R = seen.reported[lane] ** 2
-                x, v = x + seen.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
+                said, bank = seen.measurement, state.bank
+                R = said.reported_deviation[lane] ** 2
+                x, v = x + said.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
                 error, P = Phi @ error, Phi @ P @ Phi.T + Qd
-                if seen.available[lane]:
-                    g, z = v / (v + R), seen.measurement[axis, lane]
+                if said.available[lane]:
+                    g, z = v / (v + R), said.fix[axis, lane]
                     x, v = x + g * (z - x), v * (1 - g)
                     K = P[:, 0] / (P[0, 0] + R)
-                    error = error + K * (seen.ins[axis, lane] - z - error[0])
+                    error = error + K * (said.ins[axis, lane] - z - error[0])
                     P = P - np.outer(K, P[0])
-                expected = [*x, seen.ins[axis, lane] - error[0]]
+                expected = [*x, said.ins[axis, lane] - error[0]]
                 weights = np.clip(actions[k, :, lane], 0, 1)
                 weights = weights / weights.sum()
                 # Rounding over 300 steps of different but equal formulas.
-                np.testing.assert_allclose(state.position[:, axis, lane], expected, atol=1e-11)
-                np.testing.assert_allclose(state.rate[:, axis, lane], error[1:], atol=1e-11)
+                np.testing.assert_allclose(bank.position[:, axis, lane], expected, atol=1e-11)
+                rates = [bank.drift[axis, lane], bank.coloured[axis, lane]]
+                np.testing.assert_allclose(rates, error[1:], atol=1e-11)
                 variances = np.array([*v, P[0, 0]])
-                np.testing.assert_allclose(state.variance[:, 0, lane], variances, rtol=1e-10)
+                found = [*bank.plain_variance[:, 0, lane], bank.covariance.position[lane]]
+                np.testing.assert_allclose(found, variances, rtol=1e-10)
                 mean = weights @ expected
-                np.testing.assert_allclose(state.estimate[axis, lane], mean, atol=1e-11)
+                np.testing.assert_allclose(task.mean(state)[axis, lane], mean, atol=1e-11)
                 np.testing.assert_allclose(
-                    state.estimate_covariance[axis, axis, lane],
+                    task.covariance(state)[axis, axis, lane],
                     weights @ (variances + (expected - mean) ** 2),
                     rtol=1e-8,
                 )
@@ -211,36 +231,43 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
     lanes, steps = 5, 200
     task = make("random", outage_probability=1.0)
     actions = random_actions(task, lanes, steps, 1)
-    x = v = 0.0
+    Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
+    x, v, P = 0.0, 0.0, np.tile(START, (lanes, 1, 1))
     for k, (seen, state) in enumerate(
         states(task, numbers(task, lanes, steps, 1), lambda k, seen: actions[k])
     ):
         a = np.clip(actions[k, 0], -1, 1)
-        gain = seen.available * np.where(a == -1, 0.0, 10.0 ** (-2.5 * (1 - a)))
-        before = x + seen.increment[0]
-        x = np.where(seen.available > 0, (1 - gain) * before + gain * seen.measurement[0], before)
-        v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * seen.reported**2
-        np.testing.assert_allclose(state.estimate[0], x, atol=1e-12)
-        np.testing.assert_allclose(state.estimate_covariance[0, 0], v, rtol=1e-12)
+        said = seen.measurement
+        gain = said.available * np.where(a == -1, 0.0, 10.0 ** (-2.5 * (1 - a)))
+        before = x + said.increment[0]
+        x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
+        v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
+        np.testing.assert_allclose(task.mean(state)[0], x, atol=1e-12)
+        rest = np.tile(np.eye(3), (lanes, 1, 1))
+        rest[:, 0, 0] = 1 - gain
+        P = rest @ (Phi @ P @ Phi.T + Qd) @ rest
+        P[:, 0, 0] += gain**2 * said.reported_deviation**2
+        # What the innovations are scaled by, and what is reported: rounding over 200 steps.
+        np.testing.assert_allclose(state.bank.variance.assumed[0], v, rtol=1e-12)
+        np.testing.assert_allclose(task.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
     drawn = numbers(task, lanes, steps, 2)
     for _, state in states(task, drawn, constant(task, -1.0, lanes)):
-        np.testing.assert_array_equal(state.estimate, state.ins)
+        np.testing.assert_array_equal(task.mean(state), state.measurement.ins)
     for _, state in states(make("paper"), drawn, constant(task, 1.0, lanes)):
-        np.testing.assert_array_equal(state.gain, 1.0)
-        np.testing.assert_allclose(state.estimate, state.measurement, atol=1e-15)
+        np.testing.assert_array_equal(state.bank.gain, 1.0)
+        np.testing.assert_allclose(task.mean(state), state.measurement.fix, atol=1e-15)
 
 
 def test_actions_and_gains_are_inverse():
     task = make("paper")
+    bank = task.bank
     for gain in (0.0, 2e-5, 0.0032, 0.0415, 0.5, 1.0):
-        assert float(task.gain_of_action(np.array(task.action_of_gain(gain)))) == pytest.approx(
-            gain, rel=1e-12
-        )
-    assert task.gain_of_action(np.array(1.0)) == 1.0
+        assert float(bank.gain(bank.action_for_gain(gain))) == pytest.approx(gain, rel=1e-12)
+    assert bank.gain(np.array(1.0)) == 1.0
     # The least action above -1 sets about the smallest gain.
-    assert task.gain_of_action(np.array(-1 + 1e-12)) == pytest.approx(1e-5)
+    assert bank.gain(np.array(-1 + 1e-12)) == pytest.approx(1e-5)
     with pytest.raises(ValueError, match=r"gain must lie in \[0, 1\]"):
-        task.action_of_gain(1.5)
+        bank.action_for_gain(1.5)
     assert task.paper_policy.action == pytest.approx(TASK.paper_policy.action, abs=5e-4)
 
 
@@ -249,15 +276,18 @@ def test_averages_are_those_of_the_definition():
     weight = 1 - math.exp(-0.01 / 0.25)
     mean, square, product, last = 0.0, 1.0, 0.0, 0.0
     for seen, _ in states(task, numbers(task, 1, 400, 4), constant(task, 0.4, 1)):
-        if seen.available[0]:
-            n = seen.innovation[0, 0, 0] / math.sqrt(seen.variance[0, 0, 0] + seen.reported[0] ** 2)
+        said, bank = seen.measurement, seen.bank
+        if said.available[0]:
+            n = bank.seen.innovation[0, 0] / math.sqrt(
+                bank.variance.assumed[0, 0] + said.reported_deviation[0] ** 2
+            )
             mean += weight * (n - mean)
             square += weight * (n * n - square)
             product += weight * (n * last - product)
             last = n
         shown = task.observe(seen)[:, 0]
         np.testing.assert_allclose(shown[2:5], [mean, math.log1p(square), product], rtol=1e-10, atol=1e-13)
-        assert shown[0] == (last if seen.available[0] else 0.0)
+        assert shown[0] == (last if said.available[0] else 0.0)
 
 
 # --- Scenarios ---------------------------------------------------------------------------------------------
@@ -272,20 +302,19 @@ def test_disturbances_stand_in_their_windows():
         rows = [0.0 * row for row in rows]
         for k, (seen, _) in enumerate(states(task, (uniforms, normals, rows), constant(task, 0.0, lanes)), 1):
             inside = first <= k <= last
-            assert (seen.available == (0.0 if name == "outage" and inside else 1.0)).all()
+            said = seen.measurement
+            assert (said.available == (0.0 if name == "outage" and inside else 1.0)).all()
             jammed = 10.0 if name == "jamming" and inside else 1.0
-            np.testing.assert_allclose(seen.deviation, math.sqrt(2) * jammed, rtol=1e-14)
-            np.testing.assert_allclose(seen.reported, math.sqrt(2), rtol=1e-14)
+            np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
+            np.testing.assert_allclose(said.reported_deviation, math.sqrt(2), rtol=1e-14)
             pull = 0.02 * (k - first + 1) if name == "spoof-ramp" and inside else 0.0
             truth = 2 * math.sin(0.008 * k) + pull
-            np.testing.assert_allclose(
-                seen.measurement, 0.0 if inside and name == "outage" else truth, atol=1e-12
-            )
+            np.testing.assert_allclose(said.fix, 0.0 if inside and name == "outage" else truth, atol=1e-12)
 
 
 def test_random_draws_a_decade_and_reports_half_of_the_changes():
     task, lanes = make("random"), 20000
-    state = task.begin(*numbers(task, lanes, 0, 8)[:2])
+    state = task.begin(*numbers(task, lanes, 0, 8)[:2]).truth
     low, high = 10**-0.5, 10**0.5
     intensities = state.receiver_levels**2 / 2.0
     for drawn in (state.drift_deviation / 0.6, *intensities):
@@ -302,8 +331,8 @@ def test_random_draws_a_decade_and_reports_half_of_the_changes():
 
 def test_ins_noise_has_the_drawn_intensities():
     task = make("random")
-    state = task.begin(*numbers(task, 6, 0, 9)[:2])
-    s = task.sampling
+    state = task.begin(*numbers(task, 6, 0, 9)[:2]).truth
+    s = task.parameters.sampling
     for i in range(6):
         variance = (state.coloured_step[i] / s.coloured) ** 2
         q33 = state.coloured_step[i] ** 2
@@ -326,7 +355,8 @@ def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
     # One lane for each source: beta, eta, the two noises; the step is linear in them.
     normals = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0]])
     noise = np.array([[0.0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
-    after = task.sense(task.begin(np.full((20, 5), 0.5), normals), noise)
+    truth, _ = task.world.begin(Draws(np.full((20, 5), 0.5), np), normals)
+    after, _ = task.world.advance(truth, noise, None)
     error = np.stack([(after.ins - after.reference)[0], after.drift[0], after.coloured[0]])
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     # The last lane has no source and stays free of error.
@@ -346,14 +376,14 @@ def test_shapes_and_sizes(control, axes, scenario):
     task = make(scenario, control, axes=axes)
     actions = random_actions(task, lanes, steps, 0)
     uniforms, normals, rows = numbers(task, lanes, steps, 0)
-    shapes = [x.shape for x in task.begin(uniforms, normals)]
+    shapes = [x.shape for x in arrays(task.begin(uniforms, normals).bank)]
     for seen, state in states(task, (uniforms, normals, rows), lambda k, seen: actions[k]):
         observation = task.observe(seen)
         assert observation.shape == (len(task.fields), lanes)
         assert np.isfinite(observation).all()
         assert np.abs(observation).max() < 50
-        assert [x.shape for x in state] == shapes
-        assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in state)
+        assert [x.shape for x in arrays(state.bank)] == shapes
+        assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in arrays(state))
         assert task.error(state).shape == (axes, lanes) == (len(task.components), lanes)
         assert task.covariance(state).shape == (axes, axes, lanes)
         np.testing.assert_allclose(task.cost(state), (task.error(state) ** 2).sum(0) / 2.0, rtol=1e-12)
@@ -374,43 +404,26 @@ def test_the_truth_follows_the_noise_and_not_the_control(control):
         states(task, drawn, lambda k, s: actions[k]),
         strict=True,
     ):
-        for name in ("reference", "ins", "measurement", "available", "reported", "deviation"):
-            np.testing.assert_array_equal(getattr(seen, name), getattr(other, name))
+        for found, expected in zip(arrays(other[:2]), arrays(seen[:2]), strict=True):
+            np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("control", TASK.controls)
 def test_no_truth_at_any_distance(control):
-    """The same instrument readings with another truth give the same observations and estimates."""
+    """The same measurements of another truth give the same observations and estimates."""
     lanes, steps = 4, 150
     task = make("random", control, axes=2, outage_probability=1.0, spoofing_probability=0.5)
     drawn, actions = numbers(task, lanes, steps, 3), random_actions(task, lanes, steps, 3)
-    truth = [
-        "reference",
-        "drift",
-        "coloured",
-        "drift_deviation",
-        "coloured_step",
-        "white_step",
-        "receiver_levels",
-        "reported_levels",
-        "change",
-        "outage",
-        "jamming",
-        "spoofing",
-        "deviation",
-    ]
-    instruments = ["clock", "ins", "increment", "measurement", "available", "reported"]
     rng = np.random.default_rng(4)
-    other = task.begin(*drawn[:2])
-    assert set(truth + instruments) <= set(other._fields)
+    bank = task.bank.start(task.begin(*drawn[:2]).measurement)
     for k, (seen, state) in enumerate(states(task, drawn, lambda k, s: actions[k])):
-        false = {name: rng.normal(size=getattr(seen, name).shape) for name in truth}
-        read = {name: getattr(seen, name) for name in instruments}
-        other = task.predict(other._replace(**false, **read))
-        np.testing.assert_array_equal(task.observe(other), task.observe(seen))
-        other = task.act(other, actions[k])
-        np.testing.assert_array_equal(other.estimate, state.estimate)
-        np.testing.assert_array_equal(other.estimate_covariance, state.estimate_covariance)
+        bank = task.bank.predict(bank, seen.measurement)
+        false = type(seen.truth)(*(rng.normal(size=x.shape) for x in seen.truth))
+        np.testing.assert_array_equal(task.observe(seen._replace(truth=false, bank=bank)), task.observe(seen))
+        bank = task.bank.act(bank, seen.measurement, actions[k])
+        other = state._replace(truth=false, bank=bank)
+        np.testing.assert_array_equal(task.mean(other), task.mean(state))
+        np.testing.assert_array_equal(task.covariance(other), task.covariance(state))
         assert (task.error(other) != task.error(state)).any()
 
 
@@ -440,14 +453,15 @@ def test_lanes_at_different_times_do_not_disturb_each_other(control):
     for k in range(120):
         if k == late:
             fresh = task.begin(*drawn[:2])
-            state = type(state)(
-                *(np.where(restarted, new, old) for new, old in zip(fresh, state, strict=True))
+            state = state._replace(
+                truth=chosen(restarted, fresh.truth, state.truth),
+                bank=chosen(restarted, fresh.bank, state.bank),
             )
         row = np.where(restarted & (k >= late), drawn[2][k - late], drawn[2][k])
         state = task.act(
             task.measure(state, row), np.where(restarted & (k >= late), actions[k - late], actions[k])
         )
-    for found, old, new in zip(state, alone[119], alone[119 - late], strict=True):
+    for found, old, new in zip(*map(arrays, (state, alone[119], alone[119 - late])), strict=True):
         np.testing.assert_array_equal(found, np.where(restarted, new, old))
 
 
@@ -462,10 +476,10 @@ def test_torch_equals_numpy(torch, control):
     run = states(task, drawn, lambda k, s: actions[k])
     other = states(twin, copies, lambda k, s: torch.from_numpy(actions[k]))
     for (seen, state), (seen_too, state_too) in zip(run, other, strict=True):
-        assert all(x.dtype == torch.float64 for x in state_too)
+        assert all(x.dtype == torch.float64 for x in arrays(state_too))
         # The two libraries round exp, log and sin differently in the last place.
         np.testing.assert_allclose(twin.observe(seen_too).numpy(), task.observe(seen), rtol=1e-10, atol=1e-12)
-        for a, b in zip(state, state_too, strict=True):
+        for a, b in zip(arrays(state), arrays(state_too), strict=True):
             np.testing.assert_allclose(b.numpy(), a, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(twin.cost(state_too).numpy(), task.cost(state), rtol=1e-9, atol=1e-12)
         for name, record in task.records(state).items():
@@ -498,9 +512,12 @@ def test_the_cost_is_differentiable_in_the_actions(torch, control):
     [
         ({"white_intensity": -0.1}, "white_intensity must be a finite number at least 0"),
         ({"receiver_intensity": 0.0}, "receiver_intensity must be a finite number above 0"),
-        ({"step": 2.0, "duration": 1.0}, r"step must be at most the duration of 1\.0 s, got 2\.0"),
-        ({"step": -0.01}, "step must be a finite number above 0"),
-        ({"axes": 4}, "axes must be 1, 2 or 3"),
+        (
+            {"sampling_interval": 2.0, "duration": 1.0},
+            r"at most the duration of 1\.0 s, got 2\.0",
+        ),
+        ({"sampling_interval": -0.01}, "sampling_interval must be a finite number above 0"),
+        ({"axes": 4}, "axes must be an integer of at least 1 and at most 3"),
         ({"horizon": 0}, "horizon must be an integer"),
         ({"coloured": 0.0, "white_intensity": 0.0}, "must not both be 0"),
         ({"receiver_factor": (2.0, 1.0)}, "ascending order"),
@@ -517,9 +534,9 @@ def test_bad_parameters_are_refused_with_the_reason(keywords, message):
 
 def test_parameters_from_json_and_duration():
     assert LooselyCoupledNavigationParameters(drift_factor=[0.5, 2.0]).drift_factor == (0.5, 2.0)
-    assert LooselyCoupledNavigationParameters(duration=2.0, step=0.02).horizon == 100
-    with pytest.raises(ValueError, match="control must be one of"):
-        TASK(PAPER, "evidence")
+    assert LooselyCoupledNavigationParameters(duration=2.0, sampling_interval=0.02).horizon == 100
+    with pytest.raises(ValueError, match="control 'evidence'"):
+        make_task(TASK.id, "evidence")
 
 
 # --- The batched filter functions --------------------------------------------------------------------------

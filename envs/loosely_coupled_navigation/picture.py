@@ -23,8 +23,9 @@ from ..rendering import (
     error_strip,
     grown,
 )
-from ..task import Task
-from .task import LooselyCoupledNavigation, LooselyCoupledNavigationState
+from ..task import Episode, Task
+from .banks import Schemes, Steered
+from .task import LooselyCoupledNavigation
 
 TRACK = (0.06, 0.075, 0.43, 0.80)
 """Left, bottom, width, height of the panel as shares of the figure."""
@@ -47,39 +48,42 @@ class LooselyCoupledNavigationPicture(Picture):
 
     # --- the history
 
-    def records(self, state: LooselyCoupledNavigationState) -> dict[str, float]:
+    def records(self, state: Episode) -> dict[str, float]:
         """Positions in m, innovation, gain or weights."""
-        missing = state.available[0] < 0.5
+        measurement, filters = state.measurement, state.bank
+        missing = measurement.available[0] < 0.5
         values = {
-            "reference": state.reference[0, 0],
-            "ins": state.ins[0, 0],
-            "measured": math.nan if missing else state.measurement[0, 0],
-            "estimated": state.estimate[0, 0],
+            "reference": state.truth.reference[0, 0],
+            "ins": measurement.ins[0, 0],
+            "measured": math.nan if missing else measurement.fix[0, 0],
+            "estimated": self.task.mean(state)[0, 0],
         }
-        filters = ("",) if self.task.control == "gain" else tuple(f".{i}" for i in range(3))
-        for i, name in enumerate(filters):
-            values[f"innovation{name}"] = math.nan if missing else state.normalised[i, 0, 0]
-        if self.task.control == "gain":
+        normalised = filters.seen.normalised
+        if isinstance(filters, Steered):
+            values["innovation"] = math.nan if missing else normalised[0, 0]
             # A gain of zero has no logarithm: it is drawn at the smallest one that an action can set.
             smallest = self.task.parameters.smallest_gain
-            values["log_gain"] = math.log10(max(float(state.gain[0, 0]), smallest))
+            values["log_gain"] = math.log10(max(float(filters.gain[0, 0]), smallest))
         else:
-            values |= {f"weight.{i}": state.action[i, 0] for i in range(3)}
+            assert isinstance(filters, Schemes)
+            for i, weight in enumerate(filters.weights[:, 0]):
+                values[f"innovation.{i}"] = math.nan if missing else normalised[i, 0, 0]
+                values[f"weight.{i}"] = weight
         return {name: float(value) for name, value in values.items()}
 
-    def begin(self, state: LooselyCoupledNavigationState) -> None:
+    def begin(self, state: Episode) -> None:
         """Note the disturbances, and fly the reference ahead for limits that need not move."""
-        task, p = self.task, self.task.parameters
+        world, truth, p = self.task.world, state.truth, self.task.parameters
         self.disturbed = []
-        for window in (state.outage, state.jamming, state.spoofing):
+        for window in (truth.outage, truth.jamming, truth.spoofing):
             first, beyond = float(window[0, 0]), float(window[1, 0])
             if first <= p.horizon:
                 self.disturbed.append((first - 0.5, min(beyond, p.horizon + 1) - 0.5))
-        still = numpy.zeros((task.noise.normals, state.clock.shape[-1]))
+        still = numpy.zeros((world.normals, truth.number.shape[-1]))
         path = []
         for _ in range(p.horizon + 1):
-            path.append(float(state.reference[0, 0]))
-            state = task.measure(state, still)
+            path.append(float(truth.reference[0, 0]))
+            truth, _measurement = world.advance(truth, still, None)
         room = MARGIN_SIGMAS * math.sqrt(p.receiver_variance)
         self.limits = min(path) - room, max(path) + room
 
@@ -147,15 +151,14 @@ class LooselyCoupledNavigationPicture(Picture):
         self.panel.set_xlim(0.5, self.task.horizon + 1.5)
         self.panel.set_ylim(*self.limits)
 
-    def draw(self, history: History, state: LooselyCoupledNavigationState) -> None:
+    def draw(self, history: History, state: Episode) -> None:
         """Move everything to where it is now."""
         for name in ("reference", "ins", "measured", "estimated"):
             values = history.get(name, numpy.empty(0))
             getattr(self, name).set_data(numpy.arange(1, len(values) + 1), values)
-        arrived = state.available[0] > 0.5
-        self.arrived.set_data(
-            [float(state.clock[0])], [float(state.measurement[0, 0])] if arrived else [math.nan]
-        )
+        measurement = state.measurement
+        arrived = float(measurement.fix[0, 0]) if measurement.available[0] > 0.5 else math.nan
+        self.arrived.set_data([float(measurement.number[0])], [arrived])
         drawn = [history[name] for name in ("ins", "estimated") if name in history]
         if drawn:
             both = numpy.concatenate(drawn)

@@ -8,10 +8,12 @@ import numpy
 
 from ....envs.catalogue import make_task
 from ....envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ....envs.task import Episode
 from ....evaluation.seeds import episode_seeds
 from ....filters import kalman_bucy
 from ....filters import loosely_coupled as ins_gnss
 from ....filters.linear_systems import steady_kalman_bucy, van_loan
+from ...names import own_competitor
 from ...reproduction import Progress
 from ...reproduction.measured import evaluated, means, recorded
 
@@ -112,13 +114,13 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
     """Fly one episode with the drift ``DRIFT``: reference, INS, measurement and estimate, m, ``(500,)``."""
     maker = own_competitor(LooselyCoupledNavigation.id, name)
     task: Any = make_task(LooselyCoupledNavigation.id, maker.control, "paper", fixed_drift=DRIFT)
-    shown = ("reference", "ins", "measurement", "estimate")
-    series = recorded(
-        task,
-        maker(task),
-        episode_seeds("test", SEED, 1),
-        lambda state: {field: getattr(state, field)[0] for field in shown},
-    )
+
+    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+        said = episode.measurement
+        shown = (episode.truth.reference, said.ins, said.fix, task.mean(episode))
+        return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
+
+    series = recorded(task, maker(task), episode_seeds("test", SEED, 1), fields)
     return {field: values[0] for field, values in series.items()}
 
 
@@ -132,11 +134,14 @@ def exact_plain(intensity: float, riccati: bool) -> float:
     """Exact root mean square error from 2.5 to 5 s of the plain scheme, m."""
     p = PARAMETERS
     dynamics, growth, _, _, P = _model()
-    Phi, Qd = van_loan(dynamics, growth, p.step)
-    R, settled = p.receiver_variance, ins_gnss.settled_gain(intensity * p.step, p.receiver_variance)
+    Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
+    R, settled = (
+        p.receiver_variance,
+        ins_gnss.settled_gain(intensity * p.sampling_interval, p.receiver_variance),
+    )
     variance, squares = 0.0, []
     for _ in range(p.horizon):
-        variance += intensity * p.step
+        variance += intensity * p.sampling_interval
         gain = variance / (variance + R) if riccati else settled
         variance *= 1.0 - gain
         rest = numpy.eye(3) - gain * numpy.diag([1.0, 0.0, 0.0])
@@ -150,7 +155,9 @@ def exact_root_mean_squares() -> dict[str, float]:
     p = PARAMETERS
 
     def root(gain: list[float] | None) -> float:
-        found = kalman_bucy.sampled_covariance(*_model(), p.step, p.horizon * p.step, gain=gain)
+        found = kalman_bucy.sampled_covariance(
+            *_model(), p.sampling_interval, p.horizon * p.sampling_interval, gain=gain
+        )
         return math.sqrt(found.updated[LATE, 0, 0].mean())
 
     white, reduced = p.equivalent_intensities

@@ -31,7 +31,7 @@ def figures(r: Results) -> dict[str, tuple[Any, str]]:
 
 
 def _times(count: int) -> numpy.ndarray:
-    return PARAMETERS.step * numpy.arange(1, count + 1)
+    return PARAMETERS.sampling_interval * numpy.arange(1, count + 1)
 
 
 def draw_first_order(r: Results) -> Any:

@@ -1,0 +1,8 @@
+"""What LooselyCoupledNavigation is compared with, and the reproduction of its paper."""
+
+from .policies import BASELINES
+
+PAPER = "kalman-bucy-ins-gnss"
+"""Name of the paper on the command line; :mod:`.reproduction` repeats its experiments."""
+
+__all__ = ["BASELINES", "PAPER"]

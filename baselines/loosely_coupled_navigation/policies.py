@@ -1,0 +1,398 @@
+"""Policies of LooselyCoupledNavigation, and the table of all it is compared with.
+
+Equation numbers are those of the task's paper (Benkafo, Lobaty).
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ...envs.catalogue import task_class
+from ...envs.loosely_coupled_navigation.banks import GainBank
+from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.task import Task
+from ...evaluation.bootstrap import Bootstrap
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.metrics import Measure, mean_of_present
+from ...filters import loosely_coupled as ins_gnss
+from ..table import Baselines, Tunable
+from .references import Matched, MatchedCovariance
+
+
+def gain_bank(task: Task) -> GainBank:
+    """Bank of a task under control ``gain``."""
+    assert isinstance(task.bank, GainBank)
+    return task.bank
+
+
+# --- the plain scheme with a constant gain
+
+
+class FixedGain(ConstantPolicy):
+    """The plain scheme (3) with one gain for every sample."""
+
+    control = "gain"
+
+    def __init__(self, task: LooselyCoupledNavigation, gain: float) -> None:
+        super().__init__(task)
+        self.action = (float(gain_bank(task).action_for_gain(gain)),) * task.parameters.axes
+
+
+class InsOnly(FixedGain):
+    """The INS alone: no measurement is used."""
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task, 0.0)
+
+
+class GnssOnly(FixedGain):
+    """The receiver alone: the estimate is the measurement, and the INS increment where there is none."""
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task, 1.0)
+
+
+class PlainWhite(FixedGain):
+    """Settled gain for the white part of the INS noise only, ``Ge = G``."""
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task, task.parameters.settled_gains[0])
+
+
+class PlainReduced(ConstantPolicy):
+    """The paper's scheme: settled gain with the coloured part reduced to white noise."""
+
+    control = "gain"
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task)
+        self.action = task.paper_policy.action
+
+
+class BestConstant(FixedGain):
+    """The constant gain of least mean square error under the modelled noise levels, exact."""
+
+    def __init__(self, task: LooselyCoupledNavigation, gain: float | None = None) -> None:
+        if gain is None:
+            p = task.parameters
+            levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
+            K = ins_gnss.best_constant_gain(*levels)
+            growth = K * K * p.receiver_intensity * p.sampling_interval
+            gain = float(ins_gnss.settled_gain(growth, p.receiver_variance))
+        super().__init__(task, gain)
+
+
+# --- the plain scheme with a gain that varies
+
+
+class _Variances(NamedTuple):
+    """Memory of the gain schedules."""
+
+    P: numpy.ndarray
+    """Variance of the estimate after the last sample, ``(N, axes)``, m^2."""
+    squares: numpy.ndarray
+    """Average square of the innovation, ``(N, axes)``, m^2."""
+    weight: numpy.ndarray
+    """Measurements that this average has seen, ``(N,)``."""
+
+
+class TimeVarying(Policy):
+    """The plain scheme with the Riccati gain (5): high at the start of an error, settled later.
+
+    The variance follows from the equivalent intensity ``Ge``, from the noise that the receiver reports and
+    from the gaps in the data; innovations do not matter. Without gaps and changes only time does.
+    """
+
+    control = "gain"
+
+    def __init__(self, task: LooselyCoupledNavigation, intensity: float | None = None) -> None:
+        super().__init__(task)
+        p = task.parameters
+        self.loose = task
+        self.growth = (p.equivalent_intensities[1] if intensity is None else intensity) * p.sampling_interval
+        self.available = task.reader("available")
+        self.reported_variance = task.reader("reported_variance")
+        self.innovation = task.reader("innovation_in_metres")
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Set the gain ``P / (P + R)``."""
+        axes = self.loose.parameters.axes
+        zero = numpy.zeros((len(observation), axes))
+        if state is None:
+            state = _Variances(zero, zero, zero[:, 0])
+        fresh = start[:, None]
+        memory = _Variances(
+            numpy.where(fresh, 0.0, state.P),
+            numpy.where(fresh, 0.0, state.squares),
+            numpy.where(start, 0.0, state.weight),
+        )
+        available = self.available(observation) > 0.5
+        P = memory.P + self.growth
+        memory, R = self.noise(memory, P, self.reported_variance(observation), available, observation)
+        gain = numpy.where(available, P / (P + R), 0.0)
+        return gain_bank(self.task).action_for_gain(gain), memory._replace(P=(1.0 - gain) * P)
+
+    def noise(
+        self,
+        memory: _Variances,
+        P: numpy.ndarray,
+        reported: numpy.ndarray,
+        available: numpy.ndarray,
+        observation: numpy.ndarray,
+    ) -> tuple[_Variances, numpy.ndarray]:
+        """Memory and variance of the measurement noise, ``(N, axes)`` or ``(N, 1)``: here as reported."""
+        return memory, reported
+
+
+class TimeVaryingWhite(TimeVarying):
+    """The same for the white part of the INS noise only, ``Ge = G``."""
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task, task.parameters.equivalent_intensities[0])
+
+
+class InnovationAdaptive(TimeVarying):
+    """The Riccati gain with the receiver noise taken from the innovations instead of the report.
+
+    An innovation has the variance ``P + R``; so R is the average square over a window, less P. The window
+    begins with the reported noise as its first values.
+    """
+
+    def __init__(
+        self, task: LooselyCoupledNavigation, intensity: float | None = None, window: float = 0.25
+    ) -> None:
+        super().__init__(task, intensity)
+        self.rate = -math.expm1(-task.parameters.sampling_interval / window)
+
+    def noise(
+        self,
+        memory: _Variances,
+        P: numpy.ndarray,
+        reported: numpy.ndarray,
+        available: numpy.ndarray,
+        observation: numpy.ndarray,
+    ) -> tuple[_Variances, numpy.ndarray]:
+        """Average the squared innovations; R is at least a tenth of what that average leaves of it."""
+        first = (memory.weight == 0)[:, None]
+        before = numpy.where(first, P + reported, memory.squares)
+        innovation = self.innovation(observation)
+        squares = before + numpy.where(available, self.rate, 0.0) * (innovation**2 - before)
+        R = numpy.maximum(squares - P, 0.1 * squares)
+        return memory._replace(squares=squares, weight=memory.weight + 1.0), R
+
+
+class _Offset(NamedTuple):
+    """Memory of :class:`AugmentedGain`."""
+
+    offset: numpy.ndarray
+    """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""
+    drift: numpy.ndarray
+    """Estimate of beta, ``(axes, N)``, m/s."""
+    coloured: numpy.ndarray
+    """Estimate of eta, ``(axes, N)``, m/s."""
+    covariance: ins_gnss.AugmentedCovariance
+    """``(N,)`` each."""
+
+
+class AugmentedGain(TimeVarying):
+    """An augmented filter inside the policy, which steers the plain scheme towards its own estimate.
+
+    The correction of a sample is gain times innovation, and the agent sees the innovation before it chooses:
+    with ``gain = wanted correction / innovation``, where that lies in [0, 1], the estimate goes where it is
+    wanted; otherwise it waits for an innovation of the other sign, which comes after two samples on average.
+    So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
+    """
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
+        p = self.loose.parameters
+        s = p.sampling
+        none = numpy.zeros((p.axes, len(observation)))
+        zero = none[0]
+        first = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
+        memory = _Offset(none, none, none, first)
+        if state is not None:
+            covariance = ins_gnss.AugmentedCovariance(
+                *(numpy.where(start, a, b) for a, b in zip(first, state.covariance, strict=True))
+            )
+            offset, drift, coloured = (numpy.where(start, 0.0, row) for row in state[:3])
+            memory = _Offset(offset, drift, coloured, covariance)
+        R = self.reported_variance(observation)[:, 0]
+        available = numpy.where(self.available(observation)[:, 0] > 0.5, 1.0, 0.0)
+        innovation = self.innovation(observation).T
+
+        offset = memory.offset - (s.step * memory.drift + s.drive * memory.coloured)
+        P = ins_gnss.predict_augmented(memory.covariance, s, *p.modelled_growth)
+        K, P = ins_gnss.update_augmented(P, R, available)
+        own = available * (innovation - offset)
+        wanted = offset + K.position * own
+        usable = (available > 0.0) & (innovation != 0.0)
+        gain = numpy.where(usable, wanted / numpy.where(usable, innovation, 1.0), 0.0)
+        gain = numpy.clip(gain, 0.0, 1.0)
+        gain = numpy.where(gain <= p.smallest_gain, 0.0, gain)
+        after = _Offset(
+            wanted - gain * innovation,
+            memory.drift - K.drift * own,
+            s.decay * memory.coloured - K.coloured * own,
+            P,
+        )
+        return gain_bank(self.task).action_for_gain(gain.T), after
+
+
+# --- the bank
+
+
+class Augmented(Policy):
+    """Believe the augmented error-state filter, which also estimates the constant and coloured rate errors."""
+
+    control = "mode"
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Name the third filter of the bank."""
+        return numpy.full(len(observation), 2), None
+
+
+# --- metrics of one's own
+
+RECOVERED = 0.25
+"""Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
+HELD = 0.1
+"""Time for which it must stay below, s: shorter than the memory of any sensible gain, long for noise."""
+LONGEST = 1.0
+"""Time after the outage that is looked at, s; a run that has not recovered by then counts with it."""
+
+
+def recovery_times(
+    error: numpy.ndarray, available: numpy.ndarray, limit: float, held: int, longest: int
+) -> numpy.ndarray:
+    """Samples from the end of an outage until the error stays small, for each episode.
+
+    Args:
+        error: size of the error, ``(episodes, time)``.
+        available: one where there is a measurement, same shape.
+        limit: what counts as small.
+        held: samples for which it must stay small.
+        longest: samples looked at; the answer for a run that does not recover in them.
+
+    Returns:
+        ``(episodes,)``; zero where the error was small from the first measurement after the outage on; NaN
+        for episodes without an outage, or with less than ``longest + held`` samples after it.
+    """
+    episodes, steps = error.shape
+    ends = (available[:, :-1] < 0.5) & (available[:, 1:] > 0.5)
+    first = numpy.where(ends.any(axis=1), ends.argmax(axis=1) + 1, steps)
+    counted = first + longest + held <= steps
+    window = numpy.arange(longest + held)
+    index = numpy.minimum(first[:, None] + window, steps - 1)
+    small = numpy.take_along_axis(error, index, axis=1) < limit
+    runs = numpy.cumsum(numpy.concatenate([numpy.zeros((episodes, 1), int), small], axis=1), axis=1)
+    held_from = runs[:, held:] - runs[:, :-held] == held
+    found = held_from[:, :longest]
+    time = numpy.where(found.any(axis=1), found.argmax(axis=1), longest)
+    return numpy.where(counted, time.astype(float), math.nan)
+
+
+def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
+    """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
+    if "available" not in run or numpy.isnan(run["available"].values).all():
+        return []
+    cls = task_class(run.attrs["environment"])
+    scenario = cls.scenarios.get(run.attrs["scenario"])
+    parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **run.attrs["keywords"]})
+    size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
+    limit = RECOVERED * math.sqrt(parameters.receiver_variance * parameters.axes)
+    held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))
+    times = recovery_times(size, run["available"].values, limit, held, longest)
+    if numpy.isnan(times).all():
+        return []
+    lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
+    return [
+        Measure(
+            "recovery_time",
+            "position",
+            "all",
+            mean_of_present(times[:, None] * parameters.sampling_interval, bootstrap),
+            "s",
+        ),
+        Measure("not_recovered", "position", "all", mean_of_present(lost[:, None], bootstrap), "1"),
+    ]
+
+
+# --- what can be tuned
+
+
+def _intensity_tuned(
+    make: Callable[[Any, float, Mapping[str, float]], Policy],
+) -> Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]:
+    def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+        return {}, lambda task: make(task, 10.0 ** values["log10_intensity"], values)
+
+    return apply
+
+
+_INTENSITY_LIMITS = (-2.0, 1.0)
+_INTENSITY_START = math.log10(0.36)
+
+TUNABLE = {
+    "best-constant": Tunable(
+        "gain",
+        {"log10_gain": (-3.0, -0.5)},
+        {"log10_gain": math.log10(0.0462)},
+        lambda values: ({}, lambda task: BestConstant(task, 10.0 ** values["log10_gain"])),
+    ),
+    "time-varying": Tunable(
+        "gain",
+        {"log10_intensity": _INTENSITY_LIMITS},
+        {"log10_intensity": _INTENSITY_START},
+        _intensity_tuned(lambda task, intensity, _: TimeVarying(task, intensity)),
+    ),
+    "innovation-adaptive": Tunable(
+        "gain",
+        {"log10_intensity": _INTENSITY_LIMITS, "window": (0.05, 2.0)},
+        {"log10_intensity": _INTENSITY_START, "window": 0.25},
+        _intensity_tuned(lambda task, intensity, v: InnovationAdaptive(task, intensity, v["window"])),
+    ),
+}
+
+BASELINES = Baselines(
+    environment="filtergym/LooselyCoupledNavigation-v0",
+    policies={
+        "plain-reduced": PlainReduced,
+        "plain-white": PlainWhite,
+        "best-constant": BestConstant,
+        "time-varying": TimeVarying,
+        "time-varying-white": TimeVaryingWhite,
+        "innovation-adaptive": InnovationAdaptive,
+        "augmented-gain": AugmentedGain,
+        "augmented": Augmented,
+        "ins-only": InsOnly,
+        "gnss-only": GnssOnly,
+        "random": RandomPolicy,
+    },
+    references={"matched": Matched},
+    bounds={"matched-covariance": MatchedCovariance},
+    score_paper="plain-reduced",
+    score_bound="matched",
+    tunable=TUNABLE,
+    best_constant="best-constant",
+    compared=("augmented",),
+    benchmark=(
+        "plain-reduced",
+        "plain-white",
+        "best-constant",
+        "time-varying",
+        "innovation-adaptive",
+        "augmented-gain",
+        "augmented",
+        "ins-only",
+        "gnss-only",
+        "random",
+        "matched",
+        "matched-covariance",
+    ),
+    metrics=outage_metrics,
+)
+"""What the environment is compared with."""

@@ -1,0 +1,383 @@
+"""The Kalman-Bucy schemes of LooselyCoupledNavigation that are steered: one filter by its gain, or three by weights.
+
+Equations stand in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import imm
+from ...filters import loosely_coupled as ins_gnss
+from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ..controls import bank_action_space, bank_probabilities
+from ..observation import KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Compression, Quantity
+from ..task import Bank, Initial, Task
+from .parameters import AXES, LooselyCoupledNavigationParameters
+from .world import Measurement
+
+SCHEMES = ("plain-white", "plain-reduced", "augmented")
+"""The bank under ``mode`` and ``weights``."""
+KEPT_AS_DEVIATION_LOG = Compression("half the log of ", None, lambda shown: numpy.exp(2.0 * shown))
+"""The block's function returns the logarithm of a standard deviation; reading gives the variance."""
+
+
+class Innovations(NamedTuple):
+    """Innovations and their averages, of one filter ``(A, N)`` or of three ``(3, A, N)``."""
+
+    innovation: Array
+    """nu, zero where there is no measurement, m."""
+    normalised: Array
+    """The last one that there was, over its standard deviation."""
+    average: Array
+    """Exponential average of the normalised innovation."""
+    average_square: Array
+    """Of its square."""
+    average_product: Array
+    """Of its product with the one before."""
+
+
+class Steered(NamedTuple):
+    """The plain scheme with the gain of the action."""
+
+    position: Array
+    """Xh, predicted to the measurement or updated by it, m, ``(A, N)``."""
+    variance: ins_gnss.PlainVariance
+    """Of its error with the gains used, m^2, ``(A, N)`` each. ``assumed``, with the coloured noise reduced to white
+    and no drift, is the scale of the innovations that are shown; ``modelled`` is reported."""
+    seen: Innovations
+    action: Array
+    """Last action, ``(A, N)``."""
+    gain: Array
+    """Gain in force, zero without a measurement, ``(A, N)``."""
+
+
+class Schemes(NamedTuple):
+    """Three filters side by side, each with its own Kalman gain, and the weights of their estimates."""
+
+    position: Array
+    """Xh of each filter, ``(3, A, N)``, m."""
+    plain_variance: Array
+    """Of the two plain schemes, the same for all axes, ``(2, 1, N)``, m^2."""
+    drift: Array
+    """Estimate of beta by the augmented filter, ``(A, N)``, m/s."""
+    coloured: Array
+    """Of eta, likewise."""
+    covariance: ins_gnss.AugmentedCovariance
+    """Of the augmented filter, the same for all axes, ``(N,)`` each."""
+    seen: Innovations
+    weights: Array
+    """In force, ``(3, N)``."""
+
+
+class _KalmanBucyBank(Bank[Task, Measurement, Any]):
+    """What both banks share: the innovations that are shown, and the end of the observation."""
+
+    parameters: LooselyCoupledNavigationParameters
+    filters: tuple[str, ...] = ()
+    """Names of the filters, where there are several."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        p = self.parameters
+        self.axes = AXES[: p.axes] if p.axes > 1 else ()
+        self.forgetting = -math.expm1(-1.0 / p.averaging_measurements)
+        self.eye = task.constant(numpy.eye(p.axes))[:, :, None]
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """Innovations, their averages, the receiver's report, the last action, and the clock."""
+        xp, p = self.xp, self.parameters
+        nominal = math.sqrt(p.receiver_variance)
+        names = [name.replace("-", "_") for name in self.filters]
+        each = [f"{name}_{axis}" for name in names for axis in self.axes] or [*names, *self.axes]
+
+        def time(state: Any, measurement: Measurement) -> Array:
+            elapsed = p.sampling_interval * measurement.number
+            return elapsed / (elapsed + p.correlation_time)
+
+        return (
+            Block(
+                "innovation_over_sigma",
+                lambda f, measurement: measurement.available * f.seen.normalised,
+                "innovation over its predicted standard deviation",
+                each,
+                over_interval="mean",
+            ),
+            Block(
+                "innovation_over_reported",
+                lambda f, measurement: f.seen.innovation / measurement.reported_deviation,
+                "the innovation over the reported noise",
+                each,
+                SIGNED_LOG,
+                over_interval="mean",
+            ),
+            Block(
+                "average_innovation",
+                lambda f, _: f.seen.average,
+                "short average of innovation_over_sigma",
+                each,
+            ),
+            Block(
+                "average_square",
+                lambda f, _: xp.log(1.0 + f.seen.average_square),
+                "the short average of its square",
+                each,
+                KEPT_AS_LOG1P,
+            ),
+            Block(
+                "average_product",
+                lambda f, _: f.seen.average_product,
+                "short average of its product with the one before",
+                each,
+            ),
+            Block(
+                "reported_noise",
+                lambda _, measurement: xp.log(measurement.reported_deviation / nominal),
+                "the reported over the nominal variance of a measurement",
+                shown=KEPT_AS_DEVIATION_LOG,
+            ),
+            Block(
+                "available",
+                lambda _, measurement: measurement.available,
+                "1 with a measurement, 0 without",
+                over_interval="mean",
+            ),
+            self.last_action(),
+            Block("time", time, "t / (t + tau), t since the start, tau the correlation time"),
+        )
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """What the receiver reports, and the innovations, as they are."""
+        nominal = self.parameters.receiver_variance
+        return (
+            Quantity(
+                "reported_variance",
+                "m^2",
+                "variance of a measurement as the receiver reports it",
+                lambda read: nominal * read("reported_noise"),
+            ),
+            Quantity(
+                "innovation_in_metres",
+                "m",
+                "innovation of each filter and axis, zero where there is no measurement",
+                lambda read: read("innovation_over_reported") * numpy.sqrt(read("reported_variance")),
+            ),
+        )
+
+    def last_action(self) -> Block:
+        """Block of what was done before."""
+        raise NotImplementedError
+
+    def none_seen(self, zero: Array) -> Innovations:
+        """Innovations at the start of the track, of the shape of ``zero``."""
+        return Innovations(zero, zero, zero, zero + 1.0, zero)
+
+    def compared(
+        self, before: Innovations, measurement: Measurement, position: Array, variance: Array
+    ) -> Innovations:
+        """Innovations of predicted positions, and their averages; without a measurement these stand still.
+
+        Args:
+            before: at the measurement before.
+            measurement: that arrives.
+            position: predicted, m, of the shape of the innovations.
+            variance: of its error, m^2, broadcast against it.
+        """
+        xp, available, reported = self.xp, measurement.available, measurement.reported_deviation
+        innovation = available * (measurement.fix - position)
+        normalised = innovation / xp.sqrt(variance + reported * reported)
+        rate = self.forgetting * available
+        square, product = normalised * normalised, normalised * before.normalised
+        return Innovations(
+            innovation,
+            xp.where(available > 0.0, normalised, before.normalised),
+            before.average + rate * (normalised - before.average),
+            before.average_square + rate * (square - before.average_square),
+            before.average_product + rate * (product - before.average_product),
+        )
+
+
+class GainBank(_KalmanBucyBank):
+    """Control ``gain``: the plain scheme, whose gain on every axis the action sets."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        p = self.parameters
+        self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number for each axis."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.parameters.axes,), numpy.float32)
+
+    def last_action(self) -> Block:
+        """Block of the action applied before."""
+        return Block("last_action", lambda f, _: f.action, "action applied before", self.axes)
+
+    def start(self, initial: Initial) -> Steered:
+        """Start where INS and reference agree."""
+        zero = 0.0 * initial.mean
+        variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
+        return Steered(initial.mean, variance, self.none_seen(zero), zero, zero)
+
+    def predict(self, state: Steered, measurement: Measurement) -> Steered:
+        """Predict by the increment of the INS."""
+        position = state.position + measurement.increment
+        variance = ins_gnss.predict_plain(state.variance, *self.error_model)
+        seen = self.compared(state.seen, measurement, position, variance.assumed)
+        return state._replace(position=position, variance=variance, seen=seen)
+
+    def gain(self, action: Array) -> Array:
+        """Gain that an action sets, logarithmic between the smallest one and 1, zero at the lower end."""
+        gain = self.xp.exp((0.5 * math.log(self.parameters.smallest_gain)) * (1.0 - action))
+        return self.xp.where(action <= -1.0, 0.0, gain)
+
+    def action_for_gain(self, gain: Any) -> Any:
+        """Action that sets gains, NumPy: the inverse of :meth:`gain`; the smallest one and less count as zero.
+
+        Raises:
+            ValueError: a gain outside [0, 1].
+        """
+        gain = numpy.asarray(gain)
+        if not ((gain >= 0.0) & (gain <= 1.0)).all():
+            raise ValueError(f"gain must lie in [0, 1], got {gain!r}")
+        smallest = self.parameters.smallest_gain
+        logarithm = numpy.log(numpy.maximum(gain, smallest)) / math.log(smallest)
+        return numpy.where(gain <= smallest, -1.0, 1.0 - 2.0 * logarithm)
+
+    def act(self, state: Steered, measurement: Measurement, action: Array) -> Steered:
+        """Update by the gain of the action; without a measurement the gain is zero."""
+        action = self.xp.clip(action, -1.0, 1.0)
+        gain = measurement.available * self.gain(action)
+        R = measurement.reported_deviation * measurement.reported_deviation
+        return state._replace(
+            position=state.position + gain * state.seen.innovation,
+            variance=ins_gnss.update_plain(state.variance, R, gain),
+            action=action,
+            gain=gain,
+        )
+
+    def mean(self, state: Steered) -> Array:
+        """Position, ``(A, N)``, m."""
+        return state.position
+
+    def covariance(self, state: Steered) -> Array:
+        """Covariance that belongs to the gains used, ``(A, A, N)``, m^2.
+
+        It holds for the modelled noises, and for gains that do not depend on the innovations.
+        """
+        return self.eye * state.variance.modelled
+
+    def records(self, state: Steered, measurement: Measurement) -> dict[str, Array]:
+        """NIS (NaN without a measurement), gain and K."""
+        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
+        found = {"nis": self.xp.where(measurement.available > 0.0, nis, math.nan)}
+        for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
+            found[f"gain{ending}"] = state.gain[i]
+            found[f"gain_rate{ending}"] = state.gain[i] / self.parameters.sampling_interval
+        return found
+
+
+class SchemeBank(_KalmanBucyBank):
+    """Controls ``mode`` and ``weights``: three filters run side by side without mixing; the action reports."""
+
+    filters = SCHEMES
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.plain_growth = task.constant(self.parameters.plain_growth)[:, None, None]
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """One filter, or a weight for each."""
+        return bank_action_space(self.task.control, len(SCHEMES))
+
+    def last_action(self) -> Block:
+        """Block of the weights in force before."""
+        names = [name.replace("-", "_") for name in SCHEMES]
+        return Block("last_weight", lambda f, _: f.weights, "weight put in force before", names)
+
+    def start(self, initial: Initial) -> Schemes:
+        """Start all filters where INS and reference agree, with the modelled prior of the rate errors."""
+        xp, p = self.xp, self.parameters
+        zero = 0.0 * initial.mean
+        each = xp.stack([zero] * 3)
+        none = zero[0]
+        return Schemes(
+            position=each + initial.mean,
+            plain_variance=each[:2, :1],
+            drift=zero,
+            coloured=zero,
+            covariance=ins_gnss.AugmentedCovariance(
+                none, none, none, none + p.drift**2, none, none + p.coloured**2
+            ),
+            seen=self.none_seen(each),
+            weights=each[:, 0],
+        )
+
+    def predict(self, state: Schemes, measurement: Measurement) -> Schemes:
+        """Predict every filter by the increment of the INS, the augmented one less its rate errors."""
+        xp, s = self.xp, self.parameters.sampling
+        position = state.position + measurement.increment
+        corrected = position[2] - (s.step * state.drift + s.drive * state.coloured)
+        position = xp.concat([position[:2], corrected[None]])
+        plain = state.plain_variance + self.plain_growth
+        P = ins_gnss.predict_augmented(state.covariance, s, *self.parameters.modelled_growth)
+        variance = xp.concat([plain, P.position[None, None]])
+        return state._replace(
+            position=position,
+            plain_variance=plain,
+            coloured=s.decay * state.coloured,
+            covariance=P,
+            seen=self.compared(state.seen, measurement, position, variance),
+        )
+
+    def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:
+        """Update each filter by its own Kalman gain, and put the weights of the action in force."""
+        xp, available, innovation = self.xp, measurement.available, state.seen.innovation
+        R = measurement.reported_deviation * measurement.reported_deviation
+        plain = state.plain_variance
+        plain_gain = available * plain / (plain + R)
+        gain, P = ins_gnss.update_augmented(state.covariance, R, available)
+        position = xp.concat(
+            [
+                state.position[:2] + plain_gain * innovation[:2],
+                (state.position[2] + gain.position * innovation[2])[None],
+            ]
+        )
+        # Neither control asks for likelihoods, only for the shape of the bank.
+        no_evidence = xp.zeros_like(innovation[:, 0])
+        return state._replace(
+            position=position,
+            plain_variance=ins_gnss.update_variance(plain, R, plain_gain),
+            # The innovation of the position is minus that of the INS error delta.
+            drift=state.drift - gain.drift * innovation[2],
+            coloured=state.coloured - gain.coloured * innovation[2],
+            covariance=P,
+            weights=bank_probabilities(self.task.control, action, no_evidence, no_evidence, 0.0, xp),
+        )
+
+    def mean(self, state: Schemes) -> Array:
+        """Combination of the estimates, ``(A, N)``, m."""
+        return weighted_sum(state.weights, self.xp.moveaxis(state.position, 0, 1))
+
+    def covariance(self, state: Schemes) -> Array:
+        """Covariance of the combination, the spread of the estimates included, ``(A, A, N)``, m^2."""
+        xp = self.xp
+        variance = xp.concat([state.plain_variance[:, 0], state.covariance.position[None]])
+        position = xp.moveaxis(state.position, 0, 1)
+        return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
+
+    def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
+        """Weights, and the mean of the filters' NIS by them (NaN without a measurement): of the filter believed."""
+        squares = self.xp.moveaxis(state.seen.normalised * state.seen.normalised, 1, 0)
+        nis = weighted_sum(state.weights, ordered_sum(squares))
+        return {
+            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
+            "mode_probability": state.weights,
+        }

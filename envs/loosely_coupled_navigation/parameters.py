@@ -1,0 +1,151 @@
+"""Every constant of LooselyCoupledNavigation, with its limits, and what follows from them."""
+
+import functools
+from dataclasses import dataclass
+
+from ...filters import loosely_coupled as ins_gnss
+from ..parameters import TaskParameters, check, declared, parameter
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class LooselyCoupledNavigationParameters(TaskParameters):
+    """Constants of the episode; "ours" because the paper states no numbers, with the reason after it."""
+
+    axes: int = parameter(1, at_least=1, at_most=len(AXES))
+    """Coordinates, 1 (paper) to 3, independent of each other."""
+    horizon: int = parameter(500, at_least=1)
+    """Measurements acted on; ours: 5 s, the time axis of Fig. 2."""
+    duration: float | None = parameter(None, above=0.0)
+    """Length of the episode, s; where given it sets the horizon to the nearest number of measurements."""
+    decision_interval: int = parameter(1, at_least=1)
+    """Measurements for which one action holds; ours: the time-varying gain is exact only with 1."""
+    sampling_interval: float = parameter(0.01, above=0.0)
+    """From one measurement to the next, s; ours: K times it stays below 0.05 for every tuning, so sampling
+    costs little."""
+
+    reference_amplitude: float = parameter(2.0, at_least=0.0)
+    """Of the reference motion, m; ours, as in Figs. 4 and 5."""
+    reference_rate: float = parameter(0.8, at_least=0.0)
+    """Angular rate of the reference motion, rad/s; ours, as in Figs. 4 and 5."""
+
+    drift: float = parameter(0.6, at_least=0.0)
+    """Modelled standard deviation of the constant rate error beta, m/s; ours: the INS leaves the picture."""
+    coloured: float = parameter(0.4, at_least=0.0)
+    """Modelled stationary standard deviation of the coloured rate error eta, m/s; ours, as beta."""
+    correlation_time: float = parameter(1.0, above=0.0)
+    """Of the coloured rate error, s; ours: between the sampling interval and the episode."""
+    white_intensity: float = parameter(0.04, at_least=0.0)
+    """Modelled intensity G of the white rate error, m^2/s; ours: a tenth of the reduced coloured one."""
+    receiver_intensity: float = parameter(0.02, above=0.0)
+    """Nominal intensity N of the receiver noise, m^2 s; ours: 1.4 m per sample, "strongly noisy"."""
+
+    fixed_drift: float | None = None
+    """Constant rate error of every axis, m/s, in place of a random one; 1.0 is the example of Fig. 4."""
+    drift_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """True over modelled standard deviation of beta, drawn log-uniformly in this interval."""
+    coloured_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """True over modelled intensity of the coloured error, likewise."""
+    white_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """True over modelled intensity of the white error, likewise."""
+    receiver_factor: tuple[float, float] = parameter((1.0, 1.0), above=0.0, ascending=True)
+    """True over nominal intensity of the receiver noise, likewise; every change draws anew."""
+
+    noise_changes: tuple[int, int] = parameter((0, 0), at_least=0, at_most=2, ascending=True)
+    """Fewest and most changes of the receiver noise in the episode, 0 to 2, equally likely."""
+    change_start: tuple[float, float] = parameter((0.5, 4.5), at_least=0.0, ascending=True)
+    """Interval of the times of change, s; ours: both sides of a change are seen."""
+    unreported: float = parameter(0.5, at_least=0.0, at_most=1.0)
+    """Probability that the receiver goes on reporting the former noise after a change."""
+
+    outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That the measurement fails once in the episode."""
+    outage_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
+    """Interval of the start of the outage, s."""
+    outage_duration: tuple[float, float] = parameter((1.5, 1.5), at_least=0.0, ascending=True)
+    """Interval of its length, s."""
+
+    jamming_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That the receiver noise rises once in the episode, unreported."""
+    jamming_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
+    """Interval of the start of the jamming, s."""
+    jamming_duration: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, ascending=True)
+    """Interval of its length, s."""
+    jamming_factor: float = parameter(100.0, above=0.0)
+    """Intensity under jamming over intensity without; ours: ten times the noise."""
+
+    spoofing_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That the measurement is pulled off once in the episode."""
+    spoofing_start: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
+    """Interval of the start of the spoofing, s."""
+    spoofing_duration: tuple[float, float] = parameter((1.5, 1.5), at_least=0.0, ascending=True)
+    """Interval of its length, s; after it the measurement is true again."""
+    spoofing_rate: float = 2.0
+    """Rate at which every axis is pulled off, m/s; ours: twice the noise of a sample at the end."""
+
+    averaging_measurements: float = parameter(25.0, above=0.0)
+    """Time constant of the averages of innovations shown, measurements; ours: 0.25 s, the time constant of the
+    reduced tuning."""
+    smallest_gain: float = parameter(1e-5, above=0.0, below=1.0)
+    """Lowest gain but zero that an action can set; ours: K = 0.001 1/s."""
+
+    def __post_init__(self) -> None:
+        """Turn the duration into a horizon, and check every field."""
+        if self.duration is not None:
+            for name in ("duration", "sampling_interval"):
+                check(name, getattr(self, name), *declared(LooselyCoupledNavigationParameters)[name])
+            if self.sampling_interval > self.duration:
+                raise ValueError(
+                    f"sampling_interval must be at most the duration of {self.duration} s, got "
+                    f"{self.sampling_interval!r} s"
+                )
+            object.__setattr__(self, "horizon", round(self.duration / self.sampling_interval))
+        super().__post_init__()
+
+    def check(self) -> None:
+        """Check what concerns several fields together."""
+        if not (self.coloured or self.white_intensity):
+            raise ValueError(
+                "coloured and white_intensity must not both be 0: the plain scheme needs a noise"
+            )
+
+    @property
+    def receiver_variance(self) -> float:
+        """Nominal variance of a measurement, ``N / sampling_interval``, m^2."""
+        return self.receiver_intensity / self.sampling_interval
+
+    @property
+    def equivalent_intensities(self) -> tuple[float, float]:
+        """Ge of the two tunings, m^2/s: the white part, and with the coloured part reduced to white noise."""
+        return (
+            self.white_intensity,
+            self.white_intensity + 2.0 * self.coloured**2 * self.correlation_time,
+        )
+
+    @property
+    def plain_growth(self) -> tuple[float, float]:
+        """Variance that the error gains from one measurement to the next, by the two tunings, m^2."""
+        white, reduced = self.equivalent_intensities
+        return white * self.sampling_interval, reduced * self.sampling_interval
+
+    @property
+    def settled_gains(self) -> tuple[float, float]:
+        """Gains at which the plain scheme settles, by the two tunings."""
+        white, reduced = (ins_gnss.settled_gain(q, self.receiver_variance) for q in self.plain_growth)
+        return white, reduced
+
+    @functools.cached_property
+    def sampling(self) -> ins_gnss.Sampling:
+        """Exact sampling of the INS error."""
+        return ins_gnss.sampling(self.correlation_time, self.sampling_interval)
+
+    @functools.cached_property
+    def modelled_growth(self) -> tuple[float, float]:
+        """Variances that the modelled coloured rate error (m^2/s^2) and the displacement (m^2) gain from one
+        measurement to the next.
+        """
+        return (
+            (self.coloured * self.sampling.coloured) ** 2,
+            self.white_intensity * self.sampling_interval + self.coloured**2 * self.sampling.residual,
+        )

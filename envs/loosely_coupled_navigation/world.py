@@ -1,0 +1,206 @@
+"""The motion of LooselyCoupledNavigation, its INS, and the receiver; equations in ``filters/loosely_coupled.py``."""
+
+import math
+from typing import NamedTuple
+
+import numpy
+
+from ...filters.ordered_sums import ordered_sum
+from ..draws import Draws
+from ..observation import Array
+from ..task import Initial, Task, World
+from .parameters import LooselyCoupledNavigationParameters
+
+NEVER = 1e9
+"""Number of the measurement at which happens what does not; finite, so that arithmetic on it stays finite."""
+
+
+class Truth(NamedTuple):
+    """The motion, the errors of the INS, and what befalls the receiver; A axes."""
+
+    number: Array
+    """Measurements so far, ``(N,)``."""
+    reference: Array
+    """Position Xr, m, ``(A, N)``."""
+    ins: Array
+    """Position X that the INS has come to, m, ``(A, N)``."""
+    drift: Array
+    """Constant rate error beta, m/s, ``(A, N)``."""
+    coloured: Array
+    """Coloured rate error eta, m/s, ``(A, N)``."""
+    drift_deviation: Array
+    """True standard deviation of beta, m/s, ``(N,)``."""
+    coloured_step: Array
+    """Standard deviation of what eta gains from one measurement to the next, m/s, ``(N,)``."""
+    white_step: Array
+    """Standard deviation of the displacement that this gain does not explain, m, ``(N,)``."""
+    receiver_levels: Array
+    """Standard deviation of the receiver noise before, between and after its changes, m, ``(3, N)``."""
+    reported_levels: Array
+    """What the receiver reports in its place, m, ``(3, N)``."""
+    change: Array
+    """First measurement after each change, ``(2, N)``."""
+    outage: Array
+    """First measurement of the outage and first one after it, ``(2, N)``."""
+    jamming: Array
+    """Likewise, ``(2, N)``."""
+    spoofing: Array
+    """Likewise, ``(2, N)``."""
+    deviation: Array
+    """True standard deviation of this measurement, m, ``(N,)``."""
+    reported_deviation: Array
+    """What the receiver says of it, m, ``(N,)``."""
+    available: Array
+    """One where the receiver has a measurement, otherwise zero, ``(N,)``."""
+
+
+class Measurement(NamedTuple):
+    """What INS and receiver say; A axes."""
+
+    number: Array
+    """Number of the measurement, from 1 on, ``(N,)``; it is taken ``sampling_interval`` seconds after the one
+    before, the first one that long after the start of the track."""
+    ins: Array
+    """Position X by the INS alone, m, ``(A, N)``; at the start of the track it is the reference."""
+    increment: Array
+    """X minus X at the measurement before, m, ``(A, N)``."""
+    fix: Array
+    """Position Z by the receiver, m, zero where there is none, ``(A, N)``."""
+    available: Array
+    """One where the receiver has a fix, otherwise zero, ``(N,)``; the INS always speaks."""
+    reported_deviation: Array
+    """Standard deviation of each axis of the fix as the receiver reports it, m, ``(N,)``; it may be wrong, and it
+    goes on where there is no fix."""
+
+
+class InsGnssWorld(World[Task, Truth, Measurement]):
+    """A sine motion, an inertial system with three rate errors, and a satellite receiver."""
+
+    parameters: LooselyCoupledNavigationParameters
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        axes = self.parameters.axes
+        self.initial_normals, self.normals = 2 * axes, 3 * axes
+        self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
+        self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
+        """Draw noise levels, disturbances and rate errors; at the start INS and reference agree."""
+        xp, p = self.xp, self.parameters
+        drift_deviation = p.drift * draws.log_uniform("drift_factor", p.drift_factor)
+        coloured_deviation = p.coloured * xp.sqrt(draws.log_uniform("coloured_factor", p.coloured_factor))
+        white_intensity = p.white_intensity * draws.log_uniform("white_factor", p.white_factor)
+        factors = [draws.log_uniform("receiver_factor", p.receiver_factor)]
+        changes = draws.integer("noise_changes", p.noise_changes)
+        first, second = self._number_at(draws.uniform("change_start", p.change_start, 2))
+        factors += list(draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2))
+        unreported = draws.event("unreported", p.unreported, 2)
+
+        both = changes == 2
+        earlier = xp.where(changes == 0, NEVER, xp.where(both, xp.minimum(first, second), first))
+        later = xp.where(both, xp.maximum(first, second), NEVER)
+        levels = [xp.sqrt(p.receiver_variance * factor) for factor in factors]
+        reported = levels[:1]
+        for level, silent in zip(levels[1:], unreported, strict=True):
+            reported.append(xp.where(silent, reported[-1], level))
+
+        beta, eta = normals[: p.axes], normals[p.axes :]
+        zeros = 0.0 * beta
+        reference = zeros + p.reference_amplitude * xp.sin(self.phase)
+        truth = Truth(
+            number=zeros[0],
+            reference=reference,
+            ins=reference,
+            drift=drift_deviation * beta if p.fixed_drift is None else zeros + p.fixed_drift,
+            coloured=coloured_deviation * eta,
+            drift_deviation=drift_deviation,
+            coloured_step=p.sampling.coloured * coloured_deviation,
+            white_step=xp.sqrt(
+                white_intensity * p.sampling_interval + p.sampling.residual * coloured_deviation**2
+            ),
+            receiver_levels=xp.stack(levels),
+            reported_levels=xp.stack(reported),
+            change=xp.stack([earlier, later]),
+            outage=self._window("outage", draws),
+            jamming=self._window("jamming", draws),
+            spoofing=self._window("spoofing", draws),
+            deviation=levels[0],
+            reported_deviation=reported[0],
+            available=zeros[0] + 1.0,
+        )
+        return truth, Initial(reference, self.no_covariance + zeros[0])
+
+    def _number_at(self, time: Array) -> Array:
+        """Number of the measurement nearest to a time in s."""
+        return self.xp.round(time / self.parameters.sampling_interval)
+
+    def _window(self, name: str, draws: Draws) -> Array:
+        """First measurement of a disturbance and first one after it, ``(2, N)``."""
+        xp, p = self.xp, self.parameters
+        happens = draws.event(name, getattr(p, f"{name}_probability"))
+        first = self._number_at(draws.uniform(f"{name}_start", getattr(p, f"{name}_start")))
+        beyond = first + self._number_at(draws.uniform(f"{name}_duration", getattr(p, f"{name}_duration")))
+        return xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
+
+    def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
+        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver."""
+        xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
+        number = truth.number + 1.0
+        kick = truth.coloured_step * noise[:n]
+        slip = s.step * truth.drift + s.drive * truth.coloured + s.coupling * kick
+        angle = (p.reference_rate * p.sampling_interval) * number + self.phase
+        reference = p.reference_amplitude * xp.sin(angle)
+        increment = (reference - truth.reference) + (slip + truth.white_step * noise[n : 2 * n])
+        ins = truth.ins + increment
+
+        deviation, reported = truth.receiver_levels[0], truth.reported_levels[0]
+        available = truth.available
+        if p.noise_changes[1]:
+            changed, again = number >= truth.change[0], number >= truth.change[1]
+            deviation, reported = (
+                xp.where(again, levels[2], xp.where(changed, levels[1], levels[0]))
+                for levels in (truth.receiver_levels, truth.reported_levels)
+            )
+        if p.jamming_probability:
+            louder = math.sqrt(p.jamming_factor) * deviation
+            deviation = xp.where(within(number, truth.jamming), louder, deviation)
+        fix = reference + deviation * noise[2 * n : 3 * n]
+        if p.spoofing_probability:
+            pull = (p.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
+            fix = fix + xp.where(within(number, truth.spoofing), pull, 0.0)
+        if p.outage_probability:
+            available = xp.where(within(number, truth.outage), 0.0, xp.ones_like(number))
+            fix = available * fix
+        truth = truth._replace(
+            number=number,
+            reference=reference,
+            ins=ins,
+            coloured=s.decay * truth.coloured + kick,
+            deviation=deviation,
+            reported_deviation=reported,
+            available=available,
+        )
+        return truth, Measurement(number, ins, increment, fix, available, reported)
+
+    def state(self, truth: Truth) -> Array:
+        """Position, ``(A, N)``."""
+        return truth.reference
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Squared error of position, summed over the axes, over the nominal variance of a measurement."""
+        error = mean - truth.reference
+        return ordered_sum(error * error) / self.parameters.receiver_variance
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """Whether there is a measurement, its noise, and what is reported of that."""
+        return {
+            "available": truth.available,
+            "receiver_deviation": truth.deviation,
+            "reported_deviation": truth.reported_deviation,
+        }
+
+
+def within(number: Array, window: Array) -> Array:
+    """Whether a measurement stands in a window, ``(N,)``."""
+    return (number >= window[0]) & (number < window[1])
