@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.catalogue import make_task
-from ...envs.controls import signed_exponential
 from ...envs.task import Task
-from ...envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER, TightlyCoupledNavigation
+from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...filters import gnss_ins, imm
 from ..bootstrap import Bootstrap, Estimate
 from ..figures import styles
@@ -29,7 +29,9 @@ from ..policy import Policy
 from ..reproduction import Claim, Grid, Reproduction, Verdict, episode_count
 from ..rollout import run_policy, run_reference
 from ..seeds import episode_seeds
-from .policies import KnownMode, chain, lasting, switches
+from .metrics import lasting, switches
+from .policies import chain
+from .references import KnownMode
 
 TITLE = "Adaptive multi-hypothesis algorithm of an inertial-satellite navigation system"
 EPISODES = 100
@@ -147,16 +149,14 @@ class _SideBySide(Policy):
 
     def __init__(self, task: Task, lanes: Sequence[int | None]) -> None:
         super().__init__(task)
-        self.log_likelihood = task.columns([f"log_likelihood_{h}" for h in HYPOTHESES])
-        self.log_predicted = task.columns([f"log_predicted_{h}" for h in HYPOTHESES])
+        self.log_likelihood, self.log_predicted = task.reader("log_likelihood"), task.reader("log_predicted")
         self.fixed = numpy.array([lane is not None for lane in lanes])
         self.weights = numpy.array([numpy.eye(len(HYPOTHESES))[lane or 0] for lane in lanes])
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """State posterior probabilities, or certainty."""
         posterior = imm.mode_posterior(
-            signed_exponential(observation[:, self.log_predicted], numpy).T,
-            signed_exponential(observation[:, self.log_likelihood], numpy).T,
+            self.log_predicted(observation).T, self.log_likelihood(observation).T
         ).T
         return numpy.where(self.fixed[:, None], self.weights, posterior), None
 
@@ -171,25 +171,33 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     """
     task: Any = make_task(TightlyCoupledNavigation.id, "weights", scenario, **keywords)
     seeds = [seed for count in filters.values() for seed in episode_seeds("test", SEED, count)]
+    known = _Watched(task)
+    judge = task.estimated_outside() if "known mode" in filters else task
     kept: list[tuple[numpy.ndarray, ...]] = []
 
-    def record(state: Any) -> None:
-        squares = task.error(state)[:, : len(seeds)] ** 2
-        records = task.records(state)
-        P = task.covariance(state)
+    def record(episode: Any) -> None:
+        squares = judge.error(episode)[:, : len(seeds)] ** 2
+        P = judge.covariance(episode)
+        records = judge.records(episode)
+        true_mode = records["true_mode"]
+        if judge is not task:
+            # It believes the truth, and its rates never leave their apertures.
+            records["mode_probability"] = numpy.eye(len(HYPOTHESES))[true_mode].T
+            records["rate_outside_aperture"] = 0.0 * true_mode
+            records["nis"], records["nis_degrees"] = known.nis, episode.measurement.available.sum(axis=0)
         kept.append(
             (
                 numpy.stack([squares[part].sum(axis=0) for part in PARTS]),
                 (P[0, 0] + P[1, 1] + P[2, 2])[: len(seeds)],
                 records["mode_probability"][:, : len(seeds)],
-                records["true_mode"][: len(seeds)],
+                true_mode[: len(seeds)],
                 records["rate_outside_aperture"][: len(seeds)] > 0.0,
                 (records["nis"] / records["nis_degrees"])[: len(seeds)],
             )
         )
 
-    if "known mode" in filters:
-        run_reference(task, KnownMode(task), seeds, record, lambda _: None)
+    if judge is not task:
+        run_reference(task, known, seeds, record, lambda _: None)
     else:
         lanes = [FILTERS[name] for name, count in filters.items() for _ in range(count)]
         run_policy(task, _SideBySide(task, lanes), seeds, record, lambda _: None)
@@ -203,6 +211,18 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         runs[name] = Run(squares[:, lanes_of], *(s[lanes_of] for s in others))
         first += count
     return runs
+
+
+class _Watched(KnownMode):
+    """The reference, whose normalised innovation squared can be read from outside."""
+
+    nis: Any = None
+
+    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Any, Any, Any]:
+        """Keep it."""
+        mean, covariance, track = super().update(measurement, truth, memory)
+        self.nis = track.nis
+        return mean, covariance, track
 
 
 class Results(NamedTuple):
