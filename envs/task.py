@@ -393,9 +393,10 @@ class Task(ABC):
         return self._blocks.reader(name)
 
     def estimated_outside(self) -> "Task":
-        """Return this task with an :class:`OutsideBank` in place of its bank."""
+        """Return this task with an :class:`OutsideBank` in place of its bank, and nothing to observe."""
         other = copy.copy(self)
         other.bank = OutsideBank(self)
+        other._blocks, other.fields = Blocks((), (), self.xp), ()
         return other
 
     # --- what the engine calls
