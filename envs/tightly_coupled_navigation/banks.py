@@ -20,7 +20,7 @@ from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..observation import LOG1P, SIGNED_LOG, Array, Block, Quantity, scaled
 from ..task import Bank, Initial, Task
-from .parameters import HYPOTHESES, TightlyCoupledNavigationParameters
+from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
 
 if TYPE_CHECKING:
@@ -87,108 +87,63 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """Innovations of each filter by sensor, likelihoods, readings, the sky, and clock."""
+        """What each filter says by group of sensors, readings, the sky, and clock."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in HYPOTHESES]
         ranges, rates, forces, _ = task.sensors
 
-        def innovation(sensor: Any) -> Any:
-            """What has not arrived is not shown."""
-            part, sigma = sensor.readings, task.sensor_sigma[sensor.readings]
-            return lambda f, measured: measured.available[part] * f.range_innovation[part] / sigma
+        def innovation(name: str, sensor: SensorGroup) -> Block:
+            part, sigma = sensor.readings, sensor.sigma
+            return Block(
+                f"{name}_innovation", lambda f, y: y.available[part] * f.range_innovation[part] / sigma,
+                f"the {name}'s innovation at the combined prediction over sigma; 0 where it is missing",
+                slots, SIGNED_LOG,
+            )  # fmt: skip
 
-        def available(sensor: Any) -> Any:
-            return lambda f, measured: measured.available[sensor.readings]
+        def available(name: str, sensor: SensorGroup) -> Block:
+            return Block(
+                f"{name}_available", lambda f, y: y.available[sensor.readings],
+                f"1 where the {name} reached the filter", slots, over_interval="mean",
+            )  # fmt: skip
 
         return (
             Block(
-                "nis",
-                lambda f, measured: f.nis / self._present(measured),
-                "the normalised innovation squared per reading, of a group of sensors under a hypothesis",
-                each,
-                LOG1P,
-                over_interval="mean",
+                "nis", lambda f, y: f.nis / self._present(y),
+                "the normalised innovation squared per reading, of a group of sensors given those before it",
+                each, LOG1P, over_interval="mean",
             ),
             Block(
-                "average_nis",
-                lambda f, measured: f.average_nis,
-                f"the average over about {p.averaging_measurements:g} measurements of the same",
-                each,
-                LOG1P,
+                "average_nis", lambda f, y: f.average_nis,
+                f"the short average of the same, over {p.averaging_measurements:g} measurements", each, LOG1P,
             ),
             Block(
-                "log_likelihood",
-                lambda f, measured: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood minus the largest one, nats",
-                HYPOTHESES,
-                SIGNED_LOG,
+                "log_likelihood", lambda f, y: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
+                "the log-likelihood minus the largest one, nats", HYPOTHESES, SIGNED_LOG,
             ),
             Block(
-                "log_predicted",
-                lambda f, measured: f.predicted.log_probabilities,
-                "the logarithm of the predicted probability",
-                HYPOTHESES,
-                SIGNED_LOG,
+                "log_predicted", lambda f, y: f.predicted.log_probabilities,
+                "the logarithm of the predicted probability", HYPOTHESES, SIGNED_LOG,
             ),
             Block(
-                "accelerometer",
-                lambda f, measured: measured.readings[forces.readings] / p.gravity,
-                "reading",
-                ("forward", "right", "down"),
-                unit=f"{p.gravity:g} m/s^2",
+                "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
+                ("forward", "right", "down"), unit=f"{p.gravity:g} m/s^2",
             ),
+            innovation("pseudorange", ranges),
+            innovation("rate", rates),
             Block(
-                "pseudorange_innovation",
-                innovation(ranges),
-                "the pseudorange's innovation at the combined prediction over sigma; 0 where it is missing",
-                slots,
-                SIGNED_LOG,
-            ),
-            Block(
-                "rate_innovation",
-                innovation(rates),
-                "the rate's innovation at the combined prediction over sigma; 0 where it is missing",
-                slots,
-                SIGNED_LOG,
-            ),
-            Block(
-                "elevation",
-                lambda f, measured: task.elevations_at(measured.number) / (0.5 * math.pi),
-                "elevation of the satellite",
-                slots,
+                "elevation", lambda f, y: task.elevations_at(y.number) / (0.5 * math.pi), "elevation", slots,
                 unit="pi/2 rad",
             ),
+            Block("cn0", lambda f, y: y.cn0, "C/N0 less 45 dB-Hz", slots, scaled(0.1, 45.0), "10 dB-Hz"),
+            available("pseudorange", ranges),
+            available("rate", rates),
             Block(
-                "cn0",
-                lambda f, measured: measured.cn0,
-                "C/N0 less 45 dB-Hz",
-                slots,
-                scaled(0.1, 45.0),
-                "10 dB-Hz",
+                "time", lambda f, y: xp.astype(y.number, f.mean.dtype) / p.horizon,
+                "measurements so far over the horizon", unit="horizon",
             ),
-            Block(
-                "pseudorange_available",
-                available(ranges),
-                "1 where the pseudorange reached the filter",
-                slots,
-                over_interval="mean",
-            ),
-            Block(
-                "rate_available",
-                available(rates),
-                "1 where the rate reached the filter",
-                slots,
-                over_interval="mean",
-            ),
-            Block(
-                "time",
-                lambda f, measured: xp.astype(measured.number, f.mean.dtype) / p.horizon,
-                "measurements so far over the horizon",
-                unit="horizon",
-            ),
-            Block("last", lambda f, measured: f.last_action, "last action", self.actions),
-        )
+            Block("last", lambda f, y: f.last_action, "last action", self.actions),
+        )  # fmt: skip
 
     @property
     def quantities(self) -> Sequence[Quantity]:
@@ -196,18 +151,14 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         ranges, rates, *_ = self.task.sensors
         return (
             Quantity(
-                "pseudorange_innovation_in_metres",
-                "m",
-                "measured minus predicted pseudorange",
+                "pseudorange_innovation_in_metres", "m", "measured minus predicted pseudorange",
                 lambda read: ranges.sigma * read("pseudorange_innovation"),
             ),
             Quantity(
-                "rate_innovation_in_metres_per_second",
-                "m/s",
-                "measured minus predicted pseudorange rate",
+                "rate_innovation_in_metres_per_second", "m/s", "measured minus predicted pseudorange rate",
                 lambda read: rates.sigma * read("rate_innovation"),
             ),
-        )
+        )  # fmt: skip
 
     def _present(self, measurement: Measurement) -> Array:
         """Readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""

@@ -2,15 +2,28 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy
 
-from ...filters import satellites
+from ...filters import gnss_ins, satellites
 from ..parameters import TaskParameters, parameter, sized, square_matrix
 
 REST, LINE, SINGER = 0, 1, 2
 HYPOTHESES = ("rest", "constant-velocity", "singer")
 DEGREE = math.pi / 180.0
+
+
+class SensorGroup(NamedTuple):
+    """Sensors of one kind."""
+
+    name: str
+    readings: slice
+    """Where they stand among all readings."""
+    sigma: float
+    """Nominal standard deviation of each, m, m/s, m/s^2 or rad."""
+    aperture: float | None = None
+    """Distance from what they expect at which tracking loops lose them, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -193,3 +206,14 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     def site(self) -> tuple[float, float, float]:
         """Latitude and longitude, rad, and height, m."""
         return self.latitude * DEGREE, self.longitude * DEGREE, self.height
+
+    @property
+    def sensors(self) -> tuple[SensorGroup, ...]:
+        """Every group of sensors, in the order of the readings."""
+        ranges, rates, forces, angles = gnss_ins.sensor_groups(len(self.satellites))
+        return (
+            SensorGroup("pseudoranges", ranges, self.pseudorange_sigma, self.range_aperture),
+            SensorGroup("rates", rates, self.rate_sigma, self.rate_aperture),
+            SensorGroup("accelerometers", forces, self.accelerometer_sigma),
+            SensorGroup("attitude", angles, self.attitude_sigma * DEGREE),
+        )

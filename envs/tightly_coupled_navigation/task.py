@@ -16,7 +16,7 @@ adaptation time of 0.01 s must be at least one step. What is read of its motion 
 step 3 in :mod:`.banks`.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy
 
@@ -27,18 +27,6 @@ from .banks import HypothesisBank, NoiseBank
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import NavigationWorld
-
-
-class SensorGroup(NamedTuple):
-    """Sensors of one kind."""
-
-    name: str
-    readings: slice
-    """Where they stand among all readings."""
-    sigma: float
-    """Nominal standard deviation of each, m, m/s, m/s^2 or rad."""
-    aperture: float | None = None
-    """Distance from what they expect at which tracking loops lose them, in the same unit."""
 
 
 class TightlyCoupledNavigation(Task):
@@ -148,15 +136,9 @@ class TightlyCoupledNavigation(Task):
     def set_up(self) -> None:
         """List the sensors, tabulate the satellites and discretise the models."""
         p, constant = self.parameters, self.constant
-        T, S = p.sampling_interval, len(p.satellites)
-        self.satellites = S
-        parts = gnss_ins.sensor_groups(S)
-        self.sensors = (
-            SensorGroup("pseudoranges", parts[0], p.pseudorange_sigma, p.range_aperture),
-            SensorGroup("rates", parts[1], p.rate_sigma, p.rate_aperture),
-            SensorGroup("accelerometers", parts[2], p.accelerometer_sigma),
-            SensorGroup("attitude", parts[3], p.attitude_sigma * DEGREE),
-        )
+        T = p.sampling_interval
+        self.satellites = len(p.satellites)
+        self.sensors = p.sensors
         each = [s for s in self.sensors for _ in range(s.readings.start, s.readings.stop)]
         self.sensor_sigma = constant([s.sigma for s in each])[:, None]
         self.sensor_variance = [s.sigma**2 for s in each]

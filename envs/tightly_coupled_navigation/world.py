@@ -139,7 +139,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         zeros = xp.zeros_like(normals[0])
         legs, velocity = self._random_legs(draws) if p.course == "random" else self._fixed_legs(draws, zeros)
         faults = self._faults(draws)
-        # Drawn in open country too, so that the numbers of an episode stay in their places.
+        # Drawn in open country too: every scenario takes the same numbers.
         cn0 = draws.uniform("cn0", p.cn0_limits, S)
         if not p.urban:
             cn0 = p.clear_cn0 + 0.0 * cn0
@@ -168,7 +168,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
     def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array]:
         """Legs of the paper's experiment, or one that is matched to hypothesis 3, and the velocity."""
         xp, p, constant = self.xp, self.parameters, self.task.constant
-        draws.unit("legs", 15)  # nothing is drawn, but what follows keeps its place
+        # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
+        draws.unit("legs", 15)
         heading = p.heading * DEGREE
         along = (math.sin(heading), math.cos(heading), 0.0)
         right = (math.cos(heading), -math.sin(heading), 0.0)
