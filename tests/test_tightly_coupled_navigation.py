@@ -230,6 +230,19 @@ def test_fields_match_the_observation_and_are_of_order_one(scenario):
         assert abs(observation).max() < 25.0
 
 
+def test_innovations_are_read_in_their_units():
+    task = make("paper")
+    for _, measured, observation, _ in drive(task, 8, 8, 5):
+        innovation = measured.bank.range_innovation * measured.measurement.available[:8]
+        for part, name in (
+            (slice(0, 4), "pseudorange_innovation_in_metres"),
+            (slice(4, 8), "rate_innovation_in_metres_per_second"),
+        ):
+            # Through a logarithm and back.
+            read = task.reader(name)(observation.T)
+            numpy.testing.assert_allclose(read.T, innovation[part], rtol=1e-13, atol=1e-15)
+
+
 @pytest.mark.parametrize("slots", [(19,), (1, 19), (1, 11, 19), (1, 2, 11, 19, 20)])
 def test_other_numbers_of_satellites(slots):
     task = make("random", satellites=slots)

@@ -181,10 +181,11 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         records = judge.records(episode)
         true_mode = records["true_mode"]
         if judge is not task:
-            # It believes the truth, and its rates never leave their apertures.
+            # It believes the truth; nothing but apertures takes a rate away here.
+            available = episode.measurement.available
             records["mode_probability"] = numpy.eye(len(HYPOTHESES))[true_mode].T
-            records["rate_outside_aperture"] = 0.0 * true_mode
-            records["nis"], records["nis_degrees"] = known.nis, episode.measurement.available.sum(axis=0)
+            records["rate_outside_aperture"] = 1.0 - available[task.sensors[1].readings].min(axis=0)
+            records["nis"], records["nis_degrees"] = known.nis, available.sum(axis=0)
         kept.append(
             (
                 numpy.stack([squares[part].sum(axis=0) for part in PARTS]),
