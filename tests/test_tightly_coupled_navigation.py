@@ -2,17 +2,20 @@
 
 import numpy
 import pytest
-from filtergym.envs.tightly_coupled_navigation import task as navigation
+from filtergym.envs.task import Episode
+from filtergym.envs.tightly_coupled_navigation.parameters import (
+    SINGER,
+    TightlyCoupledNavigationParameters,
+)
 from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
-from filtergym.envs.tightly_coupled_navigation.task import Parameters, TightlyCoupledNavigation
-from filtergym.filters import gnss_ins
-from naive import dense
+from filtergym.envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
+from filtergym.filters import extended_kalman, gnss_ins
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
 
 
 def make(scenario, control="evidence", xp=numpy, **keywords):
-    parameters = Parameters(**{**SCENARIOS[scenario].parameters, **keywords})
+    parameters = TightlyCoupledNavigationParameters(**{**SCENARIOS[scenario].parameters, **keywords})
     return TightlyCoupledNavigation(parameters, control, xp)
 
 
@@ -41,7 +44,7 @@ def drive(task, N, seed, steps, action=None, kind=numpy.asarray):
 
 
 def singer(k, observation, state):
-    return numpy.full(state.clock.shape, navigation.SINGER)
+    return numpy.full(state.truth.step.shape, SINGER)
 
 
 def naive_bank(task, state, posterior):
@@ -59,13 +62,15 @@ def naive_bank(task, state, posterior):
             for w, m, c in zip(weight, means, covariances, strict=True)
         )
         F = gnss_ins.advance(
-            numpy.eye(17)[:, :, None, None], task.axis[:, :, i : i + 1], p.T, task.common.decay
+            numpy.eye(17)[:, :, None, None], task.axis[:, :, i : i + 1], task.common.T, task.common.decay
         )[..., 0, 0]
         mean, P = F @ mean, F @ P @ F.T + task.process_noise[:, :, i, 0]
-        position, velocity = task.satellites_now(state)
-        expected, rows = gnss_ins.observe(mean[:, None], position, velocity, state.ins_angles, p.gravity)
-        H = dense(rows, mean[:, None])[..., 0]
-        nu = (state.measurement - expected)[:, 0]
+        said = state.measurement
+        expected, rows = gnss_ins.observe(
+            mean[:, None], said.satellite_position, said.satellite_velocity, said.ins_angles, p.gravity
+        )
+        H = extended_kalman.dense(rows, mean[:, None])[..., 0]
+        nu = (said.readings - expected)[:, 0]
         R = numpy.diag(task.sensor_variance)
         S = H @ P @ H.T + R
         log_likelihoods.append(
@@ -87,34 +92,34 @@ def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
     posterior = None
     for _, measured, _, state in drive(task, 1, seed, 60):
         if posterior is None:
-            start = task.begin(*numbers(task, 1, seed, 0)[:2])
+            start = task.begin(*numbers(task, 1, seed, 0)[:2]).bank
             posterior = (
-                list(start.bank_mean[..., 0].T),
-                [start.bank_covariance[:, :, i, 0] for i in range(3)],
+                list(start.means[..., 0].T),
+                [start.covariances[:, :, i, 0] for i in range(3)],
                 start.probabilities[:, 0],
             )
         posterior, estimate = naive_bank(task, measured, posterior)
         # The information form inverts a covariance with a condition near 1e11; the mixture amplifies it.
-        numpy.testing.assert_allclose(state.estimate[:, 0], estimate, rtol=1e-6, atol=1e-5)
-        numpy.testing.assert_allclose(state.probabilities[:, 0], posterior[2], atol=1e-5)
+        numpy.testing.assert_allclose(state.bank.mean[:, 0], estimate, rtol=1e-6, atol=1e-5)
+        numpy.testing.assert_allclose(state.bank.probabilities[:, 0], posterior[2], atol=1e-5)
 
 
 def test_controls_that_ask_for_the_paper_get_it_bit_for_bit():
     steps = 40
     *_, (*_, evidence) = drive(make("random", "evidence"), 8, 3, steps)
     *_, (*_, gain) = drive(make("random", "gain"), 8, 3, steps)
-    assert (evidence.estimate == gain.estimate).all()
-    assert (evidence.covariance == gain.covariance).all()
+    assert (evidence.bank.mean == gain.bank.mean).all()
+    assert (evidence.bank.covariance == gain.bank.covariance).all()
 
 
 def test_weights_that_state_the_probabilities_follow_the_paper():
     paper = make("random")
-    probabilities = [s.probabilities for *_, s in drive(paper, 8, 3, 30)]
+    probabilities = [s.bank.probabilities for *_, s in drive(paper, 8, 3, 30)]
     told = make("random", "weights")
-    by_weights = [s.estimate for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
+    by_weights = [s.bank.mean for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
     for estimate, (*_, state) in zip(by_weights, drive(paper, 8, 3, 30), strict=True):
         # Normalising weights that already sum to one moves the last digit.
-        numpy.testing.assert_allclose(estimate, state.estimate, rtol=1e-9, atol=1e-9)
+        numpy.testing.assert_allclose(estimate, state.bank.mean, rtol=1e-9, atol=1e-9)
 
 
 def test_truth_and_noise_do_not_depend_on_the_control():
@@ -127,8 +132,8 @@ def test_truth_and_noise_do_not_depend_on_the_control():
         *_, (*_, state) = drive(make("random", control), 8, 4, 30, action)
         ends.append(state)
     for other in ends[1:]:
-        assert (other.truth == ends[0].truth).all()
-        assert (other.measurement == ends[0].measurement).all()
+        assert (other.truth.state == ends[0].truth.state).all()
+        assert (other.measurement.readings == ends[0].measurement.readings).all()
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -156,38 +161,63 @@ def test_lanes_may_stand_at_different_times():
         ahead = task.act(task.measure(ahead, row), zero)
     fresh = task.begin(uniforms, normals)
     mask = numpy.arange(8) < 4
-    mixed = type(ahead)(*(numpy.where(mask, a, b) for a, b in zip(ahead, fresh, strict=True)))
+
+    def chosen(a, b):
+        if isinstance(a, tuple):
+            return type(a)(*(chosen(*parts) for parts in zip(a, b, strict=True)))
+        return numpy.where(mask, a, b)
+
+    mixed = Episode(chosen(ahead.truth, fresh.truth), None, chosen(ahead.bank, fresh.bank))
     both = task.measure(mixed, rows[5])
     for lanes, alone in ((mask, task.measure(ahead, rows[5])), (~mask, task.measure(fresh, rows[5]))):
         assert (task.observe(both)[:, lanes] == task.observe(alone)[:, lanes]).all()
 
 
-class AnotherTruth(TightlyCoupledNavigation):
-    """Replays recorded measurements over a truth that is somewhere else."""
-
-    tape = ()
-
-    def move(self, state, k, normals):
-        truth, mode, jump = super().move(state, k, normals)
-        return 1.3 * truth + 17.0, (mode + 1) % 3, 1.0 - jump
-
-    def sense(self, state, noise):
-        step = self.tape[int(state.clock[0]) - 1]
-        names = ("measurement", "ins_angles", "available", "cn0")
-        return state._replace(noise_factor=7.0 * state.noise_factor, **dict(zip(names, step, strict=True)))
-
-
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 @pytest.mark.parametrize("scenario", ["random", "two-satellites", "urban", "paper"])
 def test_no_truth_in_the_observation(scenario, control):
-    honest = make(scenario, control)
-    seen = list(drive(honest, 8, 7, 30))
-    other = AnotherTruth(honest.parameters, control)
-    other.tape = [(s.measurement, s.ins_angles, s.available, s.cn0) for _, s, _, _ in seen]
-    for (_, _, observation, state), (_, _, same, elsewhere) in zip(seen, drive(other, 8, 7, 30), strict=True):
-        assert (observation == same).all()
-        assert (state.estimate == elsewhere.estimate).all()
-        assert (state.truth != elsewhere.truth).any()
+    """The measurements alone, replayed over no truth at all, give the same observations and estimates."""
+    task = make(scenario, control)
+    start = task.begin(*numbers(task, 8, 7, 0)[:2]).measurement
+    state = Episode(None, start, task.bank.start(start))
+    for _, measured, observation, after in drive(task, 8, 7, 30):
+        bank = task.bank.predict(state.bank, measured.measurement)
+        state = Episode(None, measured.measurement, bank)
+        assert (task.observe(state) == observation).all()
+        state = task.act(state, numpy.zeros((ZERO[control], 8)))
+        assert (task.mean(state) == task.mean(after)).all()
+
+
+@pytest.mark.parametrize("hidden", ["noise_factor", "stuck", "mode", "jumped"])
+def test_what_the_sensors_hide_is_not_measured(hidden):
+    """A truth that differs in what nobody is told, in a step where it has no effect, measures alike."""
+    task = make("random", stick_probability=0.0, rate_fault_probability=0.0)
+    uniforms, normals, rows = numbers(task, 8, 7, 2)
+    first, second = rows
+    truth = task.measure(task.begin(uniforms, normals), first).truth
+    other = truth._replace(**{hidden: 1 + getattr(truth, hidden)})
+    (_, said), (_, same) = (task.world.advance(t, second, None) for t in (truth, other))
+    for name, value in said._asdict().items():
+        numpy.testing.assert_array_equal(value, getattr(same, name), err_msg=name)
+
+
+@pytest.mark.parametrize("control", ["evidence", "gain"])
+def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
+    task = make("paper", control)
+    *_, (_, _, _, state) = drive(task, 8, 7, 5)
+    expected = task.bank.feedback(state.bank)
+    row = numpy.zeros((task.noise.normals, 8))
+    far = expected.copy()
+    far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
+    far[3, 4:] += 300.0  # clock bias, m: more than the ranges' aperture
+    for feedback, rates, ranges in ((None, 1.0, 1.0), (expected, 1.0, 1.0), (far, 0.0, 0.0)):
+        _, said = task.world.advance(state.truth, row, feedback)
+        assert (said.available[4:8, :4] == rates).all()
+        assert (said.available[:4, 4:] == ranges).all()
+        assert (said.available[:4, :4] == 1.0).all()
+        assert (said.available[4:8, 4:] == 1.0).all()
+        assert (said.available[8:] == 1.0).all()
+    assert make("matched", control).bank.feedback(state.bank) is None
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -200,16 +230,29 @@ def test_fields_match_the_observation_and_are_of_order_one(scenario):
         assert abs(observation).max() < 25.0
 
 
+def test_innovations_are_read_in_their_units():
+    task = make("paper")
+    for _, measured, observation, _ in drive(task, 8, 8, 5):
+        innovation = measured.bank.range_innovation * measured.measurement.available[:8]
+        for part, name in (
+            (slice(0, 4), "pseudorange_innovation_in_metres"),
+            (slice(4, 8), "rate_innovation_in_metres_per_second"),
+        ):
+            # Through a logarithm and back.
+            read = task.reader(name)(observation.T)
+            numpy.testing.assert_allclose(read.T, innovation[part], rtol=1e-13, atol=1e-15)
+
+
 @pytest.mark.parametrize("slots", [(19,), (1, 19), (1, 11, 19), (1, 2, 11, 19, 20)])
 def test_other_numbers_of_satellites(slots):
     task = make("random", satellites=slots)
     *_, (*_, observation, state) = drive(task, 8, 9, 60)
     assert observation.shape[0] == len(task.fields)
     assert numpy.isfinite(task.cost(state)).all()
-    sigma = numpy.sqrt(numpy.einsum("iin->in", state.covariance)[:3]).mean()
+    sigma = numpy.sqrt(numpy.einsum("iin->in", state.bank.covariance)[:3]).mean()
     full = make("random")
     *_, (*_, reference) = drive(full, 8, 9, 60)
-    better = sigma < numpy.sqrt(numpy.einsum("iin->in", reference.covariance)[:3]).mean()
+    better = sigma < numpy.sqrt(numpy.einsum("iin->in", reference.bank.covariance)[:3]).mean()
     assert better == (len(slots) > 4)
 
 
@@ -233,41 +276,41 @@ def test_other_numbers_of_satellites(slots):
 )
 def test_bad_parameters_are_refused_with_the_reason(keywords, message):
     with pytest.raises(ValueError, match=message):
-        Parameters(**keywords)
+        TightlyCoupledNavigationParameters(**keywords)
 
 
 def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
     task = make("random", stick_probability=0.0, rate_fault_probability=0.0)
     *_, (_, measured, _, _) = drive(task, 8, 10, 5)
-    thrown = measured.measurement.copy()
+    thrown = measured.measurement.readings.copy()
     thrown[4:8] += 8.0  # 80 sigma of four rates
-    measured = measured._replace(measurement=thrown)
-    update = task._update(measured, task.sensor_variance)
-    assert (update.log_likelihood < -2800.0).any()
-    state = task.act(measured._replace(log_likelihood=update.log_likelihood), numpy.zeros((3, 8)))
-    numpy.testing.assert_allclose(state.probabilities.sum(axis=0), 1.0, rtol=1e-15)
-    winner = (measured.log_predicted + update.log_likelihood).argmax(axis=0)
-    assert (state.probabilities.argmax(axis=0) == winner).all()
-    assert (state.probabilities.max(axis=0) > 0.5).all()
+    bank = task.bank.predict(measured.bank, measured.measurement._replace(readings=thrown))
+    assert (bank.log_likelihood < -2800.0).any()
+    probabilities = task.bank.act(bank, measured.measurement, numpy.zeros((3, 8))).probabilities
+    numpy.testing.assert_allclose(probabilities.sum(axis=0), 1.0, rtol=1e-15)
+    winner = (bank.predicted.log_probabilities + bank.log_likelihood).argmax(axis=0)
+    assert (probabilities.argmax(axis=0) == winner).all()
+    assert (probabilities.max(axis=0) > 0.5).all()
 
 
 def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     task = make("random", stick_probability=1.0, rate_fault_probability=1.0, satellites_outage=2.0)
     previous, noisy, stuck, out = None, 0, 0, 0
-    for k, s, _, _ in drive(task, 8, 11, 600):
+    for k, state, _, _ in drive(task, 8, 11, 600):
+        s, said = state.truth, state.measurement
         noisy = noisy + (s.noise_factor[4:8] == 5.0).sum(axis=0)
         assert (s.noise_factor[:4] == 1.0).all()
-        held = (s.clock >= s.stick[0]) & (s.clock <= s.stick[1]) & (k > 1)
+        held = (s.step >= s.faults.stuck[0]) & (s.step <= s.faults.stuck[1]) & (k > 1)
         assert (held == (s.stuck == 1.0)).all()
         if previous is not None:
-            same = (s.measurement[8:11] == previous.measurement[8:11]).all(axis=0)
+            same = (said.readings[8:11] == previous.readings[8:11]).all(axis=0)
             assert (same == held).all()
         stuck = stuck + held
-        missing = 4 - s.available[:4].sum(axis=0)
-        assert (s.available[:4] == s.available[4:8]).all()
+        missing = 4 - said.available[:4].sum(axis=0)
+        assert (said.available[:4] == said.available[4:8]).all()
         assert set(missing) <= {0.0, 2.0}
         out = out + (missing == 2.0)
-        previous = s
+        previous = said
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()
@@ -277,31 +320,35 @@ def test_urban_errors_have_the_stated_quantiles():
     task = make("urban")
     rng = numpy.random.default_rng(12)
     N = 40000
-    state = task.begin(rng.random((task.noise.uniforms, 8)), rng.standard_normal((17, 8)))
+    truth = task.begin(rng.random((task.noise.uniforms, 8)), rng.standard_normal((17, 8))).truth
     wide = numpy.zeros((4, N))
+
+    def noise():
+        return numpy.concatenate([wide, rng.standard_normal((4, N)), rng.random((4, N))])
+
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
-        s = state._replace(cn0=wide + cn0, multipath=wide, hold=wide)
-        s = task._multipath(s, wide, rng.standard_normal((4, N)), rng.random((4, N)))
+        s = truth._replace(cn0=wide + cn0, multipath=wide, hold=wide)
+        s = task.world._reflected(s, noise())
         assert (s.multipath >= 0.0).all()
         # 160,000 draws: four standard errors of the quantiles.
         assert numpy.median(s.multipath) == pytest.approx(median, abs=0.02 * median + 0.15)
         assert numpy.quantile(s.multipath, 0.95) == pytest.approx(upper, rel=0.03)
         assert s.hold.min() >= 48.0
         assert s.hold.max() <= 199.0
-        held = task._multipath(s, wide, rng.standard_normal((4, N)), rng.random((4, N)))
+        held = task.world._reflected(s, noise())
         assert (held.multipath == s.multipath).all()
 
 
 def test_random_course_has_every_leg_and_bounded_strength():
     task = make("random")
     rng = numpy.random.default_rng(13)
-    s = task.begin(rng.random((task.noise.uniforms, 512)), rng.standard_normal((17, 512)))
-    kinds = s.leg_kind
+    legs = task.begin(rng.random((task.noise.uniforms, 512)), rng.standard_normal((17, 512))).truth.legs
+    kinds = legs.kind
     assert set(numpy.unique(kinds[0])) == {0.0, 1.0}
     assert set(numpy.unique(kinds[1:])) == {1.0, 2.0}
-    strength = numpy.linalg.norm(s.leg_acceleration, axis=0)
+    strength = numpy.linalg.norm(legs.acceleration, axis=0)
     assert ((strength <= 40.0 + 1e-12) & ((strength >= 2.0 - 1e-12) == (kinds == 2.0))).all()
-    lengths = numpy.diff(s.leg_start, axis=0)
+    lengths = numpy.diff(legs.start, axis=0)
     assert lengths.min() >= 100
     assert lengths.max() <= 300
 
@@ -313,7 +360,7 @@ def test_torch_rolls_out_as_numpy_does(torch):
         for (_, _, seen, state), (_, _, also, other) in zip(a, b, strict=True):
             # Elementary functions differ in the last place; the bank multiplies that.
             numpy.testing.assert_allclose(also.numpy(), seen, rtol=1e-6, atol=1e-6)
-            numpy.testing.assert_allclose(other.estimate.numpy(), state.estimate, rtol=1e-7, atol=1e-7)
+            numpy.testing.assert_allclose(other.bank.mean.numpy(), state.bank.mean, rtol=1e-7, atol=1e-7)
 
 
 def test_gradient_from_cost_to_action(torch):
@@ -386,7 +433,7 @@ def test_reference_table_of_the_adaptive_filter():
     assert ((first >= 1) & (first <= 3)).all()
     assert 1.5 < first.mean() < 2.5
     assert (second == 1).all()
-    P = numpy.moveaxis(state.bank_covariance, (0, 1), (-2, -1))
+    P = numpy.moveaxis(state.bank.covariances, (0, 1), (-2, -1))
     sigma = numpy.sqrt(numpy.diagonal(P, axis1=-2, axis2=-1))
     # Positive definite after 3000 steps: smallest eigenvalue of the correlations.
     assert numpy.linalg.eigvalsh(P / (sigma[..., None] * sigma[..., None, :])).min() > 0.1
@@ -427,7 +474,7 @@ def test_matched_filter_is_consistent():
         if k >= 200:
             nis.append(task.records(state)["nis"].mean() / 14)
             if k % 20 == 0:
-                error, P = task.error(state).T, numpy.moveaxis(state.covariance, -1, 0)
+                error, P = task.error(state).T, numpy.moveaxis(state.bank.covariance, -1, 0)
                 nees.append((error * numpy.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 17)
     means = numpy.mean(nees, axis=0)
     assert abs(means.mean() - 1.0) < 4.0 * means.std() / numpy.sqrt(N)

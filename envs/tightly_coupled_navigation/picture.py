@@ -18,16 +18,9 @@ from ..rendering import (
     Strip,
     grown,
 )
-from ..task import Task
-from .task import (
-    GROUPS,
-    HYPOTHESES,
-    LINE,
-    REST,
-    SINGER,
-    State,
-    TightlyCoupledNavigation,
-)
+from ..task import Episode, Task
+from .parameters import HYPOTHESES, LINE, REST, SINGER
+from .task import TightlyCoupledNavigation
 
 COURSE = (0.065, 0.53, 0.43, 0.37)
 MOTION = (0.125, 0.29, 0.37, 0.15)
@@ -58,15 +51,15 @@ class TightlyCoupledNavigationPicture(Picture):
 
     # --- the history
 
-    def records(self, state: State) -> dict[str, float]:
+    def records(self, state: Episode) -> dict[str, float]:
         """Positions in m, accelerations, weights, factors, innovations, errors."""
-        S, lane = self.task.satellites, 0
-        error = self.task.error(state)[:, lane]
-        P = numpy.diagonal(self.task.covariance(state)[:, :, lane])
-        truth, estimate = state.truth[:, lane], state.estimate[:, lane]
-        innovation = state.range_innovation[:, lane] / self.task.sensor_sigma[: 2 * S, 0]
-        innovation = numpy.where(state.available[: 2 * S, lane] > 0.0, innovation, 0.0)
-        if state.clock[lane] <= 1:
+        task, bank, S, lane = self.task, state.bank, self.task.satellites, 0
+        error = task.error(state)[:, lane]
+        P = numpy.diagonal(task.covariance(state)[:, :, lane])
+        truth, estimate = state.truth.state[:, lane], bank.mean[:, lane]
+        innovation = bank.range_innovation[:, lane] / task.sensor_sigma[task.tracked, 0]
+        innovation = numpy.where(state.measurement.available[task.tracked, lane] > 0.0, innovation, 0.0)
+        if state.measurement.number[lane] <= 1:
             # The receiver clock is not known yet: hundreds of sigma that would hide all that follow.
             innovation = numpy.full_like(innovation, numpy.nan)
         values = {
@@ -83,34 +76,31 @@ class TightlyCoupledNavigationPicture(Picture):
             "range_innovation": float(numpy.abs(innovation[:S]).max()),
             "rate_innovation": float(numpy.abs(innovation[S:]).max()),
         }
-        values |= {f"weight.{i}": state.probabilities[i, lane] for i in range(len(HYPOTHESES))}
-        if self.task.control == "gain":
-            values |= {f"gain.{i}": state.last_action[i, lane] for i in range(len(GROUPS))}
+        values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
+        if task.control == "gain":
+            values |= {f"gain.{i}": bank.last_action[i, lane] for i in range(len(task.sensors))}
         return {name: float(value) for name, value in values.items()}
 
-    def begin(self, state: State) -> None:
+    def begin(self, state: Episode) -> None:
         """Look ahead when the user manoeuvres and when sensors fail: that does not depend on noise."""
-        task = self.task
-        still = numpy.zeros((task.noise.normals + task.noise.row_uniforms, state.clock.shape[-1]))
+        task, truth = self.task, state.truth
+        still = numpy.zeros((task.noise.normals + task.noise.row_uniforms, truth.step.shape[-1]))
         modes = []
         flags: list[list[bool]] = [[] for _ in FAULTS]
-        S = task.satellites
         for _ in range(task.horizon):
-            modes.append(int(state.mode[0]))
-            out = state.outage[:, 0]
-            k = float(state.clock[0])
+            modes.append(int(truth.mode[0]))
+            hidden, no_rates = truth.faults.hidden[:, 0], truth.faults.no_rates[:, 0]
+            k = float(truth.step[0])
             happening = (
-                out[2] <= k <= out[3],
-                out[0] <= k <= out[1],
-                (state.noise_factor[S : 2 * S, 0] > 1.0).any(),
-                state.stuck[0] > 0.0,
+                hidden[0] <= k <= hidden[1],
+                no_rates[0] <= k <= no_rates[1],
+                (truth.noise_factor[:, 0] > 1.0).any(),
+                truth.stuck[0] > 0.0,
             )
             for flag, now in zip(flags, happening, strict=True):
                 flag.append(bool(now))
             # Only the truth and the sensors: the filters would take a hundred times as long.
-            clock = state.clock + 1
-            truth, mode, jump = task.move(state, clock.astype(float), still[:17])
-            state = task.sense(state._replace(clock=clock, truth=truth, mode=mode, jump=jump), still[17:])
+            truth, _ = task.world.advance(truth, still, None)
         self.motions = [_runs([mode == i for mode in modes]) for i in (REST, LINE, SINGER)]
         self.faults = [_runs(flag) for flag in flags]
 
@@ -122,7 +112,7 @@ class TightlyCoupledNavigationPicture(Picture):
         weights = {name: f"weight.{i}" for i, name in enumerate(names)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
         if self.task.control == "gain":
-            gains = {name: f"gain.{i}" for i, name in enumerate(GROUPS)}
+            gains = {sensor.name: f"gain.{i}" for i, sensor in enumerate(self.task.sensors)}
             steered.append(
                 Strip(
                     "action",
@@ -229,7 +219,7 @@ class TightlyCoupledNavigationPicture(Picture):
         half = 0.5 * metres_per_inch * FIGURE_SIZE[1] * COURSE[3]
         self.course.set_ylim(0.5 * (south + north) - half, 0.5 * (south + north) + half)
 
-    def draw(self, history: History, state: State) -> None:
+    def draw(self, history: History, state: Episode) -> None:
         """Move everything to where it is now."""
         nothing = numpy.empty(0)
         pairs = {}

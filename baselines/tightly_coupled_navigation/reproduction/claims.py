@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy
 
-from ....envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER
+from ....envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...reproduction import Claim, Grid, Verdict, verdict_of
 from ...reproduction.measured import Measured, measured
 from .experiment import (

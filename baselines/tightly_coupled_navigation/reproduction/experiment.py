@@ -6,15 +6,17 @@ from typing import Any, NamedTuple
 import numpy
 
 from ....envs.catalogue import make_task
-from ....envs.controls import signed_exponential
-from ....envs.task import Task
-from ....envs.tightly_coupled_navigation.task import HYPOTHESES, LINE, REST, SINGER, TightlyCoupledNavigation
+from ....envs.task import Episode, Outside, Task
+from ....envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from ....envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ....evaluation.competitors import Policy
 from ....evaluation.seeds import episode_seeds
 from ....filters import gnss_ins, imm
 from ...reproduction import Progress
 from ...reproduction.measured import Measured, means, measured, recorded
-from ..policies import KnownMode, chain, lasting, switches
+from ..metrics import lasting, switches
+from ..policies import chain
+from ..references import KnownMode
 
 EPISODES = 100
 FEW = 40
@@ -122,16 +124,14 @@ class _SideBySide(Policy):
 
     def __init__(self, task: Task, lanes: Sequence[int | None]) -> None:
         super().__init__(task)
-        self.log_likelihood = task.columns([f"log_likelihood_{h}" for h in HYPOTHESES])
-        self.log_predicted = task.columns([f"log_predicted_{h}" for h in HYPOTHESES])
+        self.log_likelihood, self.log_predicted = task.reader("log_likelihood"), task.reader("log_predicted")
         self.fixed = numpy.array([lane is not None for lane in lanes])
         self.weights = numpy.array([numpy.eye(len(HYPOTHESES))[lane or 0] for lane in lanes])
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """State posterior probabilities, or certainty."""
         posterior = imm.mode_posterior(
-            signed_exponential(observation[:, self.log_predicted], numpy).T,
-            signed_exponential(observation[:, self.log_likelihood], numpy).T,
+            self.log_predicted(observation).T, self.log_likelihood(observation).T
         ).T
         return numpy.where(self.fixed[:, None], self.weights, posterior), None
 
@@ -147,8 +147,16 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     task: Any = make_task(TightlyCoupledNavigation.id, "weights", scenario, **keywords)
     seeds = [seed for count in filters.values() for seed in episode_seeds("test", SEED, count)]
 
-    def fields(state: Any) -> dict[str, numpy.ndarray]:
-        squares, records, P = task.error(state) ** 2, task.records(state), task.covariance(state)
+    known = _Watched(task)
+
+    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+        squares, records, P = task.error(episode) ** 2, task.records(episode), task.covariance(episode)
+        if isinstance(episode.bank, Outside):
+            # The reference believes the truth; nothing but apertures takes a rate away here.
+            available = episode.measurement.available
+            records["mode_probability"] = numpy.eye(len(HYPOTHESES))[records["true_mode"]].T
+            records["rate_outside_aperture"] = 1.0 - available[task.sensors[1].readings].min(axis=0)
+            records["nis"], records["nis_degrees"] = known.nis, available.sum(axis=0)
         return {
             "squares": numpy.stack([squares[part].sum(axis=0) for part in PARTS]),
             "variance": P[0, 0] + P[1, 1] + P[2, 2],
@@ -159,12 +167,24 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         }
 
     lanes = [FILTERS.get(name) for name, count in filters.items() for _ in range(count)]
-    actor = KnownMode(task) if "known mode" in filters else _SideBySide(task, lanes)
+    actor = known if "known mode" in filters else _SideBySide(task, lanes)
     run = Run(**recorded(task, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
         name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)
     }
+
+
+class _Watched(KnownMode):
+    """The reference, whose normalised innovation squared can be read from outside."""
+
+    nis: Any = None
+
+    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Any, Any, Any]:
+        """Keep it."""
+        mean, covariance, track = super().update(measurement, truth, memory)
+        self.nis = track.nis
+        return mean, covariance, track
 
 
 class Results(NamedTuple):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy
 
-from ....envs.tightly_coupled_navigation.task import HYPOTHESES
+from ....envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ....evaluation.figures import styles
 from ...reproduction.measured import means
 from ...reproduction.panels import draw, finish, legend_outside, looks, panels, shade

@@ -1,0 +1,160 @@
+"""What is measured of TightlyCoupledNavigation beside the metrics of every environment."""
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy
+import xarray
+
+from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
+from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.metrics import Measure, squared_errors
+
+LASTING = 10
+"""Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
+
+
+def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -> Estimate:
+    """Ratio of means over episodes, with its interval."""
+    with numpy.errstate(divide="ignore", invalid="ignore"):
+        return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
+
+
+def quantile(
+    bootstrap: Bootstrap, values: numpy.ndarray, share: float, chosen: numpy.ndarray | None = None
+) -> Estimate:
+    """Quantile over the chosen episodes (default: all), with its interval.
+
+    The smallest value that at least ``share`` of the chosen weight does not exceed.
+
+    Args:
+        bootstrap: of the episodes.
+        values: ``(episodes,)``.
+        share: such as 0.5 for the median.
+        chosen: ``(episodes,)`` booleans.
+    """
+    chosen = numpy.ones(len(values), dtype=bool) if chosen is None else chosen
+    order = numpy.argsort(numpy.where(chosen, values, numpy.inf))
+    weights = numpy.cumsum((bootstrap.weights * chosen)[:, order], axis=1)
+    # Rounding of the sums must not move a share that is met exactly.
+    enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
+    found = numpy.where(weights[:, -1] > 0.0, values[order][enough.argmax(axis=1)], numpy.nan)
+    return bootstrap.interval(found)
+
+
+def lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
+    """Where a condition begins to hold for some steps in a row; false where the end is too near.
+
+    Args:
+        condition: ``(episodes, time)`` booleans.
+        steps: how many.
+    """
+    sums = numpy.cumsum(numpy.pad(condition, ((0, 0), (1, 0))), axis=1)
+    held = numpy.zeros_like(condition)
+    if condition.shape[1] >= steps:
+        held[:, : condition.shape[1] - steps + 1] = sums[:, steps:] - sums[:, :-steps] == steps
+    return held
+
+
+class Switch(NamedTuple):
+    """One change of the true hypothesis."""
+
+    episode: int
+    before: int
+    after: int
+    wait: float
+    """Steps until the new hypothesis is believed, the first one counted; infinite where it never is."""
+
+
+def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switch]:
+    """Every change of the true hypothesis and how long the bank took to follow it.
+
+    A hypothesis is believed from the first step on which its probability exceeds one half and does so for
+    ``LASTING`` steps (or until the next change, if that comes sooner).
+
+    Args:
+        true_mode: ``(episodes, time)`` integers.
+        probability: ``(episodes, time, M)``.
+    """
+    found = []
+    length = true_mode.shape[1]
+    for episode, at in zip(*numpy.nonzero(numpy.diff(true_mode, axis=1)), strict=True):
+        first = int(at) + 1
+        before, after = int(true_mode[episode, at]), int(true_mode[episode, first])
+        others = numpy.flatnonzero(true_mode[episode, first:] != after)
+        last = first + int(others[0]) if len(others) else length
+        believed = probability[episode, first:last, after] > 0.5
+        held = lasting(believed[None], min(LASTING, last - first))[0]
+        wait = float(held.argmax()) + 1.0 if held.any() else math.inf
+        found.append(Switch(int(episode), before, after, wait))
+    return found
+
+
+def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
+    """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
+
+    ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
+    whose mean a few lost tracks rule; ``nis_per_degree``, mean NIS over the mean number of observations, 1
+    for a consistent filter; ``adaptation_time`` (mean) from the first step that carries a new motion to the
+    first on which its hypothesis has more than one half and keeps it for ten steps, and
+    ``adaptation_censored``, the share of switches where that never comes; ``track_loss_rate`` and
+    ``track_loss_time`` (median of the tracks lost) of ten steps in a row with a pseudorange rate further than
+    the aperture from the combined prediction, from the first change of motion on. Those from ``nis_per_degree``
+    on need the records of a bank: references have none.
+    """
+    if numpy.isnan(run["cost"].values).all():
+        return []  # a bound
+    measures = list(_errors(run, bootstrap))
+    if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
+        measures += _of_bank(run, bootstrap)
+    return measures
+
+
+def _errors(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
+    true_mode = run["true_mode"].values.astype(int)
+    for component, unit in (("position", "m"), ("velocity", "m/s")):
+        squares = squared_errors(run, component, run.attrs["groups"])
+        for i, name in enumerate(HYPOTHESES):
+            there = true_mode == i
+            if there.any():
+                value = _ratio(bootstrap, (squares * there).mean(axis=1), there.mean(axis=1))
+                root = Estimate(*(math.sqrt(v) for v in value))
+                yield Measure("rmse_by_hypothesis", f"{component} {name}", "all", root, unit)
+    cost = run["cost"].values.mean(axis=1)
+    yield Measure("cost_median", "", "all", quantile(bootstrap, cost, 0.5), "1")
+    yield Measure("cost_95_quantile", "", "all", quantile(bootstrap, cost, 0.95), "1")
+
+
+def _of_bank(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
+    true_mode = run["true_mode"].values.astype(int)
+    step = float(run["seconds"].values[0, 0])
+    for window, (first, last) in run.attrs["windows"].items():
+        times = slice(first - 1, last)
+        nis = run["nis"].values[:, times].mean(axis=1)
+        degrees = run["nis_degrees"].values[:, times].mean(axis=1)
+        yield Measure("nis_per_degree", "", window, _ratio(bootstrap, nis, degrees), "1")
+
+    episodes = len(true_mode)
+    changes = switches(true_mode, run["mode_probability"].values)
+    for before, after in sorted({(s.before, s.after) for s in changes}):
+        count, missed, total = numpy.zeros(episodes), numpy.zeros(episodes), numpy.zeros(episodes)
+        for s in changes:
+            if (s.before, s.after) == (before, after):
+                count[s.episode] += 1.0
+                missed[s.episode] += not math.isfinite(s.wait)
+                total[s.episode] += s.wait * step if math.isfinite(s.wait) else 0.0
+        name = f"{HYPOTHESES[before]} to {HYPOTHESES[after]}"
+        if (missed < count).any():
+            yield Measure("adaptation_time", name, "all", _ratio(bootstrap, total, count - missed), "s")
+        yield Measure("adaptation_censored", name, "all", _ratio(bootstrap, missed, count), "1")
+
+    moved = true_mode != true_mode[:, :1]
+    begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
+    in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
+    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
+    lost = numpy.asarray(outside.any(axis=1))
+    yield Measure("track_loss_rate", "", "all", bootstrap.estimate(lost.astype(float)), "1")
+    if lost.any():
+        time = (outside.argmax(axis=1) - begin + 1.0) * step
+        yield Measure("track_loss_time", "", "all", quantile(bootstrap, time, 0.5, lost), "s")

@@ -1,0 +1,234 @@
+"""Policies of TightlyCoupledNavigation, and what they are compared with.
+
+The paper is Moroz, adaptive multi-hypothesis measurer of an inertial-satellite navigation system; readings are
+those of the task.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import numpy
+
+from ...envs.task import Task
+from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
+from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ..table import Baselines, Tunable
+from .metrics import metrics
+from .references import KnownMode, KnownModeBound
+
+
+class MultiHypothesis(ConstantPolicy):
+    """The paper's algorithm, steps 1 to 8: nothing added to Bayes' rule."""
+
+    control = "evidence"
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.action = task.paper_policy.action
+
+
+def chain(stay: float) -> tuple[tuple[float, ...], ...]:
+    """Transition matrix of the hypotheses that stays with one probability and leaves for all others alike."""
+    leave = (1.0 - stay) / (len(HYPOTHESES) - 1)
+    return tuple(
+        tuple(stay if i == j else leave for j in range(len(HYPOTHESES))) for i in range(len(HYPOTHESES))
+    )
+
+
+class Sticky(MultiHypothesis):
+    """The paper's algorithm over a chain that leaves a hypothesis once in 100 s, not once in 5 s.
+
+    The chain belongs to the bank, so an evaluation sets the task's ``transition``; elsewhere set it yourself.
+    """
+
+    task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
+
+
+class _OneHypothesis(Policy):
+    """One filter whose model never changes."""
+
+    control = "mode"
+    hypothesis: ClassVar[int]
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Name the hypothesis for every episode."""
+        return numpy.full(len(observation), self.hypothesis), None
+
+
+class Rest(_OneHypothesis):
+    """Hypothesis 1 alone."""
+
+    hypothesis = REST
+
+
+class ConstantVelocity(_OneHypothesis):
+    """Hypothesis 2 alone."""
+
+    hypothesis = LINE
+
+
+class Singer(_OneHypothesis):
+    """The paper's non-adaptive measurer: Singer's model alone, as in the third filter of the bank."""
+
+    hypothesis = SINGER
+
+
+class FixedGain(ConstantPolicy):
+    """The paper's probabilities over sensors whose noise is taken to be larger or smaller, always.
+
+    Args:
+        task: the problem.
+        action: of the control "gain"; by default the accelerometers are as good as switched off.
+    """
+
+    control = "gain"
+
+    def __init__(self, task: Task, action: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0)) -> None:
+        super().__init__(task)
+        self.action = action
+
+
+class NisAdaptive(Policy):
+    """Innovation-based adaptation of the noise, under the paper's probabilities.
+
+    Where the short average of the normalised innovation squared exceeds ``threshold`` under every hypothesis,
+    the model and the sensors disagree. An excess of the pseudoranges is put down to these. Rates that disagree
+    may be noisy, or right while the accelerometers stick: ``rates`` and ``accelerometers`` say how much of the
+    rates' excess goes to either. Accelerometers that disagree may be wrong, or the first to feel a manoeuvre:
+    ``own`` says how much of their excess goes to them. With these three at zero it is nearly the constant
+    action ``base``.
+
+    Args:
+        task: the problem.
+        threshold: of the average per observation; 1 is what a consistent filter has.
+        rates: power of the rates' excess in their own variance.
+        accelerometers: power of the rates' excess in the variance of the accelerometers.
+        own: power of the accelerometers' excess in their own variance.
+        base: what is always added to the action of the accelerometers.
+    """
+
+    control = "gain"
+
+    def __init__(
+        self,
+        task: TightlyCoupledNavigation,
+        threshold: float = 3.0,
+        rates: float = 1.0,
+        accelerometers: float = 1.0,
+        own: float = 1.0,
+        base: float = 0.0,
+    ) -> None:
+        super().__init__(task)
+        self.average_nis = task.reader("average_nis")
+        self.nats = 2.0 * math.log(task.parameters.noise_scale)
+        self.threshold, self.rates, self.accelerometers = threshold, rates, accelerometers
+        self.own, self.base = own, base
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Turn excesses into logarithms of factors."""
+        nis = self.average_nis(observation).reshape(len(observation), -1, len(HYPOTHESES)).min(axis=2)
+        ranges, rates, forces, attitude = numpy.log(numpy.maximum(nis.T / self.threshold, 1.0)) / self.nats
+        action = [
+            ranges,
+            self.rates * rates,
+            self.base + self.own * forces + self.accelerometers * rates,
+            attitude,
+        ]
+        return numpy.clip(numpy.stack(action, axis=1), -1.0, 1.0), None
+
+
+class StuckCheck(NisAdaptive):
+    """Accelerometers that repeat their last reading exactly are switched off; otherwise as told by the NIS.
+
+    Noise never repeats itself, so a reading held over a whole decision is a stuck sensor for certain; until
+    the decision after it sticks the filter trusts it.
+    """
+
+    def __init__(self, task: TightlyCoupledNavigation, threshold: float = 3.0, rates: float = 0.0) -> None:
+        super().__init__(task, threshold, rates, accelerometers=0.0)
+        self.readings = task.reader("accelerometer")
+        self.switch = [sensor.name for sensor in task.sensors].index("accelerometers")
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Compare with the readings of the last decision."""
+        action, _ = super().act(observation, None, start)
+        readings = self.readings(observation)
+        if state is not None:
+            stuck = (readings == state).all(axis=1) & ~start
+            action[:, self.switch] = numpy.where(stuck, 1.0, action[:, self.switch])
+        return action, readings
+
+
+# --- what can be tuned
+
+
+def _fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+    # The other two groups change nothing that can be measured.
+    return {}, lambda task: FixedGain(task, tuple(values.get(s.name, 0.0) for s in task.sensors))
+
+
+def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+    return {"transition": chain(1.0 - 10.0 ** values["log10_leave"])}, MultiHypothesis
+
+
+def _adaptive(
+    cls: type[NisAdaptive],
+) -> Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]:
+    return lambda values: ({}, lambda task: cls(task, **values))
+
+
+TUNABLE = {
+    "fixed-gain": Tunable(
+        "gain",
+        {"rates": (-0.2, 0.3), "accelerometers": (0.0, 1.0)},
+        {"rates": 0.0, "accelerometers": 0.8},
+        _fixed_gain,
+    ),
+    "nis-adaptive": Tunable(
+        "gain",
+        {
+            "threshold": (0.5, 10.0),
+            "rates": (0.0, 2.0),
+            "accelerometers": (0.0, 4.0),
+            "own": (0.0, 2.0),
+            "base": (0.0, 1.0),
+        },
+        {"threshold": 3.0, "rates": 1.0, "accelerometers": 1.0, "own": 1.0, "base": 0.0},
+        _adaptive(NisAdaptive),
+    ),
+    "stuck-check": Tunable(
+        "gain",
+        {"threshold": (0.5, 10.0), "rates": (0.0, 2.0)},
+        {"threshold": 3.0, "rates": 0.0},
+        _adaptive(StuckCheck),
+    ),
+    "sticky": Tunable("evidence", {"log10_leave": (-6.0, -0.5)}, {"log10_leave": -4.0}, _sticky),
+}
+
+BASELINES = Baselines(
+    environment="filtergym/TightlyCoupledNavigation-v0",
+    policies={
+        "multi-hypothesis": MultiHypothesis,
+        "sticky": Sticky,
+        "nis-adaptive": NisAdaptive,
+        "stuck-check": StuckCheck,
+        "fixed-gain": FixedGain,
+        "singer": Singer,
+        "constant-velocity": ConstantVelocity,
+        "rest": Rest,
+        "random": RandomPolicy,
+    },
+    references={"known-mode": KnownMode},
+    bounds={"known-mode-bound": KnownModeBound},
+    score_paper="multi-hypothesis",
+    score_bound="known-mode",
+    tunable=TUNABLE,
+    best_constant="fixed-gain",
+    # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
+    benchmark=("multi-hypothesis", "nis-adaptive", "singer", "known-mode", "known-mode-bound"),
+    physical=("rmse", "velocity"),
+    measurement_seconds=4e-5,
+    metrics=metrics,
+)

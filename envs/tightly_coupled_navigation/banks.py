@@ -1,0 +1,316 @@
+"""The filters of TightlyCoupledNavigation that are steered: a bank of extended Kalman filters.
+
+One filter for each hypothesis on the motion, mixed before every measurement by the weights in force and
+combined after it. The steps are numbered as in the paper (see :mod:`.task`). Step 4, the prediction, stands at
+the end of :meth:`act`, because it steers the tracking loops of the next measurement.
+
+Reading: step 3 of the scan lacks a hat and carries the index k|k-1; the spread is taken about the posterior
+estimates, otherwise the matrix is not symmetric.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import extended_kalman, gnss_ins, imm
+from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ..controls import bank_action_space, bank_probabilities
+from ..observation import LOG1P, SIGNED_LOG, Array, Block, Quantity, scaled
+from ..task import Bank, Initial, Task
+from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import TightlyCoupledNavigation
+
+
+class Prediction(NamedTuple):
+    """What the bank expects at a measurement, steps 1 to 4; M = 3 hypotheses."""
+
+    mean: Array
+    """``(17, M, N)``."""
+    covariance: Array
+    """``(17, 17, M, N)``."""
+    log_probabilities: Array
+    """Logarithm of the predicted probabilities, ``(M, N)``."""
+    combined: Array
+    """Mean of the combined prediction, ``(17, N)``."""
+
+
+class Filters(NamedTuple):
+    """The bank at one moment."""
+
+    predicted: Prediction
+    """To the measurement at hand; after :meth:`act`, to the next one."""
+    means: Array
+    """After the update, ``(17, M, N)``."""
+    covariances: Array
+    """``(17, 17, M, N)``."""
+    log_likelihood: Array
+    """``(M, N)``."""
+    nis: Array
+    """Normalised innovation squared by group of sensors, each given those before it, ``(4, M, N)``."""
+    average_nis: Array
+    """Short average of the same per reading, ``(4, M, N)``."""
+    range_innovation: Array
+    """Of the combined prediction: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
+    probabilities: Array
+    """Weights of the hypotheses in force, ``(M, N)``."""
+    mean: Array
+    """Of the combination, ``(17, N)``."""
+    covariance: Array
+    """``(17, 17, N)``."""
+    last_action: Array
+    """``(A, N)``."""
+
+
+class HypothesisBank(Bank[Task, Measurement, Filters]):
+    """Controls ``evidence``, ``mode`` and ``weights``: the action weighs the hypotheses."""
+
+    task: "TightlyCoupledNavigation"
+    parameters: TightlyCoupledNavigationParameters
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """One hypothesis, or a number for each."""
+        return bank_action_space(self.task.control, len(HYPOTHESES))
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """What the components of the action concern."""
+        return HYPOTHESES
+
+    # --- what the agent is shown
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What each filter says by group of sensors, readings, the sky, and clock."""
+        xp, p, task = self.xp, self.parameters, self.task
+        slots = [str(slot) for slot in p.satellites]
+        each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in HYPOTHESES]
+        ranges, rates, forces, _ = task.sensors
+
+        def innovation(name: str, sensor: SensorGroup) -> Block:
+            part, sigma = sensor.readings, sensor.sigma
+            return Block(
+                f"{name}_innovation", lambda f, y: y.available[part] * f.range_innovation[part] / sigma,
+                f"the {name}'s innovation at the combined prediction over sigma; 0 where it is missing",
+                slots, SIGNED_LOG,
+            )  # fmt: skip
+
+        def available(name: str, sensor: SensorGroup) -> Block:
+            return Block(
+                f"{name}_available", lambda f, y: y.available[sensor.readings],
+                f"1 where the {name} reached the filter", slots, over_interval="mean",
+            )  # fmt: skip
+
+        return (
+            Block(
+                "nis", lambda f, y: f.nis / self._present(y),
+                "the normalised innovation squared per reading, of a group of sensors given those before it",
+                each, LOG1P, over_interval="mean",
+            ),
+            Block(
+                "average_nis", lambda f, y: f.average_nis,
+                f"the short average of the same, over {p.averaging_measurements:g} measurements", each, LOG1P,
+            ),
+            Block(
+                "log_likelihood", lambda f, y: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
+                "the log-likelihood minus the largest one, nats", HYPOTHESES, SIGNED_LOG,
+            ),
+            Block(
+                "log_predicted", lambda f, y: f.predicted.log_probabilities,
+                "the logarithm of the predicted probability", HYPOTHESES, SIGNED_LOG,
+            ),
+            Block(
+                "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
+                ("forward", "right", "down"), unit=f"{p.gravity:g} m/s^2",
+            ),
+            innovation("pseudorange", ranges),
+            innovation("rate", rates),
+            Block(
+                "elevation", lambda f, y: task.elevations_at(y.number) / (0.5 * math.pi), "elevation", slots,
+                unit="pi/2 rad",
+            ),
+            Block("cn0", lambda f, y: y.cn0, "C/N0 less 45 dB-Hz", slots, scaled(0.1, 45.0), "10 dB-Hz"),
+            available("pseudorange", ranges),
+            available("rate", rates),
+            Block(
+                "time", lambda f, y: xp.astype(y.number, f.mean.dtype) / p.horizon,
+                "measurements so far over the horizon", unit="horizon",
+            ),
+            Block("last", lambda f, y: f.last_action, "last action", self.actions),
+        )  # fmt: skip
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """Innovations as they are."""
+        ranges, rates, *_ = self.task.sensors
+        return (
+            Quantity(
+                "pseudorange_innovation_in_metres", "m", "measured minus predicted pseudorange",
+                lambda read: ranges.sigma * read("pseudorange_innovation"),
+            ),
+            Quantity(
+                "rate_innovation_in_metres_per_second", "m/s", "measured minus predicted pseudorange rate",
+                lambda read: rates.sigma * read("rate_innovation"),
+            ),
+        )  # fmt: skip
+
+    def _present(self, measurement: Measurement) -> Array:
+        """Readings of each group of sensors that are there, at least one, ``(4, 1, N)``."""
+        here = [ordered_sum(measurement.available[sensor.readings]) for sensor in self.task.sensors]
+        return self.xp.stack([self.xp.clip(count, 1.0, None) for count in here])[:, None]
+
+    # --- the filters
+
+    def start(self, initial: Initial) -> Filters:
+        """Start every filter from what is known of the start."""
+        xp, M, task = self.xp, len(HYPOTHESES), self.task
+        zeros = 0.0 * initial.mean[0]
+        means = xp.stack([initial.mean] * M, axis=1)
+        covariances = xp.stack([initial.covariance] * M, axis=2)
+        probabilities = task.constant(self.parameters.initial_probabilities)[:, None] + zeros
+        nis = xp.stack([xp.stack([zeros] * M)] * len(task.sensors))
+        return Filters(
+            predicted=self._predicted(means, covariances, probabilities),
+            means=means,
+            covariances=covariances,
+            log_likelihood=nis[0],
+            nis=nis,
+            average_nis=nis + 1.0,
+            range_innovation=xp.stack([zeros] * task.tracked.stop),
+            probabilities=probabilities,
+            mean=initial.mean,
+            covariance=initial.covariance,
+            last_action=xp.stack([zeros] * len(self.actions)),
+        )
+
+    def _predicted(self, means: Array, covariances: Array, probabilities: Array) -> Prediction:
+        """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
+        task, common = self.task, self.task.common
+        chain = imm.predict_mode_probabilities(task.transition, probabilities)
+        mixed = imm.mix(means, covariances, chain.mixing)
+        mean, covariance = gnss_ins.predict(*mixed, task.axis, common.T, common.decay, task.process_noise)
+        combined = weighted_sum(chain.probabilities, mean)
+        return Prediction(mean, covariance, imm.log_probabilities(chain.probabilities), combined)
+
+    def feedback(self, state: Filters) -> Array | None:
+        """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
+        return state.predicted.combined if self.parameters.aperture else None
+
+    def predict(self, state: Filters, measurement: Measurement) -> Filters:
+        """Compare the prediction with a measurement, and update with the nominal noise."""
+        xp, task, combined = self.xp, self.task, state.predicted.combined
+        seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
+        innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
+        update = self._updated(state.predicted, measurement, task.sensor_variance)
+        nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
+        change = nis / self._present(measurement) - state.average_nis
+        return state._replace(
+            means=update.mean,
+            covariances=update.covariance,
+            log_likelihood=update.log_likelihood,
+            nis=nis,
+            average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
+            range_innovation=innovation,
+        )
+
+    def _updated(
+        self, predicted: Prediction, measurement: Measurement, variance: Sequence[Any]
+    ) -> extended_kalman.Correction:
+        """Steps 5 and 6 for every hypothesis."""
+        expected, rows = gnss_ins.observe(
+            predicted.mean,
+            measurement.satellite_position[:, :, None],
+            measurement.satellite_velocity[:, :, None],
+            measurement.ins_angles[:, None],
+            self.parameters.gravity,
+        )
+        residual = measurement.readings[:, None] - expected
+        return extended_kalman.update_one_by_one(
+            predicted.mean, predicted.covariance, residual, rows, variance, measurement.available
+        )
+
+    def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
+        """Weigh the hypotheses by the action (step 7)."""
+        xp, control, dtype = self.xp, self.task.control, state.log_likelihood.dtype
+        probabilities = bank_probabilities(
+            control,
+            action,
+            state.predicted.log_probabilities,
+            state.log_likelihood,
+            self.parameters.evidence_scale,
+            xp,
+        )
+        probabilities = xp.astype(probabilities, dtype)
+        if control == "mode":
+            last = probabilities
+        else:
+            last = xp.astype(xp.clip(action, 0.0 if control == "weights" else -1.0, 1.0), dtype)
+        return self._weighed(state, probabilities, last)
+
+    def _weighed(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
+        """Combine (step 8), and predict to the next measurement."""
+        mean, covariance = imm.combine(state.means, state.covariances, probabilities)
+        return state._replace(
+            predicted=self._predicted(state.means, state.covariances, probabilities),
+            probabilities=probabilities,
+            mean=mean,
+            covariance=covariance,
+            last_action=last_action,
+        )
+
+    def mean(self, state: Filters) -> Array:
+        """Of the combination, ``(17, N)``."""
+        return state.mean
+
+    def covariance(self, state: Filters) -> Array:
+        """Of the combination, ``(17, 17, N)``."""
+        return state.covariance
+
+    def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
+        """Probabilities, NIS of the combination and its degrees, whether a rate is beyond its aperture."""
+        xp, rates = self.xp, self.task.sensors[1]
+        beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
+        return {
+            "mode_probability": state.probabilities,
+            "nis": weighted_sum(state.probabilities, ordered_sum(state.nis)),
+            "nis_degrees": ordered_sum(measurement.available),
+            "rate_outside_aperture": xp.astype(xp.any(beyond, axis=0), state.mean.dtype),
+        }
+
+
+class NoiseBank(HypothesisBank):
+    """Control ``gain``: the action says how noisy the sensors are; the paper's probabilities."""
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number for each group of sensors."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (len(self.actions),), numpy.float32)
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """The groups of sensors."""
+        return [sensor.name for sensor in self.task.sensors]
+
+    def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
+        """Update with the noise that the action asks for, and weigh by Bayes' rule."""
+        xp, p, task = self.xp, self.parameters, self.task
+        exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
+        up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
+        factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
+        variance = [
+            nominal * factor[i]
+            for i, sensor in enumerate(task.sensors)
+            for nominal in task.sensor_variance[sensor.readings]
+        ]
+        update = self._updated(state.predicted, measurement, variance)
+        state = state._replace(
+            means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
+        )
+        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
+        return self._weighed(state, probabilities, exponent)

@@ -1,0 +1,219 @@
+"""Every constant of TightlyCoupledNavigation, with its limits, and the names of its hypotheses."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy
+
+from ...filters import gnss_ins, satellites
+from ..parameters import TaskParameters, parameter, sized, square_matrix
+
+REST, LINE, SINGER = 0, 1, 2
+HYPOTHESES = ("rest", "constant-velocity", "singer")
+DEGREE = math.pi / 180.0
+
+
+class SensorGroup(NamedTuple):
+    """Sensors of one kind."""
+
+    name: str
+    readings: slice
+    """Where they stand among all readings."""
+    sigma: float
+    """Nominal standard deviation of each, m, m/s, m/s^2 or rad."""
+    aperture: float | None = None
+    """Distance from what they expect at which tracking loops lose them, in the same unit."""
+
+
+@dataclass(frozen=True)
+class TightlyCoupledNavigationParameters(TaskParameters):
+    """Every constant of the task; each is a keyword of ``gym.make``. "ours": the paper gives no value."""
+
+    course: str = parameter("random", choices=("increment", "kinematic", "matched", "random"))
+    """How the user moves: "increment" (the paper), "kinematic", "matched" or "random"."""
+    horizon: int = parameter(600, at_least=1)
+    """Measurements in an episode. Paper: 3000; ours for training: 6 s."""
+    decision_interval: int = parameter(10, at_least=1)
+    """Measurements for which an action holds. Ours: ten decisions a second."""
+    sampling_interval: float = parameter(0.01, above=0.0)
+    """Step T, s. Ours: the paper's smallest adaptation time must be one step at least."""
+
+    latitude: float = parameter(53.9, at_least=-90.0, at_most=90.0)
+    """Of the site, degrees. Ours: Minsk."""
+    longitude: float = parameter(27.5667, at_least=-180.0, at_most=180.0)
+    """Of the site, degrees. Ours."""
+    height: float = 220.0
+    """Of the site, m. Ours."""
+    satellites: tuple[int, ...] = (1, 11, 19, 20)
+    """Slots of the nominal GLONASS. Paper: four; ours: the four of smallest GDOP. With fewer, the filter
+    coasts on what is left."""
+    epoch: float = 0.0
+    """Time of the constellation at the start, s. Ours."""
+    elevation_mask: float = parameter(10.0, at_least=0.0)
+    """Satellites below are refused, degrees. Ours."""
+    gravity: float = parameter(9.81, above=0.0)
+    """m/s^2."""
+
+    pseudorange_sigma: float = parameter(3.0, above=0.0)
+    """m. Ours."""
+    rate_sigma: float = parameter(0.1, above=0.0)
+    """m/s. Ours."""
+    accelerometer_sigma: float = parameter(0.05, above=0.0)
+    """m/s^2. Ours."""
+    attitude_sigma: float = parameter(0.5, above=0.0)
+    """Of the independent attitude reference, degrees. Ours."""
+
+    frequency_density: float = parameter(0.009, above=0.0)
+    """White frequency noise of the receiver clock, m^2/s. Ours."""
+    frequency_walk_density: float = parameter(0.036, above=0.0)
+    """Random-walk frequency noise of the clock, m^2/s^3. Ours."""
+    angle_walk: float = parameter(0.01, above=0.0)
+    """Random walk of each attitude error, degrees per root second. Ours."""
+    attitude_rate_sigma: float = parameter(0.02, above=0.0)
+    """Stationary rate of each attitude error, degrees/s. Ours."""
+    attitude_rate_time: float = parameter(100.0, above=0.0)
+    """Correlation time of the attitude rates, s. Ours."""
+    rest_velocity_sigma: float = parameter(0.01, above=0.0)
+    """Regularising noise of hypothesis 1, m/s; the position takes T times as much. Ours."""
+    reset_acceleration_sigma: float = parameter(0.05, above=0.0)
+    """Regularising noise of the acceleration in hypotheses 1 and 2, m/s^2. Ours."""
+    increment_sigma: float = parameter(0.02, above=0.0)
+    """Velocity increment in one step of hypothesis 2, m/s. Ours; for the paper 0.3, the increment
+    of leg 2."""
+    singer_alpha: float = parameter(0.05, above=0.0)
+    """Reciprocal correlation time of a manoeuvre, 1/s. Ours."""
+    singer_sigma: float = parameter(18.0, above=0.0)
+    """Standard deviation of a manoeuvre, m/s^2. Ours: Singer's rule with 30 m/s^2, P_max 0.1, P_0 0.32."""
+    transition: tuple[tuple[float, ...], ...] = parameter(
+        ((0.998, 0.001, 0.001), (0.001, 0.998, 0.001), (0.001, 0.001, 0.998)),
+        at_least=0.0,
+        at_most=1.0,
+        stochastic=True,
+    )
+    """Of the hypotheses, row = from, column = to. Ours: a mean stay of 5 s."""
+    initial_probabilities: tuple[float, ...] = parameter(
+        (1 / 3, 1 / 3, 1 / 3), at_least=0.0, at_most=1.0, stochastic=True
+    )
+    """Of the hypotheses. Ours."""
+
+    initial_position_sigma: float = parameter(10.0, above=0.0)
+    """m. Ours."""
+    initial_clock_sigma: float = parameter(30.0, above=0.0)
+    """m. Ours."""
+    initial_velocity_sigma: float = parameter(0.5, above=0.0)
+    """m/s. Ours."""
+    initial_drift_sigma: float = parameter(1.0, above=0.0)
+    """m/s. Ours."""
+    initial_acceleration_sigma: float = parameter(0.5, above=0.0)
+    """m/s^2. Ours."""
+    initial_attitude_sigma: float = parameter(1.0, above=0.0)
+    """Degrees. Ours."""
+
+    heading: float = 45.0
+    """Of the level aircraft, degrees; legs of the fixed courses follow it. Ours."""
+    leg_steps: tuple[int, int] = parameter((1000, 2000), at_least=1, ascending=True)
+    """Last step of leg 1 and of leg 2 of the fixed courses. Paper."""
+    leg_acceleration: float = parameter(30.0, at_least=0.0)
+    """Of leg 2, and the jump at its end, m/s^2. Paper: 0.3 m/s per step, and 30 m/s^2."""
+    matched_speed: float = parameter(300.0, at_least=0.0)
+    """Initial speed of the matched course, m/s. Ours."""
+    legs: int = parameter(4, at_least=1)
+    """Of the random course. Ours."""
+    leg_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
+    """Limits of the duration of a random leg, s. Ours."""
+    strength: tuple[float, float] = parameter((2.0, 40.0), at_least=0.0, ascending=True)
+    """Limits of the acceleration with which a random manoeuvre begins, m/s^2. Ours."""
+    initial_speed: tuple[float, float] = parameter((0.0, 300.0), at_least=0.0, ascending=True)
+    """Limits of the speed of a random course that does not start at rest, m/s. Ours."""
+    rest_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
+    """That a random course starts at rest. Ours."""
+    true_increment_sigma: float = parameter(0.02, at_least=0.0)
+    """True random velocity increment on legs of constant velocity of the random course, m/s per step. Ours:
+    that of hypothesis 2, so that the known mode is the optimum."""
+
+    rate_fault_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
+    """That one satellite's rate channel is noisy for a while. Ours."""
+    rate_fault_factor: float = parameter(5.0, above=0.0)
+    """How much noisier. Ours."""
+    rate_fault_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
+    """s. Ours."""
+    stick_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
+    """That the accelerometers stick at their last reading for a while. Ours."""
+    stick_duration: tuple[float, float] = parameter((0.3, 1.0), at_least=0.0, ascending=True)
+    """s. Ours."""
+    rates_outage: float = parameter(0.0, at_least=0.0)
+    """How long all rates are lost, s. Ours."""
+    satellites_outage: float = parameter(0.0, at_least=0.0)
+    """How long two satellites drop out, s. Ours."""
+    urban: bool = False
+    """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
+    and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""
+    urban_hold: tuple[float, float] = parameter((0.5, 2.0), at_least=0.0, ascending=True)
+    """Limits of the time for which such an error holds, s. Ours."""
+    urban_cn0_walk: float = parameter(0.5, at_least=0.0)
+    """Random walk of C/N0, dB per step, reflected at its limits. Ours."""
+    cn0_limits: tuple[float, float] = parameter((22.0, 50.0), at_least=0.0, ascending=True)
+    """Limits of C/N0, dB-Hz. Ours."""
+    clear_cn0: float = parameter(47.0, above=0.0)
+    """C/N0 under a clear sky, dB-Hz. Ours."""
+
+    aperture: bool = False
+    """Whether the tracking loops, steered by the combined prediction, lose what they do not expect."""
+    rate_aperture: float = parameter(9.36, above=0.0)
+    """m/s: wavelength of L1 over four times a coherent time of 5 ms. Ours."""
+    range_aperture: float = parameter(293.0, above=0.0)
+    """Half a chip, m. Ours."""
+
+    evidence_scale: float = parameter(10.0, above=0.0)
+    """Nats that an evidence of one adds to the log-posterior. Ours."""
+    noise_scale: float = parameter(300.0, above=1.0)
+    """Largest factor of a sensor's standard deviation under control "gain". Ours: 300 switches a sensor off
+    for practical purposes."""
+    noise_reduction: float = parameter(3.0, above=1.0)
+    """Largest divisor of it. Ours: a filter that trusts its sensors far too much is never right, and
+    amplifies rounding from one backend to another."""
+    averaging_measurements: float = parameter(10.0, at_least=1.0)
+    """Time constant n of the short averages in the observation, measurements: the newest has the weight 1/n.
+    Ours."""
+    position_unit: float = parameter(7.4, above=0.0)
+    """Error of a single-epoch fix, m: the unit of the cost. Ours: 3 m times the dilution 2.47."""
+    velocity_unit: float = parameter(0.25, above=0.0)
+    """Error of a single-epoch velocity, m/s: the unit of the cost. Ours: 0.1 m/s times 2.47."""
+
+    def check(self) -> None:
+        """Check what concerns several fields together: the chain, and where the satellites stand."""
+        square_matrix("transition", self.transition, len(HYPOTHESES))
+        sized("initial_probabilities", self.initial_probabilities, len(HYPOTHESES))
+        if not self.satellites or len(set(self.satellites)) != len(self.satellites):
+            raise ValueError(f"satellites must be different slots, at least one, got {self.satellites!r}")
+        if self.satellites_outage > 0.0 and len(self.satellites) < 2:
+            raise ValueError(f"satellites_outage takes two satellites, got {self.satellites!r}")
+        times = self.epoch + self.sampling_interval * numpy.array([0.0, self.horizon + 1.0])
+        local, _ = satellites.local_orbits(self.satellites, times, *self.site)
+        lowest = satellites.look_angles(local)[1].min(axis=1) / DEGREE
+        for slot, elevation in zip(self.satellites, lowest, strict=True):
+            if elevation < self.elevation_mask:
+                raise ValueError(
+                    f"satellite {slot} stands at {elevation:.1f} degrees, below elevation_mask "
+                    f"{self.elevation_mask}: choose another"
+                )
+        if len(self.satellites) >= 4:
+            first = local[:, :, 0]
+            satellites.dilution_of_precision(first / numpy.sqrt((first**2).sum(axis=0)))
+
+    @property
+    def site(self) -> tuple[float, float, float]:
+        """Latitude and longitude, rad, and height, m."""
+        return self.latitude * DEGREE, self.longitude * DEGREE, self.height
+
+    @property
+    def sensors(self) -> tuple[SensorGroup, ...]:
+        """Every group of sensors, in the order of the readings."""
+        ranges, rates, forces, angles = gnss_ins.sensor_groups(len(self.satellites))
+        return (
+            SensorGroup("pseudoranges", ranges, self.pseudorange_sigma, self.range_aperture),
+            SensorGroup("rates", rates, self.rate_sigma, self.rate_aperture),
+            SensorGroup("accelerometers", forces, self.accelerometer_sigma),
+            SensorGroup("attitude", angles, self.attitude_sigma * DEGREE),
+        )

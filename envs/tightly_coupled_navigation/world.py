@@ -1,0 +1,390 @@
+"""The flight of TightlyCoupledNavigation and the sensors on board; equations in ``filters/gnss_ins.py``.
+
+Reading: a velocity that grows by 0.3 m/s in every 0.01 s already is an acceleration of 30 m/s^2, so nothing
+is left to jump at step 2000. The truth was probably a sequence of states with V incremented and A = 0:
+``course="increment"``. Physically that is an accelerometer stuck at zero through leg 2. The consistent
+alternative, where A = 30 m/s^2 in leg 2 and turns by 90 degrees, is ``course="kinematic"``.
+"""
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy
+
+from ...filters import gnss_ins
+from ...filters.ordered_sums import ordered_sum
+from ..draws import Draws
+from ..observation import Array
+from ..task import Initial, Task, World
+from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
+
+if TYPE_CHECKING:
+    from .task import TightlyCoupledNavigation
+
+KNOWN_AT_START = (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) + (1.0,) * 3 + (0.0,) * 6
+"""One for what is exact and known with errors, position, velocity and acceleration; clock and attitude errors
+are drawn and unknown."""
+QUANTILE_95 = 1.6448536269514722
+"""Of the standard normal distribution."""
+CLEAR_ERROR = 19.0
+"""95 % quantile of the multipath error, the positive part of a normal one, at 44 dB-Hz and more, m."""
+MULTIPATH = ((44.0, 7.0, 49.0), (38.0, 25.0, 79.0), (30.0, 50.0, 152.0))
+"""Below a C/N0, dB-Hz, the error is lognormal: its median and 95 % quantile, m."""
+
+
+class Legs(NamedTuple):
+    """The course, L legs."""
+
+    start: Array
+    """Last step before each leg, ``(L, N)``."""
+    kind: Array
+    """REST, LINE or SINGER, ``(L, N)``."""
+    acceleration: Array
+    """With which each leg begins, ``(3, L, N)``, m/s^2."""
+
+
+class Faults(NamedTuple):
+    """First and last step of what goes wrong, ``(2, N)`` each, and where; -1 where it does not."""
+
+    noisy: Array
+    """One satellite's rate is noisy."""
+    noisy_satellite: Array
+    """Place of that satellite, ``(N,)``."""
+    stuck: Array
+    """The accelerometers repeat their last reading."""
+    no_rates: Array
+    """No satellite has a rate."""
+    hidden: Array
+    """Two satellites are gone."""
+    hidden_satellites: Array
+    """Places of those two, ``(2, N)``."""
+
+
+class Truth(NamedTuple):
+    """The user, and what its sensors remember; S satellites, m = 2 S + 6 readings."""
+
+    step: Array
+    """Measurements so far, ``(N,)`` integers."""
+    legs: Legs
+    faults: Faults
+    state: Array
+    """``(17, N)``, in the order of filters.gnss_ins."""
+    mode: Array
+    """True hypothesis, ``(N,)`` integers."""
+    jumped: Array
+    """One where the acceleration has just taken the value with which the next leg begins, ``(N,)``."""
+    noise_factor: Array
+    """True standard deviation of each reading over the nominal one, ``(m, N)``."""
+    stuck: Array
+    """One where the accelerometers hold an old reading, ``(N,)``."""
+    accelerometers: Array
+    """Their last reading, ``(3, N)``, m/s^2."""
+    cn0: Array
+    """``(S, N)``, dB-Hz."""
+    multipath: Array
+    """Held error of each pseudorange, ``(S, N)``, m."""
+    hold: Array
+    """Steps for which it still holds, ``(S, N)``."""
+
+
+class Measurement(NamedTuple):
+    """What receiver and inertial system say; S satellites, m = 2 S + 6 readings."""
+
+    number: Array
+    """Of the measurement, counted from 1, ``(N,)`` integers; one takes ``sampling_interval`` seconds."""
+    readings: Array
+    """S pseudoranges, m; S pseudorange rates, m/s; accelerometers forward, right and down, m/s^2; differences of
+    heading, pitch and roll from the attitude reference, rad; ``(m, N)``. Their nominal standard deviations are
+    those of ``task.sensors``."""
+    available: Array
+    """One where a reading is there, zero where it is not and its value means nothing, ``(m, N)``."""
+    ins_angles: Array
+    """Heading, pitch, roll shown by the inertial system, ``(3, N)``, rad."""
+    cn0: Array
+    """Carrier to noise density of each satellite, ``(S, N)``, dB-Hz."""
+    satellite_position: Array
+    """From the ephemerides, east, north, up of the site, ``(3, S, N)``, m."""
+    satellite_velocity: Array
+    """``(3, S, N)``, m/s."""
+
+
+class NavigationWorld(World[Task, Truth, Measurement]):
+    """An aircraft with a satellite receiver and an inertial system."""
+
+    task: "TightlyCoupledNavigation"
+    parameters: TightlyCoupledNavigationParameters
+    initial_normals = gnss_ins.SIZE
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        p, task, constant, S = self.parameters, self.task, self.task.constant, self.task.satellites
+        self.normals = gnss_ins.SIZE + len(task.sensor_variance) + (2 * S if p.urban else 0)
+        self.row_uniforms = S if p.urban else 0
+        self.singer_root = constant(numpy.linalg.cholesky(task.models[SINGER].noise))
+        self.clock_root = constant(numpy.linalg.cholesky(task.common.clock_noise))
+        self.true_angles = constant([p.heading * DEGREE, 0.0, 0.0])[:, None]
+        sigmas = [p.initial_position_sigma] * 3 + [p.initial_clock_sigma]
+        sigmas += [p.initial_velocity_sigma] * 3 + [p.initial_drift_sigma]
+        sigmas += [p.initial_acceleration_sigma] * 3
+        sigmas += [p.initial_attitude_sigma * DEGREE] * 3 + [p.attitude_rate_sigma * DEGREE] * 3
+        self.initial_sigma = constant(sigmas)[:, None]
+        self.known = constant(KNOWN_AT_START)[:, None]
+        self.places = constant(range(S))[:, None]
+
+    # --- the episode
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
+        """Draw legs and faults; what is known of the start has errors."""
+        xp, p, S = self.xp, self.parameters, self.task.satellites
+        zeros = xp.zeros_like(normals[0])
+        legs, velocity = self._random_legs(draws) if p.course == "random" else self._fixed_legs(draws, zeros)
+        faults = self._faults(draws)
+        # Drawn in open country too: every scenario takes the same numbers.
+        cn0 = draws.uniform("cn0", p.cn0_limits, S)
+        if not p.urban:
+            cn0 = p.clear_cn0 + 0.0 * cn0
+        none = zeros[None]
+        moving = xp.concat([none] * 4 + [velocity, none, legs.acceleration[:, 0]] + [none] * 6)
+        spread = self.initial_sigma * normals
+        state = moving + (1.0 - self.known) * spread
+        identity = xp.eye(gnss_ins.SIZE, dtype=normals.dtype, device=self.task.device)
+        truth = Truth(
+            step=xp.astype(zeros, xp.int64),
+            legs=legs,
+            faults=faults,
+            state=state,
+            mode=xp.astype(legs.kind[0], xp.int64),
+            jumped=zeros,
+            noise_factor=xp.stack([zeros + 1.0] * len(self.task.sensor_variance)),
+            stuck=zeros,
+            accelerometers=xp.stack([zeros] * 3),
+            cn0=cn0,
+            multipath=xp.stack([zeros] * S),
+            hold=xp.stack([zeros] * S),
+        )
+        covariance = (identity * self.initial_sigma**2)[:, :, None] + zeros
+        return truth, Initial(moving + self.known * spread, covariance)
+
+    def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array]:
+        """Legs of the paper's experiment, or one that is matched to hypothesis 3, and the velocity."""
+        xp, p, constant = self.xp, self.parameters, self.task.constant
+        # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
+        draws.unit("legs", 15)
+        heading = p.heading * DEGREE
+        along = (math.sin(heading), math.cos(heading), 0.0)
+        right = (math.cos(heading), -math.sin(heading), 0.0)
+        if p.course == "matched":
+            # One leg: the others begin after the end.
+            starts: tuple[int, ...] = (0, p.horizon + 2, p.horizon + 2)
+            kinds, directions, speed = (SINGER,) * 3, (along,) * 3, p.matched_speed
+        else:
+            starts, kinds, speed = (0, *p.leg_steps), (REST, LINE, SINGER), 0.0
+            directions = ((0.0, 0.0, 0.0), along, right)
+        acceleration = constant(directions).T[:, :, None] * p.leg_acceleration + zeros
+        legs = Legs(
+            xp.stack([zeros + start for start in starts]),
+            xp.stack([zeros + kind for kind in kinds]),
+            acceleration,
+        )
+        return legs, constant(along)[:, None] * speed + zeros
+
+    def _random_legs(self, draws: Draws) -> tuple[Legs, Array]:
+        """Legs of rest, straight flight and manoeuvre at random, and the velocity at the start."""
+        xp, p = self.xp, self.parameters
+        columns: list[tuple[Array, ...]] = []
+        start = kind = velocity = None
+        for leg in range(p.legs):
+            chosen = draws.unit(f"kind_{leg}")
+            seconds = draws.uniform(f"duration_{leg}", p.leg_duration)
+            turn = draws.uniform(f"azimuth_{leg}", (0.0, 2.0 * math.pi))
+            sine = draws.uniform(f"height_{leg}", (-1.0, 1.0))
+            if leg == 0:
+                start = 0.0 * chosen
+                kind = xp.where(chosen < p.rest_probability, float(REST), float(LINE))
+                speed, size = draws.uniform("speed", p.initial_speed), start
+                level = xp.stack([xp.sin(turn), xp.cos(turn), start])
+                velocity = xp.where(kind == REST, 0.0, speed) * level
+            else:
+                # A manoeuvre follows rest and straight flight; after it, straight flight or another one.
+                straight = xp.where(chosen < 0.5, float(LINE), float(SINGER))
+                kind = xp.where(kind == SINGER, straight, float(SINGER))
+                size = xp.where(kind == SINGER, draws.uniform(f"strength_{leg}", p.strength), 0.0)
+            cosine = xp.sqrt(xp.clip(1.0 - sine * sine, 0.0, None))
+            direction = xp.stack([xp.sin(turn) * cosine, xp.cos(turn) * cosine, sine])
+            columns.append((start, kind, size * direction))
+            start = start + xp.clip(xp.round(seconds / p.sampling_interval), 1.0, None)
+        return Legs(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))), velocity
+
+    def _faults(self, draws: Draws) -> Faults:
+        """Draw what goes wrong, and when."""
+        xp, p, S, T = self.xp, self.parameters, self.task.satellites, self.parameters.sampling_interval
+
+        def window(start: Array, seconds: Array) -> Array:
+            """First and last step, from a start that is a share of the time left free."""
+            first = 1.0 + xp.floor(start * xp.clip(p.horizon * T - seconds, 0.0, None) / T)
+            return xp.stack([first, first + xp.round(seconds / T) - 1.0])
+
+        def sometimes(name: str, probability: float, seconds: tuple[float, float]) -> Array:
+            happens, start = draws.event(name, probability), draws.unit(f"{name}_start")
+            return xp.where(happens, window(start, draws.uniform(f"{name}_duration", seconds)), -1.0)
+
+        def always(name: str, seconds: float) -> Array:
+            start = draws.unit(f"{name}_start")
+            return window(start, 0.0 * start + seconds)
+
+        noisy = sometimes("noisy", p.rate_fault_probability, p.rate_fault_duration)
+        noisy_satellite = draws.integer("noisy_satellite", (0, S - 1))
+        stuck = sometimes("stuck", p.stick_probability, p.stick_duration)
+        no_rates, hidden = always("no_rates", p.rates_outage), always("hidden", p.satellites_outage)
+        first = draws.integer("hidden_satellite", (0, S - 1))
+        second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
+        return Faults(noisy, noisy_satellite, stuck, no_rates, hidden, xp.stack([first, second]))
+
+    # --- one measurement
+
+    def advance(self, truth: Truth, noise: Array, feedback: Array | None) -> tuple[Truth, Measurement]:
+        """Move the user, and measure with noise, faults, outages and multipath.
+
+        Args:
+            truth: at the measurement before.
+            noise: see :class:`.World`.
+            feedback: where tracking loops have an aperture, the state ``(17, N)`` that they expect.
+        """
+        xp, p, task, m = self.xp, self.parameters, self.task, len(self.task.sensor_variance)
+        step = truth.step + 1
+        k = xp.astype(step, noise.dtype)
+        state, mode, jumped = self._moved(truth, k, noise[: gnss_ins.SIZE])
+        noise = noise[gnss_ins.SIZE :]
+        ins_angles = self.true_angles + state[gnss_ins.ATTITUDE_ERROR]
+        position, velocity = task.satellites_at(step)
+        exact, _ = gnss_ins.observe(state, position, velocity, ins_angles, p.gravity)
+
+        ones, faults = xp.ones_like(noise[:m]), truth.faults
+        noisy = self._during(faults.noisy, k) & (self.places == faults.noisy_satellite)
+        gone = faults.hidden_satellites
+        hidden = self._during(faults.hidden, k) & ((self.places == gone[0]) | (self.places == gone[1]))
+        seen = xp.where(hidden, 0.0, ones[: task.satellites])
+        factor = self._each(ones, rates=xp.where(noisy, p.rate_fault_factor, ones[: task.satellites]))
+        available = self._each(
+            ones, pseudoranges=seen, rates=xp.where(self._during(faults.no_rates, k), 0.0, seen)
+        )
+        if p.urban:
+            truth = self._reflected(truth, noise[m:])
+        # A stick at the first measurement has no last reading to hold.
+        stuck = self._during(faults.stuck, k) & (k > 1.0)
+        measured = exact + task.sensor_sigma * factor * noise[:m]
+        ranges, rates, forces, attitude = (measured[sensor.readings] for sensor in task.sensors)
+        forces = xp.where(stuck, truth.accelerometers, forces)
+        readings = xp.concat([ranges + truth.multipath, rates, forces, attitude])
+        if feedback is not None:
+            expected = gnss_ins.ranges(feedback, gnss_ins.geometry(feedback, position, velocity))
+            innovation = readings[task.tracked] - xp.concat(expected)
+            kept = xp.astype(xp.abs(innovation) <= task.apertures, noise.dtype)
+            available = xp.concat([available[task.tracked] * kept, available[task.tracked.stop :]])
+        truth = truth._replace(
+            step=step,
+            state=state,
+            mode=mode,
+            jumped=jumped,
+            noise_factor=factor,
+            stuck=xp.astype(stuck, noise.dtype),
+            accelerometers=forces,
+        )
+        return truth, Measurement(step, readings, available, ins_angles, truth.cn0, position, velocity)
+
+    def _during(self, window: Array, k: Array) -> Array:
+        """Whether step k lies in a window, ``(N,)``."""
+        return (k >= window[0]) & (k <= window[1])
+
+    def _each(self, ones: Array, **groups: Array) -> Array:
+        """One number for each reading: what is said of its group of sensors, else one."""
+        return self.xp.concat([groups.get(s.name, ones[s.readings]) for s in self.task.sensors])
+
+    def _moved(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
+        """State at step k, the hypothesis it follows, and whether its acceleration has jumped."""
+        xp, p, task, legs = self.xp, self.parameters, self.task, truth.legs
+        T, count = p.sampling_interval, legs.start.shape[0]
+        kind, push = legs.kind[0], legs.acceleration[:, 0]
+        for i in range(1, count):
+            begun = k > legs.start[i]
+            kind = xp.where(begun, legs.kind[i], kind)
+            push = xp.where(begun, legs.acceleration[:, i], push)
+
+        moved = gnss_ins.advance(truth.state, task.axis[:, :, SINGER], T, task.common.decay)
+        w = xp.reshape(normals[:9], (3, 3, *normals.shape[1:]))
+        q = self.singer_root
+        singer = (
+            moved[0:3] + q[0, 0] * w[0],
+            moved[4:7] + (q[1, 0] * w[0] + q[1, 1] * w[1]),
+            moved[8:11] + (q[2, 0] * w[0] + q[2, 1] * w[1] + q[2, 2] * w[2]),
+        )
+        x, v = truth.state[0:3], truth.state[4:7]
+        spread = p.true_increment_sigma if p.course == "random" else 0.0
+        increment = T * push + spread * w[1]
+        felt = push if p.course == "kinematic" else 0.0 * push
+        line = (x + T * v + (0.5 * T) * increment, v + increment, felt)
+        still = (x, 0.0 * v, 0.0 * v)
+        x, v, a = (
+            xp.where(kind == REST, r, xp.where(kind == LINE, s, m))
+            for r, s, m in zip(still, line, singer, strict=True)
+        )
+        jumped = k < 0.0
+        for i in range(1, count):
+            here = (k == legs.start[i]) & (legs.kind[i] == SINGER)
+            a = xp.where(here, legs.acceleration[:, i], a)
+            jumped = jumped | here
+        # From the jump on the user manoeuvres; so he does all along a line whose acceleration is felt.
+        mode = xp.where(jumped, float(SINGER), kind)
+        if p.course == "kinematic":
+            mode = xp.where(kind == LINE, float(SINGER), mode)
+
+        c, common = self.clock_root, task.common
+        bias = moved[3] + c[0, 0] * normals[9]
+        drift = moved[7] + (c[1, 0] * normals[9] + c[1, 1] * normals[10])
+        attitude = moved[11:14] + math.sqrt(common.attitude_variance) * normals[11:14]
+        rate = moved[14:17] + math.sqrt(common.attitude_rate_variance) * normals[14:17]
+        state = xp.concat([x, bias[None], v, drift[None], a, attitude, rate])
+        return state, xp.astype(mode, xp.int64), xp.astype(jumped, normals.dtype)
+
+    def _reflected(self, truth: Truth, noise: Array) -> Truth:
+        """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now.
+
+        Args:
+            truth: before.
+            noise: S normals of the walk, S of the errors, S uniforms of how long they hold, ``(3 S, N)``.
+        """
+        xp, p, S = self.xp, self.parameters, self.task.satellites
+        walk, normal, uniform = noise[:S], noise[S : 2 * S], noise[2 * S :]
+        low, high = p.cn0_limits
+        cn0 = truth.cn0 + p.urban_cn0_walk * walk
+        cn0 = xp.clip(xp.where(cn0 < low, 2.0 * low - cn0, cn0), low, None)
+        cn0 = xp.clip(xp.where(cn0 > high, 2.0 * high - cn0, cn0), low, high)
+        error = xp.clip((CLEAR_ERROR / QUANTILE_95) * normal, 0.0, None)
+        for limit, median, upper in MULTIPATH:
+            drawn = median * xp.exp((math.log(upper / median) / QUANTILE_95) * normal)
+            error = xp.where(cn0 < limit, drawn, error)
+        ended = truth.hold <= 0.0
+        shortest, longest = p.urban_hold
+        steps = xp.round((shortest + (longest - shortest) * uniform) / p.sampling_interval)
+        return truth._replace(
+            cn0=cn0,
+            multipath=xp.where(ended, error, truth.multipath),
+            hold=xp.where(ended, steps, truth.hold) - 1.0,
+        )
+
+    # --- judgement
+
+    def state(self, truth: Truth) -> Array:
+        """``(17, N)``, in the order of filters.gnss_ins."""
+        return truth.state
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Squared position and velocity errors over those of a single-epoch fix."""
+        p, e = self.parameters, mean - truth.state
+        x, v = e[gnss_ins.POSITION], e[gnss_ins.VELOCITY]
+        return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """Time and true hypothesis."""
+        seconds = self.parameters.sampling_interval * self.xp.astype(truth.step, truth.state.dtype)
+        return {"seconds": seconds, "true_mode": truth.mode}
