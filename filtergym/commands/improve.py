@@ -1,0 +1,116 @@
+"""Commands that search for something better: tuned values and trained agents."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..baselines.catalogue import baselines_of
+from ..baselines.tuning import FOLDER, save_tuned, tune
+from ..envs.catalogue import importable_name, nearest, task_class
+from ..evaluation.files import writable_folder
+from ..reports.tables import tuned_table
+from .terminal import Environment, TrainingScenario, console, progress_bar
+
+
+def tune_policy(
+    environment: Environment,
+    policy: Annotated[str, typer.Option(help="Policy to tune.")],
+    budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
+    scenario: TrainingScenario = None,
+    seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
+) -> None:
+    """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
+
+    Example: filtergym tune filtergym/ManeuveringTarget-v0 --policy imm --budget 4000000
+    """
+    cls = task_class(environment)
+    tunable = baselines_of(cls.id).tunable
+    if policy not in tunable:
+        raise nearest("tunable policy", policy, tunable)
+    writable_folder(out)
+    with progress_bar() as bar:
+        line = bar.add_task(f"tuning {policy}", total=budget)
+        outcome = tune(
+            cls.id,
+            policy,
+            tunable[policy],
+            budget,
+            scenario,
+            seed,
+            progress=lambda steps: bar.update(line, advance=steps),
+        )
+    console.print(tuned_table(outcome, tunable[policy].start))
+    command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
+    path = save_tuned(outcome, command, out)
+    console.print(f"saved in {path}; use it as --policy {policy}-tuned")
+
+
+def train(
+    environment: Environment,
+    out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
+    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    control: Annotated[
+        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+    ] = None,
+    scenario: TrainingScenario = None,
+    steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
+    envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the training episodes and the network.")] = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+    validate_every: Annotated[
+        int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
+    ] = None,
+) -> None:
+    """Train an agent; Ctrl-C stops it with a checkpoint that --resume goes on from.
+
+    A checkpoint is loaded with pickle, which can execute code: resume only what you trust.
+
+    Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
+    """
+    try:
+        import torch
+
+        from ..agents import training_run
+
+        trainer: Any
+        if algo == "bptt":
+            from ..agents.bptt import train_bptt as trainer
+        else:
+            from ..agents.sb3_training import train_sb3 as trainer
+    except ImportError as error:
+        raise ValueError(
+            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
+        ) from error
+    torch.set_num_threads(1)  # networks this small run slower on more
+    run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario)
+    run = training_run.opened_run(out, run, resume)
+    with progress_bar() as bar:
+        line = bar.add_task(f"training {algo}", total=run.steps)
+        trainer(
+            run,
+            out,
+            resume,
+            validate_every,
+            progress=lambda done: bar.update(line, completed=done),
+            report=lambda text: console.print(text, highlight=False),
+        )
+    console.print(f"{run.steps_done:,} steps done; best agent in {out / 'best'}, checkpoint beside it")
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(help="Folder of a training run.")],
+    out: Annotated[Path | None, typer.Option(help="File; default: agent.safetensors in the folder.")] = None,
+) -> None:
+    """Write a run's best agent as plain arrays, which evaluate without torch and cannot execute anything.
+
+    Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
+    """
+    try:
+        from ..agents.export import export_run
+    except ImportError as error:
+        raise ValueError(f"export needs more packages: pip install 'filtergym[agents]' ({error})") from error
+    path = out or folder / "agent.safetensors"
+    run = export_run(folder, path)
+    console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")

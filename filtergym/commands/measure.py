@@ -1,0 +1,151 @@
+"""Commands that measure: what there is, and how it compares on the same noise."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..baselines.catalogue import baselines_of
+from ..envs.catalogue import catalogue, short_name, task_class
+from ..evaluation.figures import evaluation_figures, save
+from ..evaluation.files import writable_folder
+from ..evaluation.metrics import Record
+from ..names import competitor, evaluate, tidy_records
+from ..reports.benchmark import Cell, run_benchmark
+from ..reports.listing import environment_lines
+from ..reports.records import write_records
+from ..reports.tables import results_table
+from .terminal import (
+    Environment,
+    Episodes,
+    Experiment,
+    ScenarioName,
+    Split,
+    console,
+    parsed_settings,
+    progress_bar,
+)
+
+
+def list_environments(
+    environment: Annotated[
+        list[str] | None,
+        typer.Argument(help="Environment ids, default all; module:id for one that a module registers."),
+    ] = None,
+) -> None:
+    """List environments with their papers, controls, scenarios, policies, references and bounds.
+
+    Example: filtergym list filtergym/ManeuveringTarget-v0
+    """
+    for id in environment or catalogue():
+        first, *lines = environment_lines(id)
+        console.print(f"[bold]{first}[/bold]")
+        for line in lines:
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
+def evaluate_policies(
+    environment: Environment,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(help="Policy, reference or bound; repeat for several. Also module:Class."),
+    ] = None,
+    scenario: ScenarioName = None,
+    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    episodes: Episodes = 500,
+    seed: Experiment = 0,
+    split: Split = "test",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
+    json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+) -> None:
+    """Run policies over the same noise and compare them.
+
+    Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
+    """
+    cls = task_class(environment)
+    known = baselines_of(cls.id)
+    if out is not None:
+        writable_folder(out)
+    if json is not None:
+        writable_folder(json.parent)
+    names = policy or list(known.benchmark or known.names)
+    keywords = parsed_settings(settings or [])
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        dataset = evaluate(
+            cls.id,
+            names,
+            scenario,
+            episodes,
+            seed,
+            split,
+            control,
+            progress=lambda done: bar.update(line, advance=done),
+            **keywords,
+        )
+    records = tidy_records(dataset)
+    console.print(results_table(records))
+    if json is not None:
+        write_records(json, records)
+    if out is not None:
+        write_records(out / "records.json", records)
+        for name, figure in evaluation_figures(dataset):
+            save(figure, out / f"{name}.png")
+        console.print(f"figures and records in {out}")
+
+
+def benchmark(
+    full: Annotated[
+        bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
+    seed: Experiment = 0,
+    environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+    split: Annotated[
+        str, typer.Option(help="test; or validation, for development: training scenarios only.")
+    ] = "test",
+) -> None:
+    """Run every environment with its policies; quick by default, resumes after an interruption.
+
+    Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
+    """
+    with progress_bar() as bar:
+
+        def started(cell: Cell, total: int) -> Any:
+            line = bar.add_task(f"{short_name(cell.environment)} {cell.scenario}", total=total)
+            return lambda done: bar.update(line, advance=done)
+
+        def finished(records: list[Record]) -> None:
+            console.print(results_table(records))
+
+        run_benchmark(out, full, seed, environment or (), split, started, finished)
+    console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+
+
+def animate(
+    environment: Environment,
+    policy: Annotated[list[str], typer.Option(help="Policy; repeat for several.")],
+    out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
+    scenario: ScenarioName = None,
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    every: Annotated[int, typer.Option(help="Actions from one frame to the next.")] = 2,
+) -> None:
+    """Draw an episode under each policy as an animated GIF.
+
+    Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
+    """
+    try:
+        from ..evaluation.animation import episode_frames, write_animation
+    except ImportError as error:
+        raise ValueError(
+            f"animations need more packages: pip install 'filtergym[render]' ({error})"
+        ) from error
+    cls = task_class(environment)
+    writable_folder(out)
+    for name in policy:
+        path = out / f"{cls.id.rpartition('/')[2]}-{name.rpartition(':')[2]}.gif"
+        write_animation(episode_frames(cls.id, name, competitor(cls.id, name), scenario, seed, every), path)
+        console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

@@ -1,0 +1,156 @@
+"""Commands that write tables and pages: comparison, room, reproductions, training seeds."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..baselines.reproduction import paper_module, papers, save_reproduction
+from ..envs.catalogue import find_scenario, importable_name, short_name, task_class
+from ..evaluation.figures import save
+from ..evaluation.files import writable_folder
+from ..reports import comparison, training_seeds
+from ..reports.environment_page import environment_tables, put_tables
+from ..reports.pages import insert_between_markers, split_at_markers
+from ..reports.records import write_records
+from ..reports.room import MARKER, measure_room, room_markdown
+from ..reports.tables import claims_table, grid_table, results_table
+from .terminal import Environment, Episodes, Experiment, Split, console, progress_bar
+
+
+def comparison_page(
+    records: Annotated[Path, typer.Argument(help="benchmark.json of a full benchmark.")],
+    into: Annotated[
+        Path | None,
+        typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
+    ] = None,
+) -> None:
+    """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
+
+    Example: filtergym comparison results/benchmark.json --into docs/comparison.md
+    """
+    found = comparison.read_benchmark(records)
+    markers = {id: f"comparison {short_name(id)}" for id in found}
+    if into is not None:
+        for marker in markers.values():
+            split_at_markers(into, marker)
+    for id, own in found.items():
+        compared = comparison.compare_environment(own)
+        for grid in compared.grids:
+            console.print(grid_table(grid))
+        if into is not None:
+            picture = f"images/comparison_{short_name(id)}.png"
+            save(compared.figure, writable_folder(into.parent / "images") / Path(picture).name)
+            command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
+            text = comparison.comparison_markdown(compared, own, picture, command)
+            insert_between_markers(into, markers[id], text)
+
+
+def room(
+    environment: Environment,
+    episodes: Episodes = 5000,
+    seed: Experiment = 0,
+    into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
+) -> None:
+    """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
+
+    Example: filtergym room filtergym/ManeuveringTarget-v0
+    """
+    cls = task_class(environment)
+    if into is not None:
+        split_at_markers(into, MARKER)  # a page that cannot take the table is refused before the work
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
+    console.print(results_table(records))
+    if into is not None:
+        command = f"filtergym room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
+        insert_between_markers(into, MARKER, room_markdown(records, command))
+
+
+def page(
+    environment: Environment,
+    into: Annotated[Path | None, typer.Option(help="Page whose tables are replaced.")] = None,
+) -> None:
+    """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
+
+    Example: filtergym page filtergym/ManeuveringTarget-v0
+    """
+    if into is not None:
+        console.print(f"{into}: {', '.join(put_tables(environment, into))}", markup=False)
+        return
+    for name, table in environment_tables(environment).items():
+        console.print(f"{name}\n\n{table}\n", markup=False, soft_wrap=True)
+
+
+def reproduce(
+    paper: Annotated[str, typer.Argument(help=f"One of: {', '.join(papers())}.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Monte Carlo runs instead of the module's own.")
+    ] = None,
+) -> None:
+    """Run a paper's experiments again and give a verdict on each of its claims.
+
+    Example: filtergym reproduce imm-alpha-beta --out results/imm-alpha-beta
+    """
+    module = paper_module(paper)
+    if out is not None:
+        writable_folder(out)
+    with progress_bar() as bar:
+        line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
+        result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
+    console.print(claims_table(result))
+    if out is not None:
+        save_reproduction(result, out)
+        console.print(f"report and figures in {out}")
+
+
+def seeds(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
+    scenario: Annotated[
+        list[str] | None, typer.Option(help="Scenario; repeatable. Default: the training distribution.")
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(help="Opponent; repeatable. Default: tunable policies, tuned ones and references."),
+    ] = None,
+    episodes: Episodes = 2000,
+    seed: Experiment = 0,
+    split: Split = "test",
+    out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+    into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="PNG file for the learning curves.")] = None,
+) -> None:
+    """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
+
+    Loads models, which can execute code: score only runs that you trust.
+
+    Example: filtergym seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
+    """
+    found = training_seeds.load_runs(runs)
+    cls = task_class(found[0].run.environment)
+    scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
+    opponents = policy or training_seeds.default_opponents(cls.id)
+    marker = f"seeds {short_name(cls.id)}"
+    for file in (out, curves):
+        if file is not None:
+            writable_folder(file.parent)
+    if into is not None:
+        split_at_markers(into, marker)
+    if curves is not None:
+        save(training_seeds.learning_curves(found), curves)
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records, grids = training_seeds.compare_scenarios(
+            found, opponents, scenarios, episodes, seed, split, lambda done: bar.update(line, advance=done)
+        )
+    for grid in grids:
+        console.print(grid_table(grid))
+    if out is not None:
+        write_records(out, records)
+    if into is not None:
+        command = f"filtergym seeds RUN ... {' '.join(f'--scenario {name}' for name in scenarios)} "
+        command += "".join(f"--policy {name} " for name in policy or ())
+        command += f"--episodes {episodes} --split {split} --seed {seed}"
+        insert_between_markers(into, marker, training_seeds.grids_as_markdown(grids, found, command))

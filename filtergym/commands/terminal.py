@@ -1,0 +1,55 @@
+"""What the commands share: the terminal, and the arguments that several of them take."""
+
+import ast
+import sys
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+Environment = Annotated[
+    str,
+    typer.Argument(
+        help="Environment id; `filtergym list` shows them. module:id for one that a module registers."
+    ),
+]
+ScenarioName = Annotated[str | None, typer.Option(help="Scenario; default: the training distribution.")]
+TrainingScenario = Annotated[str | None, typer.Option(help="A training scenario; held-out ones are refused.")]
+Episodes = Annotated[int, typer.Option(help="Monte Carlo runs.")]
+Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
+Split = Annotated[str, typer.Option(help="test, validation or train.")]
+
+# Wide enough for the results table where the output is a file; a terminal keeps its own width.
+console = Console(width=None if sys.stdout.isatty() else 150)
+
+
+def progress_bar() -> Progress:
+    """Return a progress bar on standard error, so that tables can be piped; none where nobody looks."""
+    errors = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=errors,
+        transient=True,
+        disable=not errors.is_terminal,
+    )
+
+
+def parsed_settings(settings: list[str]) -> dict[str, Any]:
+    """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
+    keywords: dict[str, Any] = {}
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals or not name.strip().isidentifier() or not text.strip():
+            raise ValueError(f"--set needs name=value, such as --set horizon=50, got {setting!r}")
+        try:
+            keywords[name.strip()] = ast.literal_eval(text.strip())
+        except (ValueError, SyntaxError) as error:
+            if not text.strip().replace("-", "_").isidentifier():
+                raise ValueError(f"--set {name}: cannot read the value {text!r}") from error
+            keywords[name.strip()] = text.strip()
+    return keywords
