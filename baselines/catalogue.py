@@ -18,13 +18,14 @@ ADDED: dict[str, Baselines] = {}
 
 
 def packages() -> list[ModuleType]:
-    """Return the packages of this folder, one for each environment."""
-    package = importlib.import_module(__package__)
-    return [
+    """Return the packages of this folder that hold an environment's baselines."""
+    folder = importlib.import_module(__package__)
+    found = [
         importlib.import_module(f"{__package__}.{module.name}")
-        for module in pkgutil.iter_modules(package.__path__)
+        for module in pkgutil.iter_modules(folder.__path__)
         if module.ispkg
     ]
+    return [package for package in found if hasattr(package, "BASELINES")]
 
 
 @cache

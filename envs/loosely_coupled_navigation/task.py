@@ -40,16 +40,7 @@ class LooselyCoupledNavigation(Task):
 
     ### Action Space
 
-    ========  ==================  =======================================================================
-    control   space               meaning
-    ========  ==================  =======================================================================
-    gain      Box(-1, 1, (axes))  gain of this sample, ``1e-5^((1 - a) / 2)``: 1e-5 to 1 on a logarithmic
-                                  scale; exactly 0 (INS only) at -1, exactly 1 (GNSS only) at +1. In
-                                  continuous time ``K = gain / sampling_interval``. Zero is ``gain = 0.0032``,
-                                  ``K = 0.32 1/s``; the reduced tuning is about 0.45 (``K = 4.2 1/s``).
-    mode      Discrete(3)         the filter that is believed: plain-white, plain-reduced, augmented
-    weights   Box(0, 1, (3))      weights of the three estimates, normalised; all zero = uniform
-    ========  ==================  =======================================================================
+    What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
     Without a measurement the gain is zero, whatever the action.
 
@@ -97,6 +88,14 @@ class LooselyCoupledNavigation(Task):
     )
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
+    actions = {
+        "gain": "gain of this sample, `1e-5^((1 - a) / 2)`: 1e-5 to 1 on a logarithmic scale; exactly 0 "
+        "(INS only) at -1, exactly 1 (GNSS only) at +1. In continuous time `K = gain / "
+        "sampling_interval`. Zero is `gain = 0.0032`, `K = 0.32 1/s`; the paper's reduced tuning "
+        "is about 0.45 (`K = 4.2 1/s`)",
+        "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
+        "weights": "weights of the three estimates, normalised; all zero is uniform",
+    }
     banks = {"gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
     scenarios = SCENARIOS
     modes = SCHEMES

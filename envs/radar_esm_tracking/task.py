@@ -54,13 +54,7 @@ class RadarEsmTracking(Task):
 
     ## Action Space
 
-    | control | space | meaning |
-    |---|---|---|
-    | `evidence` (default) | `Box(-1, 1, (3,))` | times `evidence_scale` nats, added to log P; 0: the paper |
-    | `mode` | `Discrete(3)` | the class that is believed |
-    | `weights` | `Box(0, 1, (3,))` | class probabilities, normalised; all zero is uniform |
-
-    Values outside the box are taken at its edge.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
     ## Observation Space
 
@@ -107,6 +101,11 @@ class RadarEsmTracking(Task):
     )
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
+    actions = {
+        "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
+        "mode": "the class that is believed",
+        "weights": "class probabilities, normalised; all zero is uniform",
+    }
     banks = {"evidence": ClassBank, "mode": ClassBank, "weights": ClassBank}
     scenarios = SCENARIOS
     components = (

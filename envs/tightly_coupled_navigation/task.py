@@ -48,15 +48,7 @@ class TightlyCoupledNavigation(Task):
 
     ## Action Space
 
-    * `gain` (default): `Box(-1, 1, (4,))`, what the standard deviation of the noise is taken to be, over the
-      nominal one, for each sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of
-      a positive action, 3 to that of a negative one; under the paper's probabilities, for faults that no
-      weight can cure. Zero is the paper's algorithm.
-    * `evidence`: `Box(-1, 1, (3,))`, 10 nats each added to the log-posterior of the hypotheses; zero is the
-      paper's algorithm.
-    * `mode`: `Discrete(3)`, the one hypothesis believed. The bank mixes on its weights, so this collapses it
-      to one filter that switches its model.
-    * `weights`: `Box(0, 1, (3,))`, normalised; all zero is uniform.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
     The weights are used for the combination and as the prior of the next mixing.
 
@@ -101,6 +93,17 @@ class TightlyCoupledNavigation(Task):
     )
     Parameters = TightlyCoupledNavigationParameters
     World = NavigationWorld
+    actions = {
+        "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
+        "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "
+        "positive action, 3 to that of a negative one; under the paper's probabilities, for "
+        "faults that no weight can cure; **0 is the paper's algorithm**",
+        "evidence": "times `evidence_scale` nats, added to the log-posterior of the hypotheses; **0 is the "
+        "paper's algorithm**",
+        "mode": "the one hypothesis believed; the bank mixes on its weights, so this collapses it to one "
+        "filter that switches its model",
+        "weights": "weights of the three filters, normalised; all zero is uniform",
+    }
     banks = {
         "gain": NoiseBank,
         "evidence": HypothesisBank,

@@ -49,12 +49,7 @@ class UavAutopilot(Task):
 
     ## Action Space
 
-    | control | space | meaning |
-    |---|---|---|
-    | `gain` (default) | `Box(-1, 1, (1,))` | the process noise Q of the filter is scaled by 10^(2a) in the update by the measurement that was just shown; 0 is the paper's filter |
-    | `mode` | `Discrete(3)` | 0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held during dropouts), zero for coordinates without a sensor; the filter runs on behind |
-
-    Values outside the box are taken at its edge.
+    What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
     ## Observation Space
 
@@ -102,6 +97,12 @@ class UavAutopilot(Task):
     )
     Parameters = UavAutopilotParameters
     World = AircraftWorld
+    actions = {
+        "gain": "the process noise Q of the filter is scaled by 10^(2a) (`gain_decades` = 2) in the "
+        "update by the measurement that was just shown; **0 is the paper's filter**",
+        "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
+        "during dropouts), zero for coordinates without a sensor; the filter runs on behind",
+    }
     banks = {"gain": GainBank, "mode": ModeBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
