@@ -68,7 +68,7 @@ def _names(block: Block) -> str:
         return f"`{block.name}`"
     if len(block.parts) <= PARTS_SHOWN:
         return ", ".join(f"`{block.name}_{part}`" for part in block.parts)
-    return f"`{block.name}_` and one of " + ", ".join(f"`{part}`" for part in block.parts)
+    return f"`{block.name}` ending in " + ", ".join(f"`_{part}`" for part in block.parts)
 
 
 def _fields(cls: type[Task]) -> list[str]:
