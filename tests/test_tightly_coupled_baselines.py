@@ -16,7 +16,8 @@ from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LIN
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import run_bound, run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds
-from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.filters import gnss_ins
+from naive import dense
 
 from filtergym import evaluate, tidy_records
 
@@ -97,7 +98,7 @@ def test_bound_is_the_dense_recursion():
                 P[8:11] = P[:, 8:11] = 0.0
             position, velocity = task.satellites_at(truth.step)
             _, rows = gnss_ins.observe(truth.state, position, velocity, said.ins_angles, p.gravity)
-            H = extended_kalman.dense(rows, truth.state)[..., lane]
+            H = dense(rows, truth.state)[..., lane]
             R = numpy.array(task.sensor_variance) * truth.noise_factor[:, lane] ** 2
             there = said.available[:, lane] > 0.0
             there[2 * S : 2 * S + 3] &= truth.stuck[lane] == 0.0
@@ -291,7 +292,7 @@ def test_filters_side_by_side_are_the_filters_alone():
         for c, part in enumerate(experiment.PARTS):
             expected = (error[:, :, part] ** 2).sum(axis=2)
             # The weights pass through the observation's logarithms; the bank amplifies their rounding.
-            numpy.testing.assert_allclose(run.squares[c], expected, rtol=1e-5, atol=1e-9)
+            numpy.testing.assert_allclose(run.squares[:, :, c], expected, rtol=1e-5, atol=1e-9)
         if name != "known-mode":
             nis = dataset["nis"].sel(policy=name).values / dataset["nis_degrees"].sel(policy=name).values
             numpy.testing.assert_allclose(run.nis, nis[: len(run.nis)], rtol=1e-5)
