@@ -9,7 +9,8 @@ from filtergym.envs.tightly_coupled_navigation.parameters import (
 )
 from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
 from filtergym.envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
-from filtergym.filters import extended_kalman, gnss_ins
+from filtergym.filters import gnss_ins
+from naive import dense
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
 
@@ -69,7 +70,7 @@ def naive_bank(task, state, posterior):
         expected, rows = gnss_ins.observe(
             mean[:, None], said.satellite_position, said.satellite_velocity, said.ins_angles, p.gravity
         )
-        H = extended_kalman.dense(rows, mean[:, None])[..., 0]
+        H = dense(rows, mean[:, None])[..., 0]
         nu = (said.readings - expected)[:, 0]
         R = numpy.diag(task.sensor_variance)
         S = H @ P @ H.T + R
