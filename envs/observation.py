@@ -123,17 +123,13 @@ class Blocks:
             if len(set(table)) != len(table):
                 raise ValueError(f"names of an observation must differ, got {table}")
         # One call of a compression for all blocks that share it: calls cost more than numbers.
-        shared: dict[int, list[int]] = {}
+        shared: dict[Callable[[Array, ModuleType], Array], list[int]] = {}
         for i, block in enumerate(self.blocks):
             if block.shown.forward is not None:
-                shared.setdefault(id(block.shown.forward), []).append(i)
+                shared.setdefault(block.shown.forward, []).append(i)
         self._shared = [
-            (
-                self.blocks[members[0]].shown.forward,
-                members,
-                [len(_field_names(self.blocks[i])) for i in members],
-            )
-            for members in shared.values()
+            (forward, members, [len(_field_names(self.blocks[i])) for i in members])
+            for forward, members in shared.items()
         ]
         self._values = [block.value for block in self.blocks]
 
