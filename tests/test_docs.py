@@ -56,7 +56,7 @@ def test_page_names_everything(id):
 
 @pytest.mark.parametrize("id", catalogue())
 def test_page_names_every_field(id):
-    words = set(re.findall(r"`([a-zA-Z0-9_]+)`", page(id)))
+    words = set(re.findall(r"`([a-zA-Z0-9_-]+)`", page(id)))
     for control in catalogue()[id].controls:
         for field in make_task(id, control).fields:
             # A page may leave out the numbers or letters that tell filters, satellites and axes apart.
