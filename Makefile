@@ -4,7 +4,24 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := filtergym filters envs evaluation baselines agents tests benchmarks
 
-.PHONY: benchmark test coverage check format docs clean
+# Numbers, and every library once: gymnasium, scipy, xarray, matplotlib, typer and rich, safetensors.
+CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
+  test_linear_systems.py test_bounds.py test_files.py \
+  test_evaluation.py::test_tuning_improves_on_fresh_episodes_and_is_repeatable \
+  test_evaluation.py::test_dataset_has_named_axes_and_units \
+  test_evaluation.py::test_records_follow_from_the_dataset \
+  test_rendering.py::test_frames_are_images_that_change \
+  test_agents_policies.py::test_shipped_agents_need_no_torch \
+  test_command_line.py::test_help_of_every_command_ends_with_an_example \
+  test_command_line.py::test_progress_bar_says_nothing_where_nobody_looks \
+  test_command_line.py::test_list_names_everything \
+  test_command_line.py::test_evaluate_writes_tidy_records_and_figures)
+# What reads files beside the packages, so that an unpacked source distribution must hold them.
+SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
+  test_example_environment.py test_observation.py)
+DISTRIBUTIONS := build/distributions
+
+.PHONY: benchmark test coverage core-tests test-lowest test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark
@@ -14,6 +31,34 @@ test: $(VENV)/.dev  ## run the whole test suite
 
 coverage: $(VENV)/.dev  ## the same, and show the lines that no test reaches
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --cov --cov-report=term
+
+core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch
+	$(PYTHON) -m venv build/$(ENVIRONMENT)
+	build/$(ENVIRONMENT)/bin/python -m pip install --quiet --constraint $(VERSIONS) --editable . pytest hypothesis
+	OMP_NUM_THREADS=1 build/$(ENVIRONMENT)/bin/python -m pytest $(CORE_TESTS)
+
+test-lowest:  ## core tests with the lowest versions that pyproject.toml declares
+	mkdir -p build
+	$(PYTHON) -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
+	  print('\n'.join(project['dependencies']).replace('>=', '=='))" > build/lowest.txt
+	$(MAKE) core-tests ENVIRONMENT=lowest VERSIONS=build/lowest.txt
+
+test-pythons:  ## core tests with every newer Python that is found
+	@for version in 3.12 3.13; do \
+	  if python$$version -c "" 2> /dev/null; then \
+	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
+	  else echo "Python $$version is not here: its core tests are skipped."; fi; \
+	done
+
+distributions: $(VENV)/.dev  ## build what would be published; try the wheel, and the tests of the unpacked source
+	rm -rf $(DISTRIBUTIONS)
+	$(BIN)/python -m build --outdir $(DISTRIBUTIONS) . > /dev/null
+	$(PYTHON) -m venv $(DISTRIBUTIONS)/venv
+	cd $(DISTRIBUTIONS) && venv/bin/python -m pip install --quiet --constraint ../../constraints.txt *.whl
+	cd $(DISTRIBUTIONS) && OMP_NUM_THREADS=1 venv/bin/python ../../tests/check_distributions.py *.tar.gz *.whl
+	cd $(DISTRIBUTIONS) && mkdir source && tar -xzf *.tar.gz --strip-components 1 -C source
+	cd $(DISTRIBUTIONS)/source && ../venv/bin/python -m pip install --quiet --constraint constraints.txt \
+	  --editable . pytest hypothesis && OMP_NUM_THREADS=1 ../venv/bin/python -m pytest $(SOURCE_TESTS)
 
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)

@@ -2,11 +2,13 @@
 
 import sys
 from collections.abc import Callable
+from typing import Annotated
 
 import gymnasium
 import typer
 from rich.console import Console
 
+from . import __version__
 from .commands import improve, measure, report
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -25,10 +27,24 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"filtergym {__version__}")
+        raise typer.Exit
+
+
+def _general(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Gymnasium environments for adaptive-filter benchmarking."""
+
+
 def main() -> None:
     """Run the command line; a user's mistake ends in one sentence and exit code 2."""
     app = typer.Typer(
-        help="Gymnasium environments for adaptive-filter benchmarking.",
+        callback=_general,
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

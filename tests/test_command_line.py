@@ -1,10 +1,14 @@
 """The command line: what it prints, what it writes, and one clear sentence for every mistake."""
 
+import importlib.metadata
 import json
 import subprocess
 import sys
 
 import pytest
+
+from filtergym.__main__ import COMMANDS, main
+from filtergym.commands.terminal import progress_bar
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -13,6 +17,29 @@ def run(*arguments, cwd):
     return subprocess.run(
         [sys.executable, "-m", "filtergym", *arguments], capture_output=True, text=True, cwd=cwd, check=False
     )
+
+
+def test_version_is_that_of_the_installed_package(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["filtergym", "--version"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f"filtergym {importlib.metadata.version('filtergym')}\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_every_command_ends_with_an_example(command, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["filtergym", command, "--help"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0
+    assert f"Example: filtergym {command}" in capsys.readouterr().out
+
+
+def test_progress_bar_says_nothing_where_nobody_looks(capsys):
+    with progress_bar() as bar:
+        bar.add_task("evaluating", total=None)
+    assert capsys.readouterr().err == ""
 
 
 def test_list_names_everything(tmp_path):

@@ -1,15 +1,22 @@
-"""The README's snippets run as they stand, and its files and folders exist."""
+"""The snippets of README and of the package index's page run as they stand; what they point to exists."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+from filtergym.envs.catalogue import catalogue
 
 README = Path(__file__).parent.parent / "README.md"
-SNIPPETS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
+INDEX_PAGE = README.parent / "docs" / "package_index.md"
+SNIPPETS = [
+    snippet
+    for page in (README, INDEX_PAGE)
+    for snippet in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+]
 
 
-@pytest.mark.parametrize("snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer"])
+@pytest.mark.parametrize("snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer", "index"])
 def test_snippet_runs(snippet, capsys):
     if "stable_baselines3" in snippet:
         pytest.importorskip("stable_baselines3")
@@ -22,3 +29,16 @@ def test_links_exist():
     text = README.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#:]+)\)", text):
         assert (README.parent / target).exists(), target
+
+
+def test_page_of_the_package_index_has_no_relative_link():
+    """There the page stands alone, without the files beside it."""
+    project = tomllib.loads((README.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert README.parent / project["readme"] == INDEX_PAGE
+    links = re.findall(r"\]\(([^)]+)\)", INDEX_PAGE.read_text(encoding="utf-8"))
+    assert [link for link in (*links, *project.get("urls", {}).values()) if "://" not in link] == []
+
+
+def test_index_page_names_every_environment():
+    text = INDEX_PAGE.read_text(encoding="utf-8")
+    assert [id for id in catalogue() if f"`{id}`" not in text] == []

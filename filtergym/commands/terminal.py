@@ -27,6 +27,7 @@ console = Console(width=None if sys.stdout.isatty() else 150)
 def progress_bar() -> Progress:
     """Return a progress bar on standard error, so that tables can be piped; none where nobody looks."""
     errors = Console(stderr=True)
+    errors.quiet = not errors.is_terminal  # rich before 14.3 ends a disabled bar with an empty line
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -35,7 +36,7 @@ def progress_bar() -> Progress:
         TimeRemainingColumn(),
         console=errors,
         transient=True,
-        disable=not errors.is_terminal,
+        disable=errors.quiet,
     )
 
 

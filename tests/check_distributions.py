@@ -1,0 +1,66 @@
+"""Try what would be published: run by `make package`, in a clean environment that has the wheel and no torch."""
+
+import importlib.util
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import gymnasium
+import numpy
+
+import filtergym
+from filtergym.envs.catalogue import catalogue
+
+ROOMS = ("filters", "envs", "evaluation", "baselines", "agents", "filtergym")
+
+
+def check_wheel(wheel: Path, source: Path) -> None:
+    """It holds every file of the rooms, and nothing else but what describes it."""
+    files = [path for room in ROOMS for path in (source / room).rglob("*") if path.is_file()]
+    names = [path.relative_to(source).as_posix() for path in files if "__pycache__" not in path.parts]
+    wanted = {name if name.startswith("filtergym/") else f"filtergym/{name}" for name in names}
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert held == wanted, sorted(held ^ wanted)
+
+
+def check_source_distribution(archive: Path, source: Path) -> None:
+    """It holds every file of the repository but `.gitignore`; where this is no repository there is nothing to ask."""
+    if not (source / ".git").exists():
+        return
+    listed = subprocess.run(["git", "ls-files"], cwd=source, capture_output=True, text=True, check=True).stdout
+    held = {name.partition("/")[2] for name in tarfile.open(archive).getnames()}
+    assert not (missing := set(listed.split()) - held - {".gitignore"}), sorted(missing)
+
+
+def check_installed() -> None:
+    """Environments are made and stepped; shipped agents and tuned values are found and play, without torch."""
+    assert importlib.util.find_spec("torch") is None
+    for id in catalogue():
+        env = gymnasium.make(id)
+        env.reset(seed=0)
+        assert numpy.isfinite(env.step(env.action_space.sample())[1]), id
+        results = filtergym.evaluate(id, ["bptt"], episodes=2)
+        assert numpy.isfinite(results["error"]).all(), id
+
+
+def check_command_line() -> None:
+    """The installed command lists, evaluates a tuned policy and a shipped agent, and knows its version."""
+    command = Path(sys.executable).parent / "filtergym"
+    evaluate = "evaluate filtergym/ManeuveringTarget-v0 --policy imm-tuned --policy ppo --episodes 2"
+    for arguments, expected in (("--version", filtergym.__version__), ("list", "bptt"), (evaluate, "imm-tuned")):
+        ran = subprocess.run([command, *arguments.split()], capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
+        assert expected in ran.stdout
+
+
+if __name__ == "__main__":
+    source = Path(__file__).resolve().parent.parent
+    assert "site-packages" in filtergym.__file__
+    archive, wheel = map(Path, sys.argv[1:])
+    check_wheel(wheel, source)
+    check_source_distribution(archive, source)
+    check_installed()
+    check_command_line()
+    print(f"{wheel.name} and {archive.name} hold what they should, and the wheel runs.")
