@@ -155,7 +155,10 @@ class UavAutopilot(Task):
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What is fed back is recorded too: the control that follows from the estimate."""
-        return {**super().records(episode), "control_signal": self.bank.feedback(episode.bank)}
+        return {
+            **super().records(episode),
+            "control_signal": self._estimating(episode).feedback(episode.bank),
+        }
 
 
 TASK = UavAutopilot

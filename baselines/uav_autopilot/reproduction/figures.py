@@ -7,7 +7,7 @@ import numpy
 from ....envs.uav_autopilot.task import UavAutopilot
 from ....evaluation.figures import COLOURS
 from ...reproduction.panels import finish, legend_outside, looks, panels
-from ..policies import stationary
+from ..theory import stationary
 from .experiment import (
     HORIZON,
     SETTLED,
