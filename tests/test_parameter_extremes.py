@@ -116,13 +116,15 @@ def finding(env_id, keywords, kind, rng):
             if lowest < -1e-9:
                 wrong.append(f"correlations with an eigenvalue of {lowest:.2g}")
 
-    for step in range(min(DECISIONS, lanes.decisions_per_episode) + 1):
+    last = min(DECISIONS, lanes.decisions_per_episode)
+    for step in range(last + 1):
         shown = np.isfinite(lanes.observe()).all(axis=0)
         wrong.extend(f"observation {task.fields[i].name}" for i in np.flatnonzero(~shown))
         if wrong:
             return f"step {step}: {', '.join(wrong)}"
         action = lanes.widened(actions(task.action_space, rng, step))
-        lanes.step(lambda state, action=action: task.act(state, action), record)
+        if step < last:
+            lanes.step(lambda state, action=action: task.act(state, action), record)
     return ""
 
 
