@@ -31,6 +31,20 @@ OBSERVATION_LIMIT = 10.0
 """Normalised observations are cut here, as in VecNormalize."""
 
 
+ROWS = 8
+"""Observations in one matrix product."""
+
+
+def _product(rows: numpy.ndarray, weight: numpy.ndarray) -> numpy.ndarray:
+    """``rows @ weight.T`` in products of one shape: BLAS rounds by the shape, and an observation's action must
+    not depend on how many others there are.
+    """
+    count, width = rows.shape
+    padded = numpy.zeros((-(-count // ROWS), ROWS, width), rows.dtype)
+    padded.reshape(-1, width)[:count] = rows
+    return (padded @ weight.T).reshape(-1, len(weight))[:count]
+
+
 def _logistic(x: numpy.ndarray) -> numpy.ndarray:
     return 0.5 * (1.0 + numpy.tanh(0.5 * x))
 
@@ -70,7 +84,7 @@ class LearnedPolicy(Policy):
             state = self._long_short_term(x, memory)
             x = numpy.split(state, 2, axis=1)[0]
         for i, (weight, bias) in enumerate(self.layers):
-            x = x @ weight.T + bias
+            x = _product(x, weight) + bias
             if i < len(self.layers) - 1:
                 x = self.activation(x)
         if self.output == "argmax":
@@ -88,8 +102,10 @@ class LearnedPolicy(Policy):
     def _gated_unit(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
         """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
         a = self.arrays
-        from_input = numpy.split(x @ a["gru_input_weight"].T + a["gru_input_bias"], 3, axis=1)
-        from_memory = numpy.split(memory @ a["gru_memory_weight"].T + a["gru_memory_bias"], 3, axis=1)
+        from_input = _product(x, a["gru_input_weight"]) + a["gru_input_bias"]
+        from_input = numpy.split(from_input, 3, axis=1)
+        from_memory = _product(memory, a["gru_memory_weight"]) + a["gru_memory_bias"]
+        from_memory = numpy.split(from_memory, 3, axis=1)
         reset = _logistic(from_input[0] + from_memory[0])
         update = _logistic(from_input[1] + from_memory[1])
         new = numpy.tanh(from_input[2] + reset * from_memory[2])
@@ -99,8 +115,8 @@ class LearnedPolicy(Policy):
         """One step of the long short-term memory (Gers et al., 2000): what it shows, beside its cells."""
         a = self.arrays
         shown, cells = numpy.split(memory, 2, axis=1)
-        gates = x @ a["lstm_input_weight"].T + a["lstm_input_bias"]
-        gates = gates + shown @ a["lstm_memory_weight"].T + a["lstm_memory_bias"]
+        gates = _product(x, a["lstm_input_weight"]) + a["lstm_input_bias"]
+        gates = gates + _product(shown, a["lstm_memory_weight"]) + a["lstm_memory_bias"]
         admit, keep, new, show = numpy.split(gates, 4, axis=1)
         cells = _logistic(keep) * cells + _logistic(admit) * numpy.tanh(new)
         return numpy.concatenate([_logistic(show) * numpy.tanh(cells), cells], axis=1)

@@ -4,6 +4,7 @@ Zero is exactly the policy, so learning starts from it instead of from nothing. 
 of the action space, as every action is. Training over many environments: ``to_sb3(env, residual_to=policy)``.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -84,6 +85,12 @@ class ResidualPolicy(Policy):
         check_residual(task, policy)
         self.control = task.control  # type: ignore[misc]
         self.policy, self.agent = policy, agent
+
+    def begin(self, seeds: Sequence[int]) -> tuple[Any, Any]:
+        """Memories of both."""
+        both = self.policy, self.agent
+        first, second = (part.begin(seeds) if isinstance(part, Policy) else None for part in both)
+        return first, second
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Add both answers."""

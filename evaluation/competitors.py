@@ -6,6 +6,7 @@ competitor knows; it is never ranked with policies. A **bound** is computed. Eac
 what says nothing is a policy, such as a model of Stable-Baselines3.
 """
 
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol
 
 import numpy
@@ -33,6 +34,13 @@ class Policy:
 
     def __init__(self, task: Task) -> None:
         self.task = task
+
+    def begin(self, seeds: Sequence[int]) -> Any:
+        """Memory at the start of the episodes with these seeds, for the first :meth:`predict` of an evaluation.
+
+        A policy that draws numbers draws them from the seeds, so that an episode stays what it is in any company.
+        """
+        return None
 
     def predict(
         self,
@@ -84,13 +92,17 @@ class RandomPolicy(Policy):
         super().__init__(task)
         self.control = task.control  # type: ignore[misc]  # it suits every control
 
+    def begin(self, seeds: Sequence[int]) -> list[numpy.random.Generator]:
+        """Give every episode a generator of its own, of the policy's seed and the episode's."""
+        return [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
+
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Draw from the action space with a generator of the policy's own."""
-        generator = numpy.random.default_rng(self.seed) if state is None else state
+        """Draw from the action space, each row from its generator."""
+        generators = self.begin(range(len(observation))) if state is None else state
         space: Any = self.task.action_space
         if hasattr(space, "n"):
-            return generator.integers(0, space.n, len(observation)), generator
-        return generator.uniform(space.low, space.high, (len(observation), *space.shape)), generator
+            return numpy.array([generator.integers(space.n) for generator in generators]), generators
+        return numpy.stack([generator.uniform(space.low, space.high) for generator in generators]), generators
 
 
 class Reference(Protocol):

@@ -9,9 +9,12 @@ from ..envs.environment import checked_action
 from ..envs.lanes import Lanes
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
+from .competitors import Policy
 
 Progress = Callable[[int], None]
 """Told the number of measurements just done."""
+MODEL_ROWS = 128
+"""Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
 
 
 def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
@@ -29,6 +32,17 @@ def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], N
     return lanes
 
 
+def _episodes_of_calls(policy: Any, lanes: Lanes) -> list[numpy.ndarray]:
+    """Episodes that each call of ``predict`` is shown, the last one repeated to fill up.
+
+    Matrix products round by their shape, and an episode must not depend on how many others there are: the rows
+    are as many as the engine's lanes, and for a model of Stable-Baselines3 always the same.
+    """
+    rows = MODEL_ROWS if hasattr(policy, "observation_space") else lanes.width
+    firsts = range(0, lanes.count, rows)
+    return [numpy.minimum(numpy.arange(first, first + rows), lanes.count - 1) for first in firsts]
+
+
 def run_policy(
     task: Task, policy: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
 ) -> None:
@@ -42,17 +56,25 @@ def run_policy(
         tick: told of progress.
     """
     lanes = started_lanes(task, seeds)
-    memory: Any = None
-    start = numpy.ones(lanes.count, dtype=bool)
+    calls = _episodes_of_calls(policy, lanes)
+    memories = [
+        policy.begin([seeds[i] for i in call]) if isinstance(policy, Policy) else None for call in calls
+    ]
+    first = True
     for _ in range(lanes.decisions_per_episode):
-        answer, memory = policy.predict(lanes.observe(), memory, start, deterministic=True)
-        action = lanes.widened(checked_action(task.action_space, answer, lanes.count))
+        shown = lanes.observe()
+        answers = []
+        for c, call in enumerate(calls):
+            start = numpy.full(len(call), first)
+            answer, memories[c] = policy.predict(shown[call], memories[c], start, deterministic=True)
+            answers.append(checked_action(task.action_space, answer, len(call)))
+        action = lanes.widened(numpy.concatenate(answers)[: lanes.count])
 
         def update(state: Any, action: Array = action) -> Any:
             return task.act(state, action)
 
         lanes.step(update, lambda state, _: record(state))
-        start = numpy.zeros(lanes.count, dtype=bool)
+        first = False
         tick(lanes.count * task.decision_interval)
 
 

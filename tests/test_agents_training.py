@@ -342,3 +342,21 @@ class TestCommandLine:
         assert printed.err.startswith("Error: scenario 'paper' is held out")
         assert self.run(monkeypatch, capsys, "export", tmp_path / "x")[0] == 2
         assert not (tmp_path / "x").exists()
+
+
+def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
+    saved = []
+    run = small_run("ppo", 100)
+    save_agent = lambda _: saved.append(run.steps_done)  # noqa: E731
+    books = training_run.Bookkeeping(
+        run, tmp_path, 10, lambda _: None, save_agent, None, lambda: False, lambda _: None
+    )
+    costs = iter([3.0, 5.0, 2.0, 2.0, 4.0])
+    books.validation.score = lambda _: {
+        "steps": run.steps_done, "cost": next(costs), "paper": "imm", "paper_cost": 1.0,
+        "relative_cost_difference": [0.0, 0.0, 0.0],
+    }  # fmt: skip
+    for steps in (10, 20, 30, 40, 50):
+        books.safe_point(steps)
+    assert saved == [10, 30]
+    assert run.best["steps"] == 30

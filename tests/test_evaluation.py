@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 import xarray
+from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.tuning import mean_cost, merged_table, stored_values, tune
 from filtergym.evaluation.competitors import Policy
@@ -136,6 +137,21 @@ def test_tuning_improves_on_fresh_episodes_and_is_repeatable():
     assert first.cost < first.untuned_cost
     seeds = episode_seeds("validation", 1, 128)
     assert mean_cost(ENV, "random", tunable, tunable.start, seeds) == pytest.approx(first.untuned_cost)
+
+
+def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
+    """On the training episodes the largest value is the best, on fresh ones the start is."""
+    tunable = baselines_of(ENV).tunable["fixed-best"]
+    train = episode_seeds("train", 0, 8)
+    (name,) = tunable.start
+
+    def flattered(id, scenario, tunable, values, seeds):
+        return -values[name] if seeds == train else 1.0 + abs(values[name] - tunable.start[name])
+
+    monkeypatch.setattr(tuning, "mean_cost", flattered)
+    outcome = tune(ENV, "fixed-best", tunable, 20 * 8 * 100, episodes=8)
+    assert outcome.values == pytest.approx(tunable.start, rel=1e-5)
+    assert outcome.cost == outcome.untuned_cost == 1.0
 
 
 def test_tuning_refuses_held_out_scenarios_and_small_budgets():

@@ -110,8 +110,9 @@ class UavAutopilotParameters(TaskParameters):
     moment_disturbance: float = parameter(4.0, above=0.0)
     """Intensity of the noise on the pitch acceleration, (deg/s^2)^2 s. Ours: gusts alone have a zero at the
     origin towards the pitch rate, so the filter would have no steady state."""
-    actuator_disturbance: float = parameter(0.4, at_least=0.0)
-    """Intensity of the noise on the elevator rate, (deg/s)^2 s. Ours: play of the linkage."""
+    actuator_disturbance: float = parameter(0.4, above=0.0)
+    """Intensity of the noise on the elevator rate, (deg/s)^2 s. Ours: play of the linkage; without any the filter
+    would come to know the elevator exactly, and its covariance would be singular."""
 
     step_size: float = 0.0
     """Step of the command, in units of the output."""
@@ -139,9 +140,9 @@ class UavAutopilotParameters(TaskParameters):
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
     """Range of their length in measurements. Ours: up to half a settling time."""
 
-    gain_decades: float = parameter(2.0, above=0.0)
+    gain_decades: float = parameter(2.0, above=0.0, at_most=8.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the
-    circle for every positive scale, so the limit is what is useful."""
+    circle for every positive scale, so the value is what is useful; the limit is half the digits of a number."""
     wide_band_scale: float = parameter(100.0, above=0.0)
     """Scale of the process noise in mode "wide-band"."""
     averaging_measurements: float = parameter(20.0, at_least=1.0)

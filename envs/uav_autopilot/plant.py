@@ -94,12 +94,17 @@ def design(parameters: UavAutopilotParameters) -> Design:
     """Design the loop.
 
     Raises:
-        ValueError: if L does not stabilise the plant, or the sensors do not determine the state.
+        ValueError: if the plant diverges at once, L does not stabilise it, or the sensors do not determine the state.
     """
     if parameters.plant == "P":
         model = true_model = constant_rate(parameters)
     else:
         model, true_model = pitch_channel(parameters), pitch_channel(parameters, parameters.actuator_lag)
+    if not all(numpy.isfinite(part).all() for part in (*model, *true_model)):
+        raise ValueError(
+            f"the plant must move finitely in one sampling_interval, {parameters.value('sampling_interval')} s: "
+            "its coefficients make it diverge faster than numbers can say"
+        )
     names = [c.name for c in COORDINATES[parameters.plant]]
     H = numpy.eye(len(names))[[names.index(sensor) for sensor in parameters.value("sensors")]]
     R = numpy.diag(numpy.square(parameters.value("sensor_sigmas")))

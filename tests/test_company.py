@@ -1,0 +1,68 @@
+"""Episode i is episode i, bit for bit, whatever the number of episodes that are evaluated with it."""
+
+import importlib
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.residual import ResidualPolicy
+from filtergym.baselines.names import own_names
+from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.competitors import RandomPolicy
+
+from filtergym import evaluate
+from filtergym.names import competitor
+
+module = importlib.import_module("filtergym.evaluation.evaluate")
+ID = "filtergym/ManeuveringTarget-v0"
+
+
+def assert_same(some, more):
+    """The episodes of one dataset are the first of the other."""
+    for name in more:
+        expected = more[name].values
+        if "episode" in more[name].dims:
+            expected = expected[:, : some.sizes["episode"]]
+        np.testing.assert_array_equal(some[name].values, expected, err_msg=str(name))
+
+
+def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
+    names = [*own_names(env_id), *shipped_agents(env_id)]
+    everyone = evaluate(env_id, names, episodes=13, **short)
+    for count in (1, 3):
+        assert_same(evaluate(env_id, names, episodes=count, **short), everyone)
+    monkeypatch.setattr(module, "CHUNK", 8)
+    assert_same(evaluate(env_id, names, episodes=13, **short), everyone)
+
+
+def residual(task):
+    """Random corrections of random actions."""
+    return ResidualPolicy(task, RandomPolicy(task), competitor(ID, "adaptive")(task))
+
+
+residual.control = "gain"
+
+
+def test_random_actions_are_every_episodes_own(monkeypatch):
+    makers = {"random": "random", "residual": residual}
+    monkeypatch.setattr(module, "CHUNK", 8)
+    everyone = evaluate(ID, makers, episodes=17, horizon=10)
+    assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
+    policy = RandomPolicy(make_task(ID, "gain"))
+    observation = np.zeros((17, len(policy.task.fields)))
+    actions, _ = policy.predict(observation, policy.begin(everyone["episode_seed"].values.tolist()))
+    assert len(np.unique(actions)) == 17
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo"])
+def test_a_model_is_asked_about_as_many_always(algorithm):
+    pytest.importorskip("sb3_contrib")
+    from filtergym.agents.sb3_training import ALGORITHMS
+
+    env = gymnasium.make(ID, horizon=10)
+    policy = "MlpLstmPolicy" if algorithm == "recurrent-ppo" else "MlpPolicy"
+    model = ALGORITHMS[algorithm](policy, env, seed=0, device="cpu", n_steps=8, batch_size=8)
+    everyone = evaluate(ID, {"model": model}, episodes=130, horizon=10)
+    for count in (1, 3):
+        assert_same(evaluate(ID, {"model": model}, episodes=count, horizon=10), everyone)

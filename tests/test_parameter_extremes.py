@@ -1,0 +1,193 @@
+"""Parameters at the ends of their limits, alone and together: finite numbers, or one sentence that says why not.
+
+A few combinations here; every end alone and 2000 combinations of each environment by
+``python tests/test_parameter_extremes.py 2000``.
+"""
+
+import sys
+import types
+import typing
+import warnings
+
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import catalogue, find_scenario, make_task
+from filtergym.envs.lanes import Lanes
+from filtergym.envs.parameters import declared
+from filtergym.envs.reward import REWARDS, paper_task, reward
+
+ENDLESS = {float: (-1e6, -1e-6, 1e-6, 1e6), int: (1, 2, 300)}
+"""Where a limit leaves a number open: extreme, and still sensible in some unit."""
+DECISIONS = 12
+
+
+def ends(number, limits):
+    """Numbers at the ends of what limits allow."""
+    closed = [limits.at_least, limits.at_most]
+    beside = [(limits.above, 1e-6), (limits.below, -1e-6)]
+    found = [*ENDLESS[number], *closed, *(end + step for end, step in beside if end is not None)]
+    return sorted(
+        number(value)
+        for value in {v for v in found if v is not None}
+        if (limits.above is None or value > limits.above)
+        and (limits.at_least is None or value >= limits.at_least)
+        and (limits.below is None or value < limits.below)
+        and (limits.at_most is None or value <= limits.at_most)
+    )
+
+
+def extremes(hint, limits, value):
+    """Values of a parameter at its ends, as long as the one that it has."""
+    if typing.get_origin(hint) in (types.UnionType, typing.Union):
+        inner = next(other for other in typing.get_args(hint) if other is not types.NoneType)
+        return [None, *extremes(inner, limits, value)]
+    if hint is bool:
+        return [False, True]
+    if hint is str:
+        return list(limits.choices)
+    if hint in ENDLESS:
+        return ends(hint, limits)
+    of = typing.get_args(hint)
+    if not value or of[0] is str:
+        return []
+    if of[0] not in ENDLESS:
+        rows = [extremes(of[0], limits, row) for row in value]
+        return [tuple(choices[i % len(choices)] for choices in rows) for i in range(max(map(len, rows)))]
+    if limits.ascending:
+        low, *_, high = ends(of[0], limits)
+        return [(low, low), (low, high), (high, high)]
+    if limits.stochastic:
+        return [tuple(float(i == k) for i in range(len(value))) for k in range(len(value))]
+    return [
+        (*value[:k], end, *value[k + count :])
+        for end in ends(of[0], limits)
+        for k, count in [(0, len(value)), *((k, 1) for k in range(len(value)))]
+    ]
+
+
+def table(cls, scenario):
+    """Extremes of every parameter of an environment in a scenario."""
+    parameters = cls.Parameters(**find_scenario(cls, scenario).parameters)
+
+    def value(name):
+        given = getattr(parameters, name)
+        if given is None and name in ("sensor_sigmas", "initial_sigmas", "state_weights"):
+            return parameters.value(name)  # UavAutopilot: the plant's own
+        return given
+
+    found = {n: extremes(*declared, value(n)) for n, declared in declared(cls.Parameters).items()}
+    return {name: values for name, values in found.items() if values}
+
+
+def actions(space, rng, step):
+    """Actions of a step for three episodes: at the edges of the space, or within."""
+    if hasattr(space, "n"):
+        return rng.integers(space.n, size=3)
+    edge = rng.choice([space.low, space.high], size=3)
+    return edge if step % 3 == 0 else rng.uniform(space.low, space.high, edge.shape)
+
+
+def finding(env_id, keywords, kind, rng):
+    """Run three episodes with these keywords: "" if all is well, "refused: ..." or what went wrong."""
+    try:
+        task = make_task(env_id, **{"horizon": 60, "decision_interval": 1, **keywords})
+        lanes = Lanes(task, 3, paper_task(task) if kind == "relative" else None)
+    except np.linalg.LinAlgError as error:
+        return f"LinAlgError: {error}"
+    except ValueError as error:
+        return f"refused: {error}"
+    for lane in range(3):
+        lanes.seed(lane, np.random.default_rng(lane))
+    lanes.restart()
+    wrong = []
+
+    def record(state, paper_state):
+        P = np.moveaxis(task.covariance(state), -1, 0)
+        found = {
+            "error": task.error(state),
+            "cost": task.cost(state),
+            "reward": reward(kind, task, state, lanes.paper, paper_state),
+            "covariance": P,
+        }
+        wrong.extend(name for name, values in found.items() if not np.isfinite(values).all())
+        if not wrong:
+            sigma = np.sqrt(np.maximum(np.einsum("nii->ni", P), 1e-300))
+            lowest = np.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None, :]).min()
+            if lowest < -1e-9:
+                wrong.append(f"correlations with an eigenvalue of {lowest:.2g}")
+
+    last = min(DECISIONS, lanes.decisions_per_episode)
+    for step in range(last + 1):
+        shown = np.isfinite(lanes.observe()).all(axis=0)
+        wrong.extend(f"observation {task.fields[i].name}" for i in np.flatnonzero(~shown))
+        if wrong:
+            return f"step {step}: {', '.join(wrong)}"
+        action = lanes.widened(actions(task.action_space, rng, step))
+        if step < last:
+            lanes.step(lambda state, action=action: task.act(state, action), record)
+    return ""
+
+
+def combinations(cls, count, seed):
+    """Random controls, scenarios and one to six parameters at their ends, each with a reward."""
+    rng = np.random.default_rng(seed)
+    tables = {scenario: table(cls, scenario) for scenario in cls.scenarios}
+    for i in range(count):
+        scenario = str(rng.choice(list(tables)))
+        names = rng.choice(list(tables[scenario]), size=rng.integers(1, 7), replace=False)
+        chosen = {str(n): tables[scenario][n][rng.integers(len(tables[scenario][n]))] for n in names}
+        yield {"control": str(rng.choice(cls.controls)), "scenario": scenario, **chosen}, REWARDS[i % 3]
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_extreme_parameters_are_finite_or_refused(env_id):
+    rng = np.random.default_rng(0)
+    for keywords, kind in combinations(catalogue()[env_id], 12, seed=1):
+        said = finding(env_id, keywords, kind, rng)
+        assert not said or said.startswith("refused: "), f"{keywords}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        ("actuator_disturbance", 0.0),
+        ("gain_decades", 1e6),
+        ("lift_incidence", -1e6),
+        ("moment_rate", 1e6),
+    ],
+)
+def test_what_no_filter_can_answer_is_refused(parameter, value):
+    with pytest.raises(ValueError, match=r"must") as caught:
+        make_task("UavAutopilot", **{parameter: value})
+    assert not isinstance(caught.value, np.linalg.LinAlgError)
+
+
+def main(count, *chosen):
+    """Try every end alone, then random combinations, and print what fails."""
+    warnings.simplefilter("ignore")
+    for env_id, cls in catalogue().items():
+        if chosen and not any(name in env_id for name in chosen):
+            continue
+        alone = [
+            ({"control": control, name: value}, "log-likelihood")
+            for name, values in table(cls, None).items()
+            for value in values
+            for control in {cls.controls[0], cls.controls[-1]}
+        ]
+        cases = [*alone, *combinations(cls, int(count), seed=0)]
+        rng = np.random.default_rng(0)
+        refused = failed = 0
+        for keywords, kind in cases:
+            try:
+                said = finding(env_id, keywords, kind, rng)
+            except Exception as error:  # noqa: BLE001  (whatever it is, it is counted)
+                said = f"{type(error).__name__}: {error}"
+            refused += said.startswith("refused: ")
+            if said and not said.startswith("refused: "):
+                failed += 1
+                print(f"{env_id} {keywords}: {said}", flush=True)
+        print(f"{env_id}: {len(cases)} tried ({len(alone)} alone), {refused} refused, {failed} failed", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
