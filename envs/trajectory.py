@@ -1,5 +1,6 @@
 """A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,7 +99,9 @@ def read_trajectory(path: Path) -> Trajectory:
         if path.suffix == ".nc":
             import xarray
 
-            with xarray.open_dataset(path, engine="scipy", decode_times=False) as data:
+            # From memory: a mapped file stays open where its reading fails.
+            content = io.BytesIO(path.read_bytes())
+            with xarray.open_dataset(content, engine="scipy", decode_times=False) as data:
                 columns = {str(name): data[name].values for name in data.variables}
         else:
             with path.open(encoding="utf-8-sig") as file:

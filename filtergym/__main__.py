@@ -1,8 +1,10 @@
 """The command line: ``filtergym`` or ``python -m filtergym``."""
 
+import functools
 import os
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import typer
@@ -29,6 +31,21 @@ REPORT = (
 )
 
 
+@functools.cache
+def application() -> Any:
+    """Return the commands as one program: called with its arguments, it ends in SystemExit."""
+    app = typer.Typer(
+        help="Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+    )
+    for name, command in COMMANDS.items():
+        app.command(name)(command)
+    return typer.main.get_command(app)
+
+
 def main() -> None:
     """Run the command line.
 
@@ -39,17 +56,8 @@ def main() -> None:
         # Modules of one's own are found, as by ``python -m filtergym``; last, so that none of them hides a library.
         sys.path.append(os.getcwd())
     debug = "--debug" in sys.argv
-    app = typer.Typer(
-        help="Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback.",
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode="rich",
-    )
-    for name, command in COMMANDS.items():
-        app.command(name)(command)
     try:
-        app([word for word in sys.argv[1:] if word != "--debug"])
+        application()([word for word in sys.argv[1:] if word != "--debug"])
     except Exception as error:
         if debug:
             raise
