@@ -21,8 +21,9 @@ import torch
 from filtergym.agents import training_run
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
-from filtergym.agents.export import export_run, network_arrays
+from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import LearnedPolicy, read_header
+from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_training import Sb3Policy, load_sb3_policy, train_sb3
 from filtergym.agents.training_run import load_run, new_run, resumed_run
 from sb3_contrib import RecurrentPPO
