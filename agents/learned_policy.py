@@ -19,6 +19,7 @@ from ..envs.catalogue import make_task, short_name, task_class
 from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
+from ..evaluation.stored import fits
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
@@ -27,6 +28,7 @@ ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
 }
 OUTPUTS = ("clip", "tanh", "argmax")
 """How the last layer becomes an action: cut to the box, squashed into it, or the largest entry's index."""
+HEADER = ("environment", "control", "fields", "output", "activation", "run")
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are cut here, as in VecNormalize."""
 
@@ -158,14 +160,53 @@ def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
         with safe_open(path, framework="numpy") as file:
             header: dict[str, Any] = dict(file.metadata() or {})
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+        lacking = [name for name in HEADER if name not in header]
+        if lacking:
+            raise ValueError(f"its header lacks {', '.join(lacking)}")
         header |= {name: json.loads(header[name]) for name in ("fields", "run")}
         if header["output"] not in OUTPUTS or header["activation"] not in ACTIVATIONS:
-            raise KeyError("output or activation")
+            raise ValueError(f"unknown output {header['output']!r} or activation {header['activation']!r}")
+        if not fits(header["fields"], list[str]) or not fits(header["run"], dict[str, Any]):
+            raise ValueError("its header has no list of fields or no record of a run")
+        header["answers"] = _checked_answers(arrays, len(header["fields"]))
     except FileNotFoundError as error:
         raise ValueError(f"no learned policy at {path}") from error
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not a learned policy of filtergym: {error}") from error
     return arrays, header
+
+
+def _checked_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
+    """Check that arrays are those of a network, and return how many numbers it answers with.
+
+    Args:
+        arrays: of the file.
+        width: of the observation.
+
+    Raises:
+        ValueError: if an array is missing or unknown, or not of the shape that the others ask for.
+    """
+    expected: dict[str, tuple[int, ...]] = {"observation_mean": (width,), "observation_scale": (width,)}
+    for unit, gates in (("gru", 3), ("lstm", 4)):
+        if f"{unit}_memory_weight" in arrays:
+            memory = arrays[f"{unit}_memory_weight"].shape[-1:] or (0,)
+            size = gates * memory[0]
+            expected |= {f"{unit}_input_weight": (size, width), f"{unit}_input_bias": (size,)}
+            expected |= {f"{unit}_memory_weight": (size, *memory), f"{unit}_memory_bias": (size,)}
+            width = memory[0]
+    for i in range(max(1, sum(name.startswith("weight_") for name in arrays))):
+        below, width = width, arrays[f"bias_{i}"].size if f"bias_{i}" in arrays else 0
+        expected |= {f"weight_{i}": (width, below), f"bias_{i}": (width,)}
+    if arrays.keys() != expected.keys():
+        raise ValueError(
+            f"it holds the arrays {', '.join(sorted(arrays))}, not {', '.join(sorted(expected))}"
+        )
+    for name, shape in expected.items():
+        if arrays[name].shape != shape or not numpy.isfinite(arrays[name]).all():
+            raise ValueError(
+                f"{name} must be finite numbers of shape {shape}, got shape {arrays[name].shape}"
+            )
+    return width
 
 
 class _Stored:
@@ -181,6 +222,13 @@ class _Stored:
         if fields != self.header["fields"]:
             raise ValueError(
                 f"{self.path} was trained on other fields than {task.id} shows: {self.header['fields']}"
+            )
+        space: Any = task.action_space
+        count = int(space.n) if hasattr(space, "n") else space.shape[0]
+        if (self.header["output"] == "argmax") != hasattr(space, "n") or self.header["answers"] != count:
+            raise ValueError(
+                f"{self.path} answers with {self.header['output']} of {self.header['answers']} numbers, which is no "
+                f"action of control {task.control!r}: {space}"
             )
         return LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
 

@@ -2,13 +2,14 @@
 
 A checkpoint holds the model with its optimiser, the normalisation, the replay buffer if there is one, the
 environments in the middle of their episodes, and every random generator: a run that was resumed equals one
-that never stopped. It is loaded with pickle: never resume from a stranger's folder.
+that never stopped. It is loaded with pickle, which can execute code, so that takes ``trust``. Beside the best model
+lie its plain arrays, which take none.
 """
 
+import contextlib
 import importlib.util
 import pickle
 import random
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 from ..envs.catalogue import make_task
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
-from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
+from .learned_policy import write_arrays
+from .network_arrays import network_arrays
+from .training_run import Bookkeeping, TrainingRun, check_trust, interruption, learning_rate_schedule
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
@@ -39,13 +42,6 @@ SPACES: dict[str, tuple[type[gymnasium.Space], ...]] = {
     "sac": (gymnasium.spaces.Box,),
     "dqn": (gymnasium.spaces.Discrete,),
 }
-
-
-# What unpickling a corrupt file stumbles over.
-UNREADABLE = (
-    OSError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError, ValueError, TypeError, KeyError, IndexError,
-    AttributeError, ImportError, RuntimeError,
-)  # fmt: skip
 
 
 class Sb3Policy:
@@ -71,14 +67,23 @@ class Sb3Policy:
         return self.model.predict(observation, state, episode_start, deterministic)
 
 
-def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | None = None) -> Sb3Policy:
+def load_sb3_policy(
+    path: Path, algorithm: str | None = None, control: str | None = None, *, trust: bool = False
+) -> Sb3Policy:
     """Load a model's zip, with its ``vecnormalize.pkl`` if there is one: beside it, or where rl-zoo3 puts it.
 
-    Both can execute code while they are loaded: open only what you trust.
+    Args:
+        path: of the zip.
+        algorithm: one of ``ALGORITHMS``; default: by the class of the model's policy.
+        control: that the model steers; default: the one that fits its action space.
+        trust: both files can execute code while they are loaded, and are not without this.
 
     Raises:
-        ValueError: if there is no such file, or it is not a model.
+        ValueError: if there is no such file, it is not trusted, or not a model.
     """
+    if not path.is_file():
+        raise ValueError(f"no model at {path}")
+    check_trust(f"model {path} is loaded with pickle", trust)
     try:
         if algorithm is None:
             data = load_from_zip_file(path, device="cpu")[0] or {}
@@ -100,13 +105,11 @@ def load_sb3_policy(path: Path, algorithm: str | None = None, control: str | Non
                     normalisation = pickle.load(file)
                 normalisation.training = False
                 break
-    except FileNotFoundError as error:
-        raise ValueError(f"no model at {path}") from error
     except StopIteration as error:
         raise ValueError(
             f"{path} is a model of an algorithm that is not one of {', '.join(ALGORITHMS)}"
         ) from error
-    except UNREADABLE as error:
+    except Exception as error:  # unpickling a corrupt file stumbles over anything
         raise ValueError(f"cannot read the model {path}: {error}") from error
     return Sb3Policy(model, normalisation, control)
 
@@ -148,6 +151,14 @@ def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder:
         normalisation.save(str(folder / "vecnormalize.pkl"))
 
 
+def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
+    """Write a model, and beside it ``agent.safetensors``, its plain arrays, if a learned policy can hold it."""
+    save_model(agent.model, agent.normalisation, folder)
+    with contextlib.suppress(ValueError):
+        arrays, output, activation = network_arrays(agent, run.algorithm)
+        write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
+
+
 def save_checkpoint(
     model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
 ) -> None:
@@ -168,12 +179,15 @@ def save_checkpoint(
     (folder / "rest.pkl").write_bytes(pickle.dumps(rest))
 
 
-def load_checkpoint(run: TrainingRun, folder: Path) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
+def load_checkpoint(
+    run: TrainingRun, folder: Path, trust: bool
+) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
     """Go on where a checkpoint was written.
 
     Raises:
-        ValueError: if a file is missing or corrupt.
+        ValueError: if it is not trusted, or a file is missing or corrupt.
     """
+    check_trust(f"the checkpoint in {folder} is loaded with pickle", trust)
     adapted = training_environment(run)
     env: Any = adapted
     normalisation = None
@@ -185,17 +199,17 @@ def load_checkpoint(run: TrainingRun, folder: Path) -> tuple[BaseAlgorithm, Task
             model.load_replay_buffer(folder / "replay_buffer.pkl")
         rest = pickle.loads((folder / "rest.pkl").read_bytes())
         adapted.restore(rest["environment"])
-    except UNREADABLE as error:
+        if normalisation is not None:
+            normalisation.returns = rest["returns"]
+            normalisation.old_obs, normalisation.old_reward = rest["original"]
+        torch.set_rng_state(rest["torch"])
+        numpy.random.set_state(rest["numpy"])  # noqa: NPY002
+        random.setstate(rest["python"])
+        model.action_space._np_random = rest["action_space"]
+        if isinstance(model, RecurrentPPO):
+            model._last_lstm_states = rest["lstm"]  # loading has set them to zero
+    except Exception as error:  # unpickling a corrupt file stumbles over anything
         raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
-    if normalisation is not None:
-        normalisation.returns = rest["returns"]
-        normalisation.old_obs, normalisation.old_reward = rest["original"]
-    torch.set_rng_state(rest["torch"])
-    numpy.random.set_state(rest["numpy"])  # noqa: NPY002
-    random.setstate(rest["python"])
-    model.action_space._np_random = rest["action_space"]
-    if isinstance(model, RecurrentPPO):
-        model._last_lstm_states = rest["lstm"]  # loading has set them to zero
     return model, adapted, normalisation
 
 
@@ -217,6 +231,8 @@ def train_sb3(
     interval: int | None = None,
     progress: Callable[[int], None] = lambda steps: None,
     report: Callable[[str], None] = lambda line: None,
+    *,
+    trust: bool = False,
 ) -> TrainingRun:
     """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
 
@@ -227,6 +243,11 @@ def train_sb3(
         interval: environment steps between two validations; default: a twentieth of the run.
         progress: told of all environment steps done so far.
         report: told of every validation.
+        trust: load the checkpoint, which can execute code; resuming takes it.
+
+    Raises:
+        ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
+            read.
     """
     check_algorithm(run)
     values = dict(run.hyperparameters)
@@ -235,7 +256,7 @@ def train_sb3(
     normalize = values.pop("normalize", False)
     normalisation: VecNormalize | None = None
     if resume:
-        model, adapted, normalisation = load_checkpoint(run, folder / "checkpoint")
+        model, adapted, normalisation = load_checkpoint(run, folder / "checkpoint", trust)
     else:
         adapted = training_environment(run)
         env: Any = adapted
@@ -257,7 +278,7 @@ def train_sb3(
             folder,
             interval or max(1, run.steps // 20),
             lambda place: save_checkpoint(model, adapted, normalisation, place),
-            lambda place: save_model(model, normalisation, place),
+            lambda place: save_agent(policy, run, place),
             policy,
             stop,
             report,

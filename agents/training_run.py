@@ -7,13 +7,14 @@ one, from which ``--resume`` goes on), ``best/`` (the agent with the lowest vali
 import importlib.metadata
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import xarray
 
@@ -22,10 +23,23 @@ from ..baselines.names import evaluate
 from ..envs.catalogue import find_scenario, importable_name, nearest, task_class
 from ..evaluation.files import whole_folder, writable_folder, write_text
 from ..evaluation.metrics import tidy_records
+from ..evaluation.stored import read_json, restored
 
 FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 VALIDATION_EPISODES = 512
+
+
+class Validated(TypedDict):
+    """One validation of a run."""
+
+    steps: int
+    cost: float
+    paper: NotRequired[str]
+    """Name of the paper's algorithm, where there is one."""
+    paper_cost: NotRequired[float]
+    relative_cost_difference: NotRequired[list[float]]
+    """Value and 95 % interval."""
 
 
 @dataclass
@@ -46,12 +60,12 @@ class TrainingRun:
     seconds: float = 0.0
     """Time spent, over all sessions."""
     versions: dict[str, str] = field(default_factory=dict)
-    validation: list[dict[str, Any]] = field(default_factory=list)
+    validation: list[Validated] = field(default_factory=list)
     exported: dict[str, Any] | None = None
     """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
 
     @property
-    def best(self) -> dict[str, Any] | None:
+    def best(self) -> Validated | None:
         """The validation with the lowest cost."""
         return min(self.validation, key=lambda entry: entry["cost"], default=None)
 
@@ -133,23 +147,48 @@ def installed_versions() -> dict[str, str]:
     return versions
 
 
+def check_trust(what: str, trust: bool) -> None:
+    """Raise ValueError if something that can execute code is not trusted.
+
+    Args:
+        what: it is, and what happens to it.
+        trust: whether the user says so.
+    """
+    if not trust:
+        raise ValueError(
+            f"{what}, which can execute code: if you made it or know who did, add --trust (in Python: trust=True)"
+        )
+
+
 def save_run(run: TrainingRun, path: Path) -> None:
     """Write a run's record, whole or not at all."""
     write_text(path, json.dumps(asdict(run), indent=1) + "\n")
 
 
-def load_run(folder: Path) -> TrainingRun:
+def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     """Read ``run.json``.
 
+    Args:
+        folder: of the run.
+        trust: import the module that registers the environment, which executes it. An environment of filtergym, or one
+            whose module is imported already, takes no trust.
+
     Raises:
-        ValueError: if there is none, or it is not one.
+        ValueError: if there is none, it is not one, or its environment takes ``trust``.
     """
+    path = folder / "run.json"
     try:
-        return TrainingRun(**json.loads((folder / "run.json").read_text(encoding="utf-8")))
+        values = read_json(path)
     except FileNotFoundError as error:
         raise ValueError(f"no training run in {folder}: it has no run.json") from error
-    except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"cannot read {folder / 'run.json'}: {error}") from error
+    try:
+        run = restored(TrainingRun, values)
+    except ValueError as error:
+        raise ValueError(f"{path} is not the record of a run: {error}") from error
+    module, colon, _ = run.environment.partition(":")
+    if colon and module not in sys.modules:
+        check_trust(f"{path} asks for an import of module {module!r}", trust)
+    return run
 
 
 def best_agent(folder: Path) -> Path:
@@ -221,13 +260,13 @@ class Validation:
             run.environment, {name: policy}, run.scenario, VALIDATION_EPISODES, split="validation"
         )
 
-    def score(self, policy: Any) -> dict[str, Any]:
+    def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
         dataset = self._evaluated("agent", policy)
         if self.paper_dataset is not None:
             dataset = xarray.concat([dataset, self.paper_dataset], "policy", combine_attrs="override")
         found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
-        entry = {"steps": self.run.steps_done, "cost": found["agent", "cost"].value}
+        entry: Validated = {"steps": self.run.steps_done, "cost": found["agent", "cost"].value}
         if not self.paper:
             return entry
         difference = found["agent", "relative_cost_difference"]

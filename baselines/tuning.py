@@ -7,6 +7,7 @@ best candidate is kept by its cost on the validation split only if it beats the 
 
 import json
 import math
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -20,6 +21,7 @@ from ..envs.task import Task
 from ..evaluation.files import write_text
 from ..evaluation.rollout import run_policy
 from ..evaluation.seeds import episode_seeds
+from ..evaluation.stored import fits, read_json
 from .catalogue import baselines_of, package_of
 from .table import Tunable
 
@@ -137,36 +139,72 @@ def tune(
     cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh), best[1]
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
-    rounded = {name: float(f"{value:.6g}") for name, value in values.items()}
-    return Tuned(cls.id, policy, chosen.name, rounded, cost, untuned, spent * steps, seed)
+    kept = {name: rounded(value) for name, value in values.items()}
+    return Tuned(cls.id, policy, chosen.name, kept, cost, untuned, spent * steps, seed)
 
 
 def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
     """Return tuned values and where they stand: one's own in ``tuned/``, or those that are shipped.
 
     Raises:
-        ValueError: if the policy was never tuned.
+        ValueError: if the policy was never tuned, or the file that should say so is broken.
     """
-    package = package_of(id)
-    places: list[Any] = [table_path(id), *([] if package is None else [files(package) / "tuned.json"])]
-    for place in places:
-        if place.is_file():
-            table = json.loads(place.read_text(encoding="utf-8"))
-            if policy in table:
-                return table[policy]["values"], str(place)
+    for place in _places(id):
+        table = read_table(place)
+        if policy in table:
+            return _checked_values(table[policy].get("values"), policy, id, place), str(place)
     raise ValueError(f"no tuned values of policy {policy!r}: run filtergym tune {id} --policy {policy}")
+
+
+def read_table(place: Any) -> dict[str, dict[str, Any]]:
+    """Return what a file says of tuned policies; nothing if there is none.
+
+    Raises:
+        ValueError: if it is not such a file.
+    """
+    try:
+        table = read_json(place)
+    except FileNotFoundError:
+        return {}
+    if not fits(table, dict[str, dict[str, Any]]):
+        raise ValueError(f"{place} is not a table of tuned policies: correct or remove it")
+    return table
+
+
+def _checked_values(values: Any, policy: str, id: str, place: Any) -> dict[str, float]:
+    """Raise ValueError if values are not those of a policy, within the limits of the search."""
+    limits = baselines_of(id).tunable[policy].limits
+    if not fits(values, dict[str, float]) or values.keys() != limits.keys():
+        raise ValueError(
+            f"{place} must give policy {policy!r} a number for each of {', '.join(limits)}, got "
+            f"{reprlib.repr(values)}: tune it again, or remove the file"
+        )
+    for name, (low, high) in limits.items():
+        # Values are stored rounded, so that one at a limit can lie just beyond it.
+        if not min(low, rounded(low)) <= values[name] <= max(high, rounded(high)):
+            raise ValueError(
+                f"{place}: {name} of policy {policy!r} must be from {low:g} to {high:g}, got {values[name]!r}"
+            )
+    return values
+
+
+def rounded(value: float) -> float:
+    """Six digits, as tuned values are stored."""
+    return float(f"{value:.6g}")
 
 
 def tuned_names(id: str) -> list[str]:
     """Return ``NAME-tuned`` of every tunable policy that has stored values."""
-    names = []
-    for policy in baselines_of(id).tunable:
-        try:
-            stored_values(id, policy)
-        except ValueError:
-            continue
-        names.append(f"{policy}-tuned")
-    return names
+    tables = [read_table(place) for place in _places(id)]
+    return [
+        f"{policy}-tuned" for policy in baselines_of(id).tunable if any(policy in table for table in tables)
+    ]
+
+
+def _places(id: str) -> list[Any]:
+    """Files of tuned values, one's own first."""
+    package = package_of(id)
+    return [table_path(id), *([] if package is None else [files(package) / "tuned.json"])]
 
 
 class TunedPolicy(NamedTuple):

@@ -48,6 +48,24 @@ def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
     return ValueError(f"unknown {kind} {name!r}: {hint}")
 
 
+def imported(module: str, refusal: str) -> ModuleType:
+    """Import a module that a user has named.
+
+    Args:
+        module: its name, with dots.
+        refusal: beginning of the error.
+
+    Raises:
+        ValueError: if that is no name of a module, or the import fails, for whatever reason.
+    """
+    try:
+        if not all(part.isidentifier() for part in module.split(".")):
+            raise ImportError("a module is named by words with dots between them")
+        return importlib.import_module(module)
+    except Exception as error:  # a module is a program: it can raise anything
+        raise ValueError(f"{refusal}: {type(error).__name__}: {error}") from error
+
+
 def task_class(id: str) -> type[Task]:
     """Return the task of an environment id; ``filtergym/`` may be left out.
 
@@ -58,12 +76,7 @@ def task_class(id: str) -> type[Task]:
     """
     module, colon, own = id.partition(":")
     if colon:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise ValueError(
-                f"cannot import {module!r}, which registers environment {own!r}: {error}"
-            ) from error
+        imported(module, f"cannot import {module!r}, which registers environment {own!r}")
         id = own
     known = catalogue()
     for candidate in (id, f"filtergym/{id}", f"filtergym/{id}-v0"):
@@ -87,6 +100,14 @@ def parameter_names(cls: type[Task]) -> list[str]:
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 
+def check_names(cls: type[Task], keywords: Iterable[str]) -> None:
+    """Raise ValueError if a keyword is no parameter of an environment."""
+    known = parameter_names(cls)
+    for name in keywords:
+        if name not in known:
+            raise nearest("parameter", name, known)
+
+
 def find_scenario(
     cls: type[Task], scenario: str | Trajectory | None, keywords: Mapping[str, Any] | None = None
 ) -> Scenario:
@@ -96,7 +117,11 @@ def find_scenario(
         cls: the environment.
         scenario: a name, a trajectory, or the path of a CSV or NetCDF file with one.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
+
+    Raises:
+        ValueError: for an unknown scenario or parameter, or a file that holds no trajectory.
     """
+    check_names(cls, keywords or ())
     if isinstance(scenario, str) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
         scenario = read_trajectory(Path(scenario))
     if isinstance(scenario, Trajectory):
@@ -133,10 +158,6 @@ def make_task(
     if control not in cls.controls:
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
-    known = parameter_names(cls)
-    for name in keywords:
-        if name not in known:
-            raise nearest("parameter", name, known)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})
     return cls(parameters, control, xp, device)
 

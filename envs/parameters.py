@@ -11,7 +11,7 @@ was expected.
 """
 
 import dataclasses
-import math
+import sys
 import types
 import typing
 from collections.abc import Sequence
@@ -128,8 +128,12 @@ def _within(value: float, limits: Limits) -> bool:
     )
 
 
+LARGEST = sys.float_info.max
+
+
 def _number(name: str, value: Any, limits: Limits) -> None:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # Compared, not converted: a whole number can be too large for a float.
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
         raise ValueError(f"{name} must be {f'a finite number {_stated(limits)}'.strip()}, got {value!r}")
 

@@ -1,5 +1,6 @@
 """A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,26 +99,36 @@ def read_trajectory(path: Path) -> Trajectory:
         if path.suffix == ".nc":
             import xarray
 
-            with xarray.open_dataset(path, engine="scipy", decode_times=False) as data:
+            # From memory: a mapped file stays open where its reading fails.
+            content = io.BytesIO(path.read_bytes())
+            with xarray.open_dataset(content, engine="scipy", decode_times=False) as data:
                 columns = {str(name): data[name].values for name in data.variables}
         else:
             with path.open(encoding="utf-8-sig") as file:
                 names = [name.strip() for name in file.readline().split(",")]
                 values = numpy.loadtxt(file, delimiter=",", ndmin=2)
+            twice = {name for name in names if names.count(name) > 1}
+            if twice:
+                raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
             if values.shape[1] != len(names):
                 raise ValueError(f"{len(names)} column names but {values.shape[1]} columns")
             columns = dict(zip(names, values.T, strict=True))
-    except (OSError, ValueError, TypeError) as error:
-        raise ValueError(f"cannot read trajectory {path}: {error}") from error
+    except Exception as error:  # the reader of NetCDF raises whatever a broken file makes it stumble over
+        raise ValueError(f"cannot read trajectory {path}: {str(error) or type(error).__name__}") from error
     missing = [name for name in ("time", "x", "y") if name not in columns]
     if missing:
         raise ValueError(
             f"trajectory {path} lacks the column {', '.join(missing)}; it has {', '.join(columns)} and needs "
             "time, x, y and optionally vx, vy"
         )
-    position = numpy.column_stack([columns["x"], columns["y"]])
-    velocity = numpy.column_stack([columns["vx"], columns["vy"]]) if {"vx", "vy"} <= set(columns) else None
-    return Trajectory(columns["time"], position, velocity, name=path.stem)
+    try:
+        position = numpy.column_stack([columns["x"], columns["y"]])
+        velocity = (
+            numpy.column_stack([columns["vx"], columns["vy"]]) if {"vx", "vy"} <= set(columns) else None
+        )
+        return Trajectory(columns["time"], position, velocity, name=path.stem)
+    except (ValueError, TypeError) as error:  # columns of words, of other lengths, of more dimensions
+        raise ValueError(f"trajectory {path}: {error}") from error
 
 
 def flown_legs(

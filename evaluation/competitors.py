@@ -7,7 +7,7 @@ what says nothing is a policy, such as a model of Stable-Baselines3.
 """
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy
 
@@ -19,6 +19,22 @@ Kind = Literal["policy", "reference", "bound"]
 def kind_of(competitor: Any) -> Kind:
     """Say what a competitor is, or what a maker makes."""
     return getattr(competitor, "kind", "policy")
+
+
+def check_competitor(name: str, found: Any) -> Any:
+    """Return what a user has named, if it can compete; it is not called yet.
+
+    Raises:
+        ValueError: if it is neither an object or a class with ``predict``, nor the class of a reference or a bound.
+    """
+    kind = kind_of(found)
+    methods = ("predict",) if kind == "policy" else ("start", "update")
+    if kind not in get_args(Kind) or not all(callable(getattr(found, method, None)) for method in methods):
+        raise ValueError(
+            f"{name!r} is no policy, reference or bound: a policy has a method predict, the others say their kind and "
+            "have start and update"
+        )
+    return found
 
 
 class Policy:

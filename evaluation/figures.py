@@ -237,7 +237,7 @@ def draw_differences(
             axis.errorbar(
                 value,
                 row + gap * (i - 0.5 * (len(names) - 1)),
-                xerr=[[value - low], [high - value]],
+                xerr=[[max(value - low, 0.0)], [max(high - value, 0.0)]],
                 fmt="D" if name in learned else "o",
                 ms=4.5 if name in learned else 3.5,
                 color=style["color"],

@@ -1,8 +1,10 @@
 """The command line: ``filtergym`` or ``python -m filtergym``."""
 
+import functools
+import os
 import sys
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import gymnasium
 import typer
@@ -25,6 +27,9 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "export": improve.export,
     "seeds": report.seeds,
 }
+REPORT = (
+    "--debug shows where it happened: if that is not in code of your own, please report it with what it shows"
+)
 
 
 def _show_version(wanted: bool) -> None:
@@ -38,11 +43,12 @@ def _general(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
-    """Gymnasium environments for adaptive-filter benchmarking."""
+    """Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback."""
 
 
-def main() -> None:
-    """Run the command line; a user's mistake ends in one sentence and exit code 2."""
+@functools.cache
+def application() -> Any:
+    """Return the commands as one program: called with its arguments, it ends in SystemExit."""
     app = typer.Typer(
         callback=_general,
         no_args_is_help=True,
@@ -52,13 +58,33 @@ def main() -> None:
     )
     for name, command in COMMANDS.items():
         app.command(name)(command)
+    return typer.main.get_command(app)
+
+
+def main() -> None:
+    """Run the command line.
+
+    A user's mistake ends in one sentence and exit code 2; what nobody expected in one that asks for a report, and exit
+    code 1. With ``--debug`` both end in a traceback.
+    """
+    if not sys.flags.safe_path and os.getcwd() not in sys.path:
+        # Modules of one's own are found, as by ``python -m filtergym``; last, so that none of them hides a library.
+        sys.path.append(os.getcwd())
+    debug = "--debug" in sys.argv
     try:
-        app()
-    except (ValueError, gymnasium.error.Error) as error:
-        Console(stderr=True, highlight=False).print(
-            f"Error: {error}", style="red", markup=False, soft_wrap=True
+        application()([word for word in sys.argv[1:] if word != "--debug"])
+    except Exception as error:
+        if debug:
+            raise
+        text, code = f"Error: {error}", 2
+        if isinstance(error, MemoryError):
+            text = f"Error: not enough memory, ask for less at once: {error}"
+        elif not isinstance(error, ValueError | gymnasium.error.Error):
+            text, code = f"Error: unexpected {type(error).__name__}: {error}; {REPORT}", 1
+        Console(stderr=True, highlight=False, emoji=False).print(
+            text.replace("\n", " "), style="red", markup=False, soft_wrap=True
         )
-        sys.exit(2)
+        sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
-import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,36 +8,38 @@ import xarray
 from .agents.named_policies import learned_policy, shipped_agents
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
-from .envs.catalogue import nearest, task_class
+from .envs.catalogue import imported, nearest, task_class
 from .evaluation import metrics
+from .evaluation.competitors import check_competitor
 from .evaluation.metrics import Record
 from .evaluation.rollout import Progress
 
 
-def competitor(env: str, name: str) -> Any:
+def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     """Return what makes a policy, reference estimator or bound for a task.
 
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), or ``module:Class`` of a user's.
+        trust: load a ``.zip``, which can execute code.
 
     Raises:
-        ValueError: if there is no such name.
+        ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
     id = task_class(env).id
     if name in baselines_of(id).names or name.endswith("-tuned"):
         return baselines.own_competitor(id, name)
-    if ":" in name:
-        module, _, attribute = name.partition(":")
-        try:
-            return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(f"cannot load policy {name!r}: {error}") from error
-    learned = learned_policy(id, name)
-    if learned is None:
+    learned = learned_policy(id, name, trust)
+    if learned is not None:
+        return learned
+    module, colon, attribute = name.partition(":")
+    if not colon:
         raise nearest("policy", name, [*baselines.own_names(id), *shipped_agents(id)])
-    return learned
+    holder = imported(module, f"cannot load policy {name!r}")
+    if not hasattr(holder, attribute):
+        raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
+    return check_competitor(name, getattr(holder, attribute))
 
 
 def evaluate(
@@ -50,6 +51,8 @@ def evaluate(
     split: str = "test",
     control: str | None = None,
     progress: Progress | None = None,
+    *,
+    trust: bool = False,
     **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, reference estimators and bounds over the same episodes.
@@ -64,6 +67,7 @@ def evaluate(
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
+        trust: load models' zips, which can execute code.
         **keywords: parameters of the task.
 
     Returns:
@@ -75,7 +79,8 @@ def evaluate(
     """
     named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
     objects = {
-        name: competitor(env, entry) if isinstance(entry, str) else entry for name, entry in named.items()
+        name: competitor(env, entry, trust=trust) if isinstance(entry, str) else entry
+        for name, entry in named.items()
     }
     return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
 

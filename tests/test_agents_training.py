@@ -1,5 +1,6 @@
 """Training runs: what they refuse, that a resumed one equals one that never stopped, and what they export."""
 
+import functools
 import os
 import shutil
 import signal
@@ -20,8 +21,9 @@ import torch
 from filtergym.agents import training_run
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
-from filtergym.agents.export import export_run, network_arrays
+from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import LearnedPolicy, read_header
+from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_training import Sb3Policy, load_sb3_policy, train_sb3
 from filtergym.agents.training_run import load_run, new_run, resumed_run
 from sb3_contrib import RecurrentPPO
@@ -51,14 +53,14 @@ def small_run(algorithm, steps, envs=4, **keywords):
 
 def train(run, folder, **keywords):
     folder.mkdir(exist_ok=True)
-    trainer = train_bptt if run.algorithm == "bptt" else train_sb3
+    trainer = train_bptt if run.algorithm == "bptt" else functools.partial(train_sb3, trust=True)
     return trainer(run, folder, interval=keywords.pop("interval", 10**9), **keywords)
 
 
 def weights(algorithm, folder):
     if algorithm == "bptt":
         return torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]
-    agent = load_sb3_policy(folder / "checkpoint" / "model.zip", algorithm)
+    agent = load_sb3_policy(folder / "checkpoint" / "model.zip", algorithm, trust=True)
     statistics = agent.normalisation.obs_rms
     return {
         **agent.model.policy.state_dict(),
@@ -112,7 +114,7 @@ def test_validation_is_that_of_evaluate(tmp_path):
     run = train(small_run("ppo", 240), tmp_path)
     (entry,) = run.validation
     zip_file = str(tmp_path / "best" / "model.zip")
-    dataset = evaluate(ID, [zip_file, "imm"], episodes=16, split="validation")
+    dataset = evaluate(ID, [zip_file, "imm"], episodes=16, split="validation", trust=True)
     cost = dataset["cost"].mean(["episode", "time"])
     # The mean of a bootstrap weights the episodes equally, in another order of summation.
     assert entry["cost"] == pytest.approx(float(cost.sel(policy=zip_file)), rel=1e-12)
@@ -138,7 +140,7 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     file = tmp_path / "agent.safetensors"
     export_run(tmp_path, file)
     policy = competitor(ID, str(file))(make_task(ID, control))
-    model = load_sb3_policy(tmp_path / "best" / "model.zip")
+    model = load_sb3_policy(tmp_path / "best" / "model.zip", trust=True)
     shown = np.random.default_rng(0).normal(0.0, 3.0, (50, *model.observation_space.shape))
     action, expected = policy.predict(shown)[0], model.predict(shown)[0]
     assert action.shape == expected.shape
@@ -260,7 +262,9 @@ def test_normalisation_is_found_where_rl_zoo3_puts_it(tmp_path):
     (folder / "filtergym-ManeuveringTarget-v0").mkdir(parents=True)
     model = shutil.copy(best / "model.zip", folder / "filtergym-ManeuveringTarget-v0.zip")
     shutil.copy(best / "vecnormalize.pkl", folder / "filtergym-ManeuveringTarget-v0")
-    statistics = [load_sb3_policy(path).normalisation.obs_rms.mean for path in (best / "model.zip", model)]
+    statistics = [
+        load_sb3_policy(path, trust=True).normalisation.obs_rms.mean for path in (best / "model.zip", model)
+    ]
     np.testing.assert_array_equal(*statistics)
 
 
@@ -270,7 +274,7 @@ def test_files_that_are_no_policies(tmp_path):
             competitor(ID, str(tmp_path / name))
         (tmp_path / name).write_bytes(b"garbage" * 30)
         with pytest.raises(ValueError, match=r"cannot read the model|is not a learned policy"):
-            competitor(ID, str(tmp_path / name))
+            competitor(ID, str(tmp_path / name), trust=True)
 
 
 def recurrent_agent(control, layers=1):

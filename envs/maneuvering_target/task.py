@@ -114,8 +114,10 @@ class ManeuveringTarget(Task):
     @classmethod
     def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
         """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
+        for name in ("sampling_interval", "horizon"):
+            if name in keywords:
+                check(name, keywords[name], *declared(ManeuveringTargetParameters)[name])
         interval = keywords.get("sampling_interval", ManeuveringTargetParameters.sampling_interval)
-        check("sampling_interval", interval, *declared(ManeuveringTargetParameters)["sampling_interval"])
         farthest = float(numpy.hypot(*trajectory.position.T).max())
         if farthest > FARTHEST_RANGE:
             raise ValueError(

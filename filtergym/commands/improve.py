@@ -1,16 +1,18 @@
 """Commands that search for something better: tuned values and trained agents."""
 
+import functools
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from ..agents.export import export_run
 from ..baselines.catalogue import baselines_of
-from ..baselines.tuning import FOLDER, save_tuned, tune
+from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation.files import writable_folder
 from ..reports.tables import tuned_table
-from .terminal import Environment, TrainingScenario, console, progress_bar
+from .terminal import Environment, TrainingScenario, Trust, console, progress_bar
 
 
 def tune_policy(
@@ -30,6 +32,7 @@ def tune_policy(
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
     writable_folder(out)
+    read_table(table_path(cls.id, out))  # a file that cannot take the values is refused before the work
     with progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
@@ -62,10 +65,12 @@ def train(
     validate_every: Annotated[
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
     ] = None,
+    trust: Trust = False,
 ) -> None:
     """Train an agent; Ctrl-C stops it with a checkpoint that --resume goes on from.
 
-    A checkpoint is loaded with pickle, which can execute code: resume only what you trust.
+    A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one also takes --trust. One of bptt
+    cannot.
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
     """
@@ -78,7 +83,9 @@ def train(
         if algo == "bptt":
             from ..agents.bptt import train_bptt as trainer
         else:
-            from ..agents.sb3_training import train_sb3 as trainer
+            from ..agents.sb3_training import train_sb3
+
+            trainer = functools.partial(train_sb3, trust=trust)
     except ImportError as error:
         raise ValueError(
             f"training needs more packages: pip install 'filtergym[agents]' ({error})"
@@ -102,15 +109,15 @@ def train(
 def export(
     folder: Annotated[Path, typer.Argument(help="Folder of a training run.")],
     out: Annotated[Path | None, typer.Option(help="File; default: agent.safetensors in the folder.")] = None,
+    trust: Trust = False,
 ) -> None:
     """Write a run's best agent as plain arrays, which evaluate without torch and cannot execute anything.
 
+    Nothing is executed either: training has left the arrays beside the model. A folder with the model only takes
+    --trust.
+
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
     """
-    try:
-        from ..agents.export import export_run
-    except ImportError as error:
-        raise ValueError(f"export needs more packages: pip install 'filtergym[agents]' ({error})") from error
     path = out or folder / "agent.safetensors"
-    run = export_run(folder, path)
+    run = export_run(folder, path, trust)
     console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")

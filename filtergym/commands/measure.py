@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.catalogue import baselines_of
-from ..envs.catalogue import catalogue, short_name, task_class
+from ..envs.catalogue import catalogue, check_names, short_name, task_class
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import writable_folder
 from ..evaluation.metrics import Record
@@ -21,6 +21,7 @@ from .terminal import (
     Experiment,
     ScenarioName,
     Split,
+    Trust,
     console,
     parsed_settings,
     progress_bar,
@@ -39,9 +40,9 @@ def list_environments(
     """
     for id in environment or catalogue():
         first, *lines = environment_lines(id)
-        console.print(f"[bold]{first}[/bold]")
+        console.print(first, style="bold")
         for line in lines:
-            console.print(line, highlight=False, soft_wrap=True, markup=False)
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def evaluate_policies(
@@ -60,6 +61,7 @@ def evaluate_policies(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
     json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+    trust: Trust = False,
 ) -> None:
     """Run policies over the same noise and compare them.
 
@@ -73,6 +75,7 @@ def evaluate_policies(
         writable_folder(json.parent)
     names = policy or list(known.benchmark or known.names)
     keywords = parsed_settings(settings or [])
+    check_names(cls, keywords)
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         dataset = evaluate(
@@ -84,6 +87,7 @@ def evaluate_policies(
             split,
             control,
             progress=lambda done: bar.update(line, advance=done),
+            trust=trust,
             **keywords,
         )
     records = tidy_records(dataset)
@@ -132,6 +136,7 @@ def animate(
     scenario: ScenarioName = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
     every: Annotated[int, typer.Option(help="Actions from one frame to the next.")] = 2,
+    trust: Trust = False,
 ) -> None:
     """Draw an episode under each policy as an animated GIF.
 
@@ -146,6 +151,7 @@ def animate(
     cls = task_class(environment)
     writable_folder(out)
     for name in policy:
-        path = out / f"{cls.id.rpartition('/')[2]}-{name.rpartition(':')[2]}.gif"
-        write_animation(episode_frames(cls.id, name, competitor(cls.id, name), scenario, seed, every), path)
+        path = out / f"{cls.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
+        maker = competitor(cls.id, name, trust=trust)
+        write_animation(episode_frames(cls.id, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

@@ -15,7 +15,7 @@ from ..reports.pages import insert_between_markers, split_at_markers
 from ..reports.records import write_records
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table, results_table
-from .terminal import Environment, Episodes, Experiment, Split, console, progress_bar
+from .terminal import Environment, Episodes, Experiment, Split, Trust, console, progress_bar
 
 
 def comparison_page(
@@ -77,10 +77,10 @@ def page(
     Example: filtergym page filtergym/ManeuveringTarget-v0
     """
     if into is not None:
-        console.print(f"{into}: {', '.join(put_tables(environment, into))}", markup=False)
+        console.print(f"{into}: {', '.join(put_tables(environment, into))}")
         return
     for name, table in environment_tables(environment).items():
-        console.print(f"{name}\n\n{table}\n", markup=False, soft_wrap=True)
+        console.print(f"{name}\n\n{table}\n", soft_wrap=True)
 
 
 def reproduce(
@@ -121,14 +121,15 @@ def seeds(
     out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
     curves: Annotated[Path | None, typer.Option(help="PNG file for the learning curves.")] = None,
+    trust: Trust = False,
 ) -> None:
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
 
-    Loads models, which can execute code: score only runs that you trust.
+    A run's best agent is plain arrays; where it is a model only, loading can execute code and needs --trust.
 
     Example: filtergym seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
     """
-    found = training_seeds.load_runs(runs)
+    found = training_seeds.load_runs(runs, trust)
     cls = task_class(found[0].run.environment)
     scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
     opponents = policy or training_seeds.default_opponents(cls.id)
@@ -143,7 +144,14 @@ def seeds(
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         records, grids = training_seeds.compare_scenarios(
-            found, opponents, scenarios, episodes, seed, split, lambda done: bar.update(line, advance=done)
+            found,
+            opponents,
+            scenarios,
+            episodes,
+            seed,
+            split,
+            lambda done: bar.update(line, advance=done),
+            trust,
         )
     for grid in grids:
         console.print(grid_table(grid))

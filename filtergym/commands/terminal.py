@@ -18,10 +18,17 @@ ScenarioName = Annotated[str | None, typer.Option(help="Scenario; default: the t
 TrainingScenario = Annotated[str | None, typer.Option(help="A training scenario; held-out ones are refused.")]
 Episodes = Annotated[int, typer.Option(help="Monte Carlo runs.")]
 Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust", help="Load files and modules that can execute code: you made them, or know who did."
+    ),
+]
 Split = Annotated[str, typer.Option(help="test, validation or train.")]
 
-# Wide enough for the results table where the output is a file; a terminal keeps its own width.
-console = Console(width=None if sys.stdout.isatty() else 150)
+# Wide enough for the results table where the output is a file; a terminal keeps its own width. No markup: names and
+# paths are printed as they are.
+console = Console(width=None if sys.stdout.isatty() else 150, markup=False, emoji=False)
 
 
 def progress_bar() -> Progress:
@@ -29,7 +36,7 @@ def progress_bar() -> Progress:
     errors = Console(stderr=True)
     errors.quiet = not errors.is_terminal  # rich before 14.3 ends a disabled bar with an empty line
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
@@ -49,7 +56,7 @@ def parsed_settings(settings: list[str]) -> dict[str, Any]:
             raise ValueError(f"--set needs name=value, such as --set horizon=50, got {setting!r}")
         try:
             keywords[name.strip()] = ast.literal_eval(text.strip())
-        except (ValueError, SyntaxError) as error:
+        except (ValueError, SyntaxError, TypeError, MemoryError, RecursionError) as error:
             if not text.strip().replace("-", "_").isidentifier():
                 raise ValueError(f"--set {name}: cannot read the value {text!r}") from error
             keywords[name.strip()] = text.strip()

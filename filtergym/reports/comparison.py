@@ -28,11 +28,13 @@ def read_benchmark(path: Path) -> dict[str, list[Record]]:
     """Read the records of a benchmark, by environment.
 
     Raises:
-        ValueError: if the file is not one.
+        ValueError: if the file is not one, or holds nothing.
     """
     found: dict[str, list[Record]] = {}
     for record in read_records(path):
         found.setdefault(record.environment, []).append(record)
+    if not found:
+        raise ValueError(f"{path} holds no records: make them by filtergym benchmark --full")
     return found
 
 
@@ -55,7 +57,7 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
     """Tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Raises:
-        ValueError: if the paper's algorithm is not among the records.
+        ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
     """
     cls = task_class(records[0].environment)
     known = baselines_of(cls.id)
@@ -65,7 +67,12 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records if r.window == "all"}
     sizes = {record.scenario: record.episodes for record in records}
     metric, component = known.physical
-    unit = next(r.unit for r in records if (r.metric, r.component) == known.physical)
+    units = [r.unit for r in records if (r.metric, r.component) == known.physical]
+    if not columns or not units:
+        raise ValueError(
+            f"the records of {cls.id} hold nothing to compare with {paper!r}, or no {metric} {component}: make them by "
+            "filtergym benchmark --full"
+        )
 
     def rows(metric: str, component: str, names: Sequence[str], scale: float = 1.0) -> list[list[str]]:
         return [
@@ -90,7 +97,7 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             rows(DIFFERENCE, "", columns, 100.0),
         ),
         Grid(
-            f"{quantity}, {unit}",
+            f"{quantity}, {units[0]}",
             ["scenario", *(heads[name] for name in (paper, *shown))],
             rows(metric, component, (paper, *shown)),
         ),

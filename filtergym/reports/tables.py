@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from ..baselines.catalogue import baselines_of
@@ -86,7 +85,7 @@ def results_table(records: Sequence[Any]) -> Table:
     told = {**known.references, **known.bounds}
     notes = ["score: 0 = the paper's algorithm, 1 = the reference that it is measured against."]
     notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
-    table.caption = escape("\n".join(notes))
+    table.caption = "\n".join(notes)
     table.caption_justify = "left"
     return table
 
@@ -112,7 +111,7 @@ def grid_table(grid: Grid) -> Table:
     """Return a table of text for the terminal: numbers to the right, without the marks of Markdown."""
 
     def plain(cell: str) -> str:
-        return escape(cell.replace("`", "").replace("<br>", "\n"))
+        return cell.replace("`", "").replace("<br>", "\n")
 
     table = Table(title=plain(grid.title), title_justify="left")
     for i, name in enumerate(grid.header):

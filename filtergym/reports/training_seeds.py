@@ -113,14 +113,18 @@ def spread(values: numpy.ndarray) -> Spread:
     )
 
 
-def load_runs(folders: Sequence[Path]) -> list[SeedRun]:
+def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
     """Read training runs of one environment, sorted by algorithm and seed.
+
+    Args:
+        folders: of the runs.
+        trust: import the modules that their records name; see :func:`.load_run`.
 
     Raises:
         ValueError: if they are of different environments, or runs of one algorithm differ in more than the
             seed.
     """
-    runs = {folder: load_run(folder) for folder in folders}
+    runs = {folder: load_run(folder, trust) for folder in folders}
     first = next(iter(runs.values()))
     seen: dict[str, TrainingRun] = {}
     found: dict[str, SeedRun] = {}
@@ -149,13 +153,17 @@ def load_runs(folders: Sequence[Path]) -> list[SeedRun]:
 def learning_curves(runs: Sequence[SeedRun]) -> Any:
     """Picture of every run's validations; a dot marks its best agent."""
     first = runs[0].run
+    paper = paper_of(first.environment)
+    for member in runs:
+        if not all(entry.get("relative_cost_difference") for entry in member.run.validation or [{}]):
+            raise ValueError(f"the record of {member.name} has no validations against {paper!r} to draw")
     curves: dict[str, list[tuple[list[float], list[float]]]] = {}
     for member in runs:
         steps = [entry["steps"] for entry in member.run.validation]
         values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
         curves.setdefault(member.algorithm, []).append((steps, values))
     title = f"{first.environment}, scenario {first.scenario}; dots: best agents"
-    return draw_learning_curves(curves, title, paper_of(first.environment))
+    return draw_learning_curves(curves, title, paper)
 
 
 def default_opponents(id: str) -> list[str]:
@@ -174,18 +182,21 @@ def episode_means(
     seed: int,
     split: str,
     progress: Callable[[int], None] = lambda done: None,
+    trust: bool = False,
 ) -> EpisodeMeans:
     """Evaluate runs and opponents on the same episodes, one after the other to save memory.
+
+    With ``trust``, models that can execute code are loaded.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
     """
     id = runs[0].run.environment
     policies: dict[str, tuple[Any, str | None]] = {
-        member.name: (competitor(id, str(member.agent)), member.run.control) for member in runs
+        member.name: (competitor(id, str(member.agent), trust=trust), member.run.control) for member in runs
     }
     for name in dict.fromkeys([paper_of(id), *opponents]):
-        policies[name] = competitor(id, name), None
+        policies[name] = competitor(id, name, trust=trust), None
         if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     cost: dict[str, numpy.ndarray] = {}
@@ -348,12 +359,13 @@ def compare_scenarios(
     seed: int,
     split: str,
     progress: Callable[[int], None] = lambda done: None,
+    trust: bool = False,
 ) -> tuple[list[Comparison], list[Grid]]:
     """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them."""
     records: list[Comparison] = []
     grids: list[Grid] = []
     for scenario in scenarios:
-        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress)
+        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress, trust)
         comparisons = compare(runs, means, scenario, seed, split)
         records += comparisons
         grids += comparison_grids(runs, comparisons)

@@ -1,0 +1,189 @@
+"""What can execute code when it is loaded is not loaded, unless somebody says --trust."""
+
+import json
+import pickle
+import shutil
+import sys
+import zipfile
+
+import pytest
+from filtergym.agents.export import export_run
+from filtergym.agents.learned_policy import PRETRAINED
+
+import filtergym
+from filtergym.__main__ import main
+from filtergym.names import competitor
+
+ID = "filtergym/ManeuveringTarget-v0"
+AGENT = PRETRAINED / "ManeuveringTarget-v0" / "ppo"
+
+
+class Trap:
+    """Writes a file when it is unpickled."""
+
+    def __init__(self, file):
+        self.file = str(file)
+
+    def __reduce__(self):
+        return open, (self.file, "w")
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Run the command line; returns exit code, output and errors."""
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def stranger(tmp_path, monkeypatch):
+    """A run's folder from a stranger, below the working directory; the name of the file that his code writes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    folder, sprung = tmp_path / "run", tmp_path / "sprung"
+    for name in ("best", "checkpoint"):
+        (folder / name).mkdir(parents=True)
+        with zipfile.ZipFile(folder / name / "model.zip", "w") as file:
+            file.writestr("data", json.dumps({"policy_class": {":serialized:": ""}}))
+        (folder / name / "vecnormalize.pkl").write_bytes(pickle.dumps(Trap(sprung)))
+    (folder / "checkpoint" / "rest.pkl").write_bytes(pickle.dumps(Trap(sprung)))
+    record = json.loads(AGENT.with_suffix(".json").read_text(encoding="utf-8"))
+    (folder / "run.json").write_text(json.dumps(record))
+    return folder, sprung
+
+
+def test_a_model_is_not_unpickled(stranger, command):
+    pytest.importorskip("stable_baselines3")
+    folder, sprung = stranger
+    record = json.loads((folder / "run.json").read_text())
+    train = (
+        "train", ID, "--out", folder, "--algo", "ppo", "--resume", "--steps", record["steps"],
+        "--envs", record["envs"], "--seed", record["seed"],
+    )  # fmt: skip
+    model = folder / "best" / "model.zip"
+    for words in (
+        ("export", folder),
+        ("evaluate", ID, "--policy", model, "--episodes", 1),
+        ("seeds", folder, "--episodes", 2),
+        ("animate", ID, "--policy", model),
+        train,
+    ):
+        code, _, errors = command(*words)
+        assert (code, errors.count("\n")) == (2, 1), (words, errors)
+        assert "pickle, which can execute code: if you made it or know who did, add --trust" in errors
+    with pytest.raises(ValueError, match="trust=True"):
+        filtergym.evaluate(ID, [str(model)], episodes=1)
+    with pytest.raises(ValueError, match="trust=True"):
+        export_run(folder, folder / "agent.safetensors")
+    assert not sprung.exists()
+    # With --trust it is: that is what the word is for.
+    (folder / "checkpoint" / "model.zip").unlink()
+    assert command(*train, "--trust")[0] == 2
+    assert sprung.exists()
+
+
+def test_plain_arrays_take_no_trust(stranger, command):
+    folder, _ = stranger
+    shutil.copyfile(AGENT.with_suffix(".safetensors"), folder / "best" / "agent.safetensors")
+    assert command("export", folder)[0] == 0
+    assert command("evaluate", ID, "--policy", folder / "agent.safetensors", "--episodes", 2)[0] == 0
+
+
+def test_the_module_that_a_record_names_is_not_imported(stranger, command):
+    folder, sprung = stranger
+    (folder / "evil.py").write_text(f"open({str(sprung)!r}, 'w')")
+    record = json.loads((folder / "run.json").read_text()) | {"environment": "run.evil:mine/Turns-v0"}
+    (folder / "run.json").write_text(json.dumps(record))
+    for words in (("export", folder), ("seeds", folder)):
+        code, _, errors = command(*words)
+        assert code == 2
+        assert "asks for an import of module 'run.evil', which can execute code" in errors
+    assert not sprung.exists()
+    assert "unknown environment 'mine/Turns-v0'" in command("seeds", folder, "--trust")[2]
+    assert sprung.exists()
+
+
+def test_what_is_no_policy_is_not_called(command):
+    for name in ("os:system", "os:path", "sys:argv", "math:pi"):
+        code, _, errors = command("evaluate", ID, "--policy", name, "--episodes", 1)
+        assert code == 2
+        assert f"'{name}' is no policy, reference or bound" in errors
+    found = competitor(ID, "filtergym.baselines.maneuvering_target.references:KnownTurn")
+    assert found.kind == "reference"
+
+
+def test_a_name_with_a_colon_can_be_a_path(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a:b").mkdir()
+    for name in ("a:b/agent.safetensors", "C:\\agent.safetensors"):
+        shutil.copyfile(AGENT.with_suffix(".safetensors"), tmp_path / name)
+        code, output, errors = command("evaluate", ID, "--policy", name, "--episodes", 2)
+        assert code == 0, errors
+        assert name in output
+    for name, expected in (
+        ("D:\\agent.safetensors", "no learned policy at D:\\agent.safetensors"),
+        (".x:C", "cannot load policy '.x:C': ImportError: a module is named by words"),
+        ("D:\\agent", "cannot load policy 'D:\\\\agent'"),
+    ):
+        code, _, errors = command("evaluate", ID, "--policy", name, "--episodes", 1)
+        assert code == 2
+        assert expected in errors
+
+
+def test_a_path_is_not_read_as_markup(stranger, command):
+    folder, name = stranger[0], "[bold]:warning:/[/red]/a.safetensors"
+    shutil.copyfile(AGENT.with_suffix(".safetensors"), folder / "best" / "agent.safetensors")
+    code, output, errors = command("export", folder, "--out", name)
+    assert code == 0, errors
+    assert name in output
+    code, output, errors = command("evaluate", ID, "--policy", name, "--episodes", 2)
+    assert code == 0, errors
+    assert name in output
+    assert name[:-1] in command("evaluate", ID, "--policy", name[:-1])[2]
+
+
+def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, command):
+    """As an installed command starts: without the working directory on the path."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(tmp_path))])
+    for name in ("middle_policy", "middle_environment"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    (tmp_path / "middle_policy.py").write_text(
+        "from filtergym.evaluation.competitors import ConstantPolicy\n"
+        "class Middle(ConstantPolicy):\n    control, action = 'gain', (0.0,)\n"
+    )
+    (tmp_path / "middle_environment.py").write_text("1 / 0")
+    code, output, errors = command("evaluate", ID, "--policy", "middle_policy:Middle", "--episodes", 2)
+    assert code == 0, errors
+    assert "middle_policy:Middle" in output
+    # An environment's module is looked for in the same places, and its errors are a sentence, too.
+    code, _, errors = command("list", "middle_environment:mine/Middle-v0")
+    assert code == 2
+    assert "registers environment 'mine/Middle-v0': ZeroDivisionError" in errors
+
+
+def test_a_file_of_ones_own_hides_no_library(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    command("list", ID)
+    assert sys.path[-1] == str(tmp_path)
+
+
+def test_what_nobody_expected_is_a_sentence(monkeypatch, command):
+    def broken(*_, **__):
+        raise KeyError("lost")
+
+    monkeypatch.setattr("filtergym.commands.measure.evaluate", broken)
+    code, _, errors = command("evaluate", ID, "--policy", "imm")
+    assert (code, errors.count("\n")) == (1, 1)
+    assert "Error: unexpected KeyError: 'lost'; --debug shows where" in errors
+    assert "please report it" in errors
+    monkeypatch.setattr("sys.argv", ["filtergym", "evaluate", ID, "--policy", "imm", "--debug"])
+    with pytest.raises(KeyError, match="lost"):
+        main()
