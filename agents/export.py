@@ -8,7 +8,7 @@ import numpy
 import torch
 
 from ..evaluation.evaluate import evaluate
-from ..evaluation.files import whole_file
+from ..evaluation.files import found_folder, whole_files, writable_file
 from .learned_policy import read_header, stored_policy, write_arrays
 from .sb3_training import Sb3Policy, load_sb3_policy
 from .training_run import TrainingRun, load_run, save_run
@@ -77,25 +77,30 @@ def export_run(folder: Path, out: Path) -> TrainingRun:
     """Write the best agent of a run as ``out``, with its ``run.json`` beside it under the same name.
 
     Raises:
-        ValueError: if the folder holds no run, or none that can be exported.
+        ValueError: if the folder holds no run, or none that can be exported, or the file cannot be written.
     """
     run = load_run(folder)
-    if run.algorithm == "bptt":
-        source = folder / "best" / "agent.safetensors"
-        read_header(source)
-        with whole_file(out) as partial:
-            shutil.copyfile(source, partial)
-    else:
-        agent = load_sb3_policy(folder / "best" / "model.zip", run.algorithm)
-        arrays, output, activation = network_arrays(agent, run.algorithm)
-        write_arrays(out, arrays, run, output, activation)
-    dataset = evaluate(
-        run.environment,
-        {"exported": stored_policy(run.environment, out)},
-        run.scenario,
-        CHECK_EPISODES,
-        split="validation",
-    )
-    run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
-    save_run(run, out.with_suffix(".json"))
+    if out.suffix != ".safetensors":
+        raise ValueError(f"{out} must end in .safetensors, by which an evaluation knows what it is")
+    writable_file(out)
+    best = found_folder(folder / "best")
+    with whole_files(out.parent) as waiting:
+        file = waiting / out.name
+        if run.algorithm == "bptt":
+            source = best / "agent.safetensors"
+            read_header(source)
+            shutil.copyfile(source, file)
+        else:
+            agent = load_sb3_policy(best / "model.zip", run.algorithm)
+            arrays, output, activation = network_arrays(agent, run.algorithm)
+            write_arrays(file, arrays, run, output, activation)
+        dataset = evaluate(
+            run.environment,
+            {"exported": stored_policy(run.environment, file)},
+            run.scenario,
+            CHECK_EPISODES,
+            split="validation",
+        )
+        run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
+        save_run(run, file.with_suffix(".json"))
     return run

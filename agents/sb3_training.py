@@ -6,6 +6,7 @@ that never stopped. It is loaded with pickle: never resume from a stranger's fol
 """
 
 import importlib.util
+import io
 import pickle
 import random
 import zipfile
@@ -143,7 +144,10 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
     """Write ``model.zip`` and ``vecnormalize.pkl``."""
-    model.save(folder / "model.zip")
+    # Through memory: on a full disk torch raises something of its own.
+    written = io.BytesIO()
+    model.save(written)
+    (folder / "model.zip").write_bytes(written.getvalue())
     if normalisation is not None:
         normalisation.save(str(folder / "vecnormalize.pkl"))
 
@@ -218,7 +222,7 @@ def train_sb3(
     progress: Callable[[int], None] = lambda steps: None,
     report: Callable[[str], None] = lambda line: None,
 ) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
     Args:
         run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
@@ -228,6 +232,8 @@ def train_sb3(
         progress: told of all environment steps done so far.
         report: told of every validation.
     """
+    if resume and run.finished:
+        return run
     check_algorithm(run)
     values = dict(run.hyperparameters)
     values["learning_rate"] = learning_rate_schedule(values["learning_rate"])

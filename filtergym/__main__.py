@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from .commands import improve, measure, report
+from .commands.terminal import close_output, open_output
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
@@ -33,12 +34,14 @@ def main() -> None:
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
+        result_callback=close_output,
     )
     for name, command in COMMANDS.items():
         app.command(name)(command)
+    open_output()
     try:
         app()
-    except (ValueError, gymnasium.error.Error) as error:
+    except (ValueError, OSError, gymnasium.error.Error) as error:
         Console(stderr=True, highlight=False).print(
             f"Error: {error}", style="red", markup=False, soft_wrap=True
         )

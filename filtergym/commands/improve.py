@@ -6,9 +6,9 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.catalogue import baselines_of
-from ..baselines.tuning import FOLDER, save_tuned, tune
+from ..baselines.tuning import FOLDER, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
-from ..evaluation.files import writable_folder
+from ..evaluation.files import writable_file
 from ..reports.tables import tuned_table
 from .terminal import Environment, TrainingScenario, console, progress_bar
 
@@ -29,7 +29,7 @@ def tune_policy(
     tunable = baselines_of(cls.id).tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
-    writable_folder(out)
+    writable_file(table_path(cls.id, out))
     with progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
@@ -41,9 +41,9 @@ def tune_policy(
             seed,
             progress=lambda steps: bar.update(line, advance=steps),
         )
-    console.print(tuned_table(outcome, tunable[policy].start))
     command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
+    console.print(tuned_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
@@ -63,7 +63,7 @@ def train(
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
     ] = None,
 ) -> None:
-    """Train an agent; Ctrl-C stops it with a checkpoint that --resume goes on from.
+    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint is loaded with pickle, which can execute code: resume only what you trust.
 
