@@ -8,6 +8,7 @@ gradients stop.
 """
 
 import importlib.util
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -140,13 +141,15 @@ def train_bptt(
     progress: Callable[[int], None] = lambda steps: None,
     report: Callable[[str], None] = lambda line: None,
 ) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
     Arguments as in :func:`.sb3_training.train_sb3`.
 
     Raises:
         ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
     """
+    if resume and run.finished:
+        return run
     task = make_task(run.environment, run.control, run.scenario)
     space = task.action_space
     if not isinstance(space, gymnasium.spaces.Box):
@@ -187,7 +190,10 @@ def train_bptt(
             "generators": _saved_generators(env),
             "steps": steps_done,
         }
-        torch.save(kept, place / "checkpoint.pt")
+        # Through memory: on a full disk torch raises something of its own.
+        written = io.BytesIO()
+        torch.save(kept, written)
+        (place / "checkpoint.pt").write_bytes(written.getvalue())
 
     def save_agent(place: Path) -> None:
         write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")

@@ -4,7 +4,7 @@ import shutil
 from pathlib import Path
 
 from ..evaluation.evaluate import evaluate
-from ..evaluation.files import whole_file
+from ..evaluation.files import whole_files, writable_file
 from .learned_policy import stored_policy, write_arrays
 from .named_policies import learned_policy
 from .training_run import TrainingRun, best_agent, load_run, save_run
@@ -22,26 +22,31 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
             both can execute code.
 
     Raises:
-        ValueError: if the folder holds no run, none that can be exported, or one that takes ``trust``.
+        ValueError: if the folder holds no run, none that can be exported, or one that takes ``trust``, or the file
+            cannot be written.
     """
     run = load_run(folder, trust)
+    if out.suffix != ".safetensors":
+        raise ValueError(f"{out} must end in .safetensors, by which an evaluation knows what it is")
+    writable_file(out)
     source = best_agent(folder)
     agent = learned_policy(run.environment, str(source), trust)
-    if source.suffix == ".safetensors":
-        with whole_file(out) as partial:
-            shutil.copyfile(source, partial)
-    else:
-        from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
+    with whole_files(out.parent) as waiting:
+        file = waiting / out.name
+        if source.suffix == ".safetensors":
+            shutil.copyfile(source, file)
+        else:
+            from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
 
-        arrays, output, activation = network_arrays(agent, run.algorithm)
-        write_arrays(out, arrays, run, output, activation)
-    dataset = evaluate(
-        run.environment,
-        {"exported": stored_policy(run.environment, out)},
-        run.scenario,
-        CHECK_EPISODES,
-        split="validation",
-    )
-    run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
-    save_run(run, out.with_suffix(".json"))
+            arrays, output, activation = network_arrays(agent, run.algorithm)
+            write_arrays(file, arrays, run, output, activation)
+        dataset = evaluate(
+            run.environment,
+            {"exported": stored_policy(run.environment, file)},
+            run.scenario,
+            CHECK_EPISODES,
+            split="validation",
+        )
+        run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
+        save_run(run, file.with_suffix(".json"))
     return run

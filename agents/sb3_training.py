@@ -8,6 +8,7 @@ lie its plain arrays, which take none.
 
 import contextlib
 import importlib.util
+import io
 import pickle
 import random
 from collections.abc import Callable
@@ -146,7 +147,10 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
     """Write ``model.zip`` and ``vecnormalize.pkl``."""
-    model.save(folder / "model.zip")
+    # Through memory: on a full disk torch raises something of its own.
+    written = io.BytesIO()
+    model.save(written)
+    (folder / "model.zip").write_bytes(written.getvalue())
     if normalisation is not None:
         normalisation.save(str(folder / "vecnormalize.pkl"))
 
@@ -234,7 +238,7 @@ def train_sb3(
     *,
     trust: bool = False,
 ) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C.
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
     Args:
         run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
@@ -249,6 +253,8 @@ def train_sb3(
         ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
             read.
     """
+    if resume and run.finished:
+        return run
     check_algorithm(run)
     values = dict(run.hyperparameters)
     values["learning_rate"] = learning_rate_schedule(values["learning_rate"])

@@ -1,7 +1,8 @@
 """What every training run has, whatever the algorithm: its folder, its record, and its validation.
 
 A run's folder holds ``run.json`` (command, versions, seeds, duration, validation), ``checkpoint/`` (the last
-one, from which ``--resume`` goes on), ``best/`` (the agent with the lowest validation cost) and the log.
+one, from which ``--resume`` goes on, with the ``run.json`` of its time), ``best/`` (the agent with the lowest
+validation cost) and the log.
 """
 
 import importlib.metadata
@@ -21,7 +22,7 @@ import xarray
 from ..baselines.catalogue import baselines_of
 from ..baselines.names import evaluate
 from ..envs.catalogue import find_scenario, importable_name, nearest, task_class
-from ..evaluation.files import whole_folder, writable_folder, write_text
+from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.metrics import tidy_records
 from ..evaluation.stored import read_json, restored
 
@@ -63,6 +64,11 @@ class TrainingRun:
     validation: list[Validated] = field(default_factory=list)
     exported: dict[str, Any] | None = None
     """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps asked for are done."""
+        return self.steps_done >= self.steps
 
     @property
     def best(self) -> Validated | None:
@@ -197,26 +203,39 @@ def best_agent(folder: Path) -> Path:
     Raises:
         ValueError: if the run has not been validated yet.
     """
+    best = found_folder(folder / "best")
     for name in ("agent.safetensors", "model.zip"):
-        if (folder / "best" / name).is_file():
-            return folder / "best" / name
+        if (best / name).is_file():
+            return best / name
     raise ValueError(f"{folder} has no best agent yet: train it up to its first validation")
 
 
 def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
-    """Read the run of a folder to go on with it, up to the steps asked for.
+    """Read the run of a folder to go on with it, up to the steps asked for; what a crash left is put in order.
 
     Raises:
         ValueError: if it is a run of something else.
     """
-    run = load_run(folder)
+    checkpoint = folder / "checkpoint"
+    for place in (checkpoint, folder / "best"):
+        settle_folder(place)
+    # A crash between the two leaves a checkpoint that is newer than the folder's record: its own one counts.
+    own = (checkpoint / "run.json").exists()
+    try:
+        run = load_run(checkpoint if own else folder)
+    except ValueError as error:
+        if own:
+            raise ValueError(f"cannot read the checkpoint in {checkpoint}: {error}") from error
+        raise
     for name in ("environment", "control", "scenario", "algorithm", "seed", "envs", "hyperparameters"):
         if getattr(run, name) != getattr(asked, name):
             raise ValueError(
                 f"{folder} holds a run with {name} {getattr(run, name)!r}, not {getattr(asked, name)!r}"
             )
-    if not (folder / "checkpoint").is_dir():
+    if not checkpoint.is_dir():
         raise ValueError(f"{folder} has no checkpoint to resume from")
+    if not (folder / "run.json").exists() or load_run(folder) != run:
+        save_run(run, folder / "run.json")
     run.steps = asked.steps
     return run
 
@@ -227,7 +246,7 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool) -> TrainingRun:
     Raises:
         ValueError: if the folder cannot be written to, holds a run already, or holds another one.
     """
-    if not resume and (folder / "run.json").exists():
+    if not resume and ((folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()):
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
@@ -280,20 +299,25 @@ class Validation:
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Turn the first Ctrl-C into a wish to stop at the next safe point; the second one stops at once."""
+    """Turn the first Ctrl-C or SIGTERM into a wish to stop at the next safe point; the second stops at once."""
     wished = False
 
     def wish(*_: Any) -> None:
         nonlocal wished
         wished = True
-        signal.signal(signal.SIGINT, before)
+        restore()
 
-    before = signal.getsignal(signal.SIGINT)
-    signal.signal(signal.SIGINT, wish)
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in before:
+        signal.signal(number, wish)
     try:
         yield lambda: wished
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()
 
 
 class Bookkeeping:
@@ -343,6 +367,7 @@ class Bookkeeping:
                 self.save_agent(best)
         with whole_folder(self.folder / "checkpoint") as checkpoint:
             self.save_checkpoint(checkpoint)
+            save_run(run, checkpoint / "run.json")
         save_run(run, self.folder / "run.json")
         line = f"{steps_done:,} steps: validation cost {entry['cost']:.4g}"
         if self.validation.paper:

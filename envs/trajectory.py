@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy
 
+MOST_SAMPLES = 20_000
+"""Of a flight, 33 h of scans 6 s apart; more are taken for a mistake of units or an outlier among the times."""
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -57,6 +60,21 @@ class Trajectory:
         """Seconds from the first to the last time."""
         return float(self.time[-1] - self.time[0])
 
+    def intervals(self, interval: float) -> int:
+        """Number of whole sampling intervals (s) that the flight lasts.
+
+        Raises:
+            ValueError: if they are too many for an episode.
+        """
+        count = self.duration / interval + 1e-9
+        if count > MOST_SAMPLES:
+            raise ValueError(
+                f"trajectory {self.name!r} lasts {self.duration:g} s, which is {count:.4g} sampling intervals "
+                f"of {interval:g} s, more than {MOST_SAMPLES:,}: check that its times are seconds, "
+                "or give a larger sampling_interval"
+            )
+        return int(count)
+
     def resampled(self, interval: float, count: int) -> numpy.ndarray:
         """State at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
 
@@ -65,7 +83,15 @@ class Trajectory:
 
         Returns:
             x, y (m) and their rates (m/s), ``(4, count)``.
+
+        Raises:
+            ValueError: if that are too many samples.
         """
+        if count > MOST_SAMPLES:
+            raise ValueError(
+                f"trajectory {self.name!r} cannot be sampled {count:,} times, more than {MOST_SAMPLES:,}: "
+                "give a smaller horizon"
+            )
         from scipy.interpolate import CubicHermiteSpline, CubicSpline, make_interp_spline
 
         if self.velocity is not None:

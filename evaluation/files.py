@@ -1,10 +1,22 @@
-"""Files that are whole or not there: written beside their place, then moved into it."""
+"""Files and folders that are whole or as they were: written beside their place, then moved into it.
 
+Whatever the operating system refuses on the way, such as a full disk, is one sentence that names the place.
+"""
+
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+@contextmanager
+def _refusals_told(place: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ValueError(f"cannot write {place}: {error.strerror or error}") from error
 
 
 def writable_folder(path: Path) -> Path:
@@ -13,13 +25,32 @@ def writable_folder(path: Path) -> Path:
     Raises:
         ValueError: if it cannot.
     """
-    try:
+    with _refusals_told(f"to folder {path}"):
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-    except OSError as error:
-        raise ValueError(f"cannot write to folder {path}: {error.strerror or error}") from error
     return path
+
+
+def writable_file(path: Path) -> Path:
+    """Check that a file can be written, before any long work begins; its folder is made.
+
+    Raises:
+        ValueError: if it cannot, or if a folder or a device has its name.
+    """
+    with _refusals_told(f"file {path}"):
+        if path.exists() and not path.is_file():
+            raise ValueError(f"cannot write file {path}: a folder or device has that name")
+        writable_folder(path.parent)
+        _partial(path).touch()
+        _partial(path).unlink()
+    return path
+
+
+def _partial(path: Path) -> Path:
+    # Beside what a link points to: the link stays.
+    place = Path(os.path.realpath(path))
+    return place.with_name(f".{place.name}.partial")
 
 
 @contextmanager
@@ -27,35 +58,93 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Give a new file that takes the place of an old one only when it is complete.
 
     Raises:
-        ValueError: if the folder cannot be written to.
+        ValueError: if it cannot be written.
     """
-    partial = writable_folder(path.parent) / f".{path.name}.partial"
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+    partial = _partial(writable_file(path))
+    with _refusals_told(f"file {path}"):
+        try:
+            yield partial
+            partial.replace(os.path.realpath(path))
+        finally:
+            partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_files(folder: Path) -> Iterator[Path]:
+    """Give a new folder whose files go into another one together, when all of them are complete.
+
+    Raises:
+        ValueError: if they cannot be written.
+    """
+    writable_folder(folder)
+    with (
+        _refusals_told(f"to folder {folder}"),
+        tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-", ignore_cleanup_errors=True) as waiting,
+    ):
+        yield Path(waiting)
+        complete = list(Path(waiting).iterdir())
+        for path in complete:
+            writable_file(folder / path.name)
+        for path in complete:
+            path.replace(folder / path.name)
+
+
+def _beside(folder: Path) -> tuple[Path, Path]:
+    return folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".old")
+
+
+def found_folder(folder: Path) -> Path:
+    """Return where a folder of :func:`whole_folder` is: beside its place if a crash came while it was moved.
+
+    The old one is moved away only when the new one is complete, so without the folder both others are whole.
+    """
+    partial, old = _beside(folder)
+    if folder.exists() or not old.exists():
+        return folder
+    return partial if partial.exists() else old
+
+
+def settle_folder(folder: Path) -> None:
+    """Finish what a crash interrupted, and remove what it left.
+
+    Raises:
+        ValueError: if it cannot be moved into its place.
+    """
+    found = found_folder(folder)
+    if found != folder:
+        with _refusals_told(f"folder {folder}"):
+            found.rename(folder)
+    for leftover in _beside(folder):
+        shutil.rmtree(leftover, ignore_errors=True)
 
 
 @contextmanager
 def whole_folder(folder: Path) -> Iterator[Path]:
-    """Give a new folder that takes the place of an old one only when it is complete."""
-    partial, old = folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".old")
-    for leftover in (partial, old):
-        shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
-    yield partial
-    if folder.exists():
-        folder.rename(old)
-    partial.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    """Give a new folder that takes the place of an old one only when it is complete.
+
+    Raises:
+        ValueError: if it cannot be written.
+    """
+    settle_folder(folder)
+    partial, old = _beside(folder)
+    with _refusals_told(f"folder {folder}"):
+        try:
+            partial.mkdir(parents=True)
+            yield partial
+            if folder.exists():
+                folder.rename(old)
+            partial.rename(folder)
+        finally:
+            if found_folder(folder) == folder:
+                for leftover in (partial, old):
+                    shutil.rmtree(leftover, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file.
 
     Raises:
-        ValueError: if the folder cannot be written to.
+        ValueError: if it cannot be written.
     """
     with whole_file(path) as partial:
         partial.write_text(text, encoding="utf-8")

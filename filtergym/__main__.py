@@ -12,6 +12,7 @@ from rich.console import Console
 
 from . import __version__
 from .commands import improve, measure, report
+from .commands.terminal import close_output, open_output
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
@@ -55,6 +56,7 @@ def application() -> Any:
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
+        result_callback=close_output,
     )
     for name, command in COMMANDS.items():
         app.command(name)(command)
@@ -64,13 +66,14 @@ def application() -> Any:
 def main() -> None:
     """Run the command line.
 
-    A user's mistake ends in one sentence and exit code 2; what nobody expected in one that asks for a report, and exit
-    code 1. With ``--debug`` both end in a traceback.
+    A user's mistake, or what the operating system refuses, ends in one sentence and exit code 2; what nobody expected
+    in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
     """
     if not sys.flags.safe_path and os.getcwd() not in sys.path:
         # Modules of one's own are found, as by ``python -m filtergym``; last, so that none of them hides a library.
         sys.path.append(os.getcwd())
     debug = "--debug" in sys.argv
+    open_output()
     try:
         application()([word for word in sys.argv[1:] if word != "--debug"])
     except Exception as error:
@@ -79,7 +82,7 @@ def main() -> None:
         text, code = f"Error: {error}", 2
         if isinstance(error, MemoryError):
             text = f"Error: not enough memory, ask for less at once: {error}"
-        elif not isinstance(error, ValueError | gymnasium.error.Error):
+        elif not isinstance(error, ValueError | OSError | gymnasium.error.Error):
             text, code = f"Error: unexpected {type(error).__name__}: {error}; {REPORT}", 1
         Console(stderr=True, highlight=False, emoji=False).print(
             text.replace("\n", " "), style="red", markup=False, soft_wrap=True

@@ -29,7 +29,9 @@ def check_source_distribution(archive: Path, source: Path) -> None:
     """It holds every file of the repository but `.gitignore`; where this is no repository there is nothing to ask."""
     if not (source / ".git").exists():
         return
-    listed = subprocess.run(["git", "ls-files"], cwd=source, capture_output=True, text=True, check=True).stdout
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=source, capture_output=True, text=True, check=True
+    ).stdout
     held = {name.partition("/")[2] for name in tarfile.open(archive).getnames()}
     assert not (missing := set(listed.split()) - held - {".gitignore"}), sorted(missing)
 
@@ -49,7 +51,11 @@ def check_command_line() -> None:
     """The installed command lists, evaluates a tuned policy and a shipped agent, and knows its version."""
     command = Path(sys.executable).parent / "filtergym"
     evaluate = "evaluate filtergym/ManeuveringTarget-v0 --policy imm-tuned --policy ppo --episodes 2"
-    for arguments, expected in (("--version", filtergym.__version__), ("list", "bptt"), (evaluate, "imm-tuned")):
+    for arguments, expected in (
+        ("--version", filtergym.__version__),
+        ("list", "bptt"),
+        (evaluate, "imm-tuned"),
+    ):
         ran = subprocess.run([command, *arguments.split()], capture_output=True, text=True, check=False)
         assert ran.returncode == 0, ran.stderr
         assert expected in ran.stdout

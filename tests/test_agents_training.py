@@ -22,7 +22,7 @@ from filtergym.agents import training_run
 from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
-from filtergym.agents.learned_policy import LearnedPolicy, read_header
+from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_header
 from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_training import Sb3Policy, load_sb3_policy, train_sb3
 from filtergym.agents.training_run import load_run, new_run, resumed_run
@@ -92,22 +92,52 @@ def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
         assert torch.equal(tensor, other[name]), name
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
-def test_control_c_leaves_a_checkpoint_to_resume_from(algorithm, tmp_path):
-    told, before = [], signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize(
+    ("algorithm", "number"), [("ppo", signal.SIGINT), ("bptt", signal.SIGINT), ("bptt", signal.SIGTERM)]
+)
+def test_a_signal_leaves_a_checkpoint_to_resume_from(algorithm, number, tmp_path):
+    told, before = [], signal.getsignal(number)
 
     def interrupt(steps):
         if not told:
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
         told.append(steps)
 
     train(small_run(algorithm, 10_000), tmp_path, progress=interrupt)
     done = load_run(tmp_path).steps_done
     assert 0 < done < 2000
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     train(resumed_run(tmp_path, small_run(algorithm, 2000)), tmp_path, resume=True)
     assert load_run(tmp_path).steps_done >= 2000
     assert len(load_run(tmp_path).validation) == 2
+
+
+def contents(folder):
+    return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_resuming_a_finished_run_changes_nothing(algorithm, tmp_path):
+    train(small_run(algorithm, 240), tmp_path)
+    before = contents(tmp_path)
+    for steps in (240, 100):
+        run = train(resumed_run(tmp_path, small_run(algorithm, steps)), tmp_path, resume=True)
+        assert len(run.validation) == 1
+        assert contents(tmp_path) == before
+
+
+def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
+    train(small_run("bptt", 400), tmp_path)
+    # As a crash leaves it: the new checkpoint complete beside its place, the record still to be written.
+    (tmp_path / "checkpoint").rename(tmp_path / "checkpoint.partial")
+    (tmp_path / "checkpoint.old").mkdir()
+    record = (tmp_path / "run.json").read_bytes()
+    (tmp_path / "run.json").unlink()
+    with pytest.raises(ValueError, match="add --resume"):
+        training_run.opened_run(tmp_path, small_run("bptt", 400), resume=False)
+    run = resumed_run(tmp_path, small_run("bptt", 800))
+    assert (tmp_path / "run.json").read_bytes() == record
+    assert train(run, tmp_path, resume=True).steps_done == 800
 
 
 def test_validation_is_that_of_evaluate(tmp_path):
@@ -346,6 +376,26 @@ class TestCommandLine:
         assert printed.err.startswith("Error: scenario 'paper' is held out")
         assert self.run(monkeypatch, capsys, "export", tmp_path / "x")[0] == 2
         assert not (tmp_path / "x").exists()
+
+    def test_export_refuses_what_is_no_file_for_it(self, monkeypatch, capsys, tmp_path):
+        best = tmp_path / "best"
+        best.mkdir()
+        shipped = PRETRAINED / "ManeuveringTarget-v0" / "bptt"
+        shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")
+        shutil.copyfile(shipped.with_suffix(".json"), tmp_path / "run.json")
+        (tmp_path / "folder.safetensors").mkdir()
+        (tmp_path / "taken.json").mkdir()
+        before = contents(tmp_path)
+        for out, expected in (
+            (".", "must end in .safetensors"),
+            (tmp_path / "a.json", "must end in .safetensors"),
+            (tmp_path / "folder.safetensors", "a folder or device has that name"),
+            (tmp_path / "taken.safetensors", "a folder or device has that name"),
+        ):
+            code, printed = self.run(monkeypatch, capsys, "export", tmp_path, "--out", out)
+            assert (code, printed.err.count("\n")) == (2, 1)
+            assert expected in printed.err
+            assert contents(tmp_path) == before
 
 
 def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):

@@ -167,6 +167,22 @@ def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
     assert not (tmp_path / "unfinished").exists()
 
 
+def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
+    from filtergym.reports import benchmark
+
+    cell = benchmark.Cell(ENV, "paper", 20, ("imm",))
+    monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])
+    monkeypatch.setattr(benchmark, "run_cell", lambda *_: [])
+    waiting = tmp_path / "unfinished"
+    others = {"thesis.tex", "ManeuveringTarget-v0.paper.20.test1.json", "folder"}
+    (waiting / "folder").mkdir(parents=True)
+    for name in others - {"folder"}:
+        (waiting / name).write_text("mine")
+    benchmark.run_benchmark(tmp_path, full=False, seed=0)
+    assert (tmp_path / "benchmark.json").exists()
+    assert {path.name for path in waiting.iterdir()} == others
+
+
 def test_full_benchmark_compares_everything():
     from filtergym.reports import benchmark
 

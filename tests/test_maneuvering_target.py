@@ -609,3 +609,22 @@ def test_resampled_trajectory_runs_through_positions_and_velocities():
 def test_bad_trajectories(time, position, velocity, message):
     with pytest.raises(ValueError, match=message):
         Trajectory(time, position, velocity)
+
+
+@pytest.mark.parametrize(
+    ("last", "keywords", "message"),
+    [
+        (1e9, {}, r"lasts 1e\+09 s, which is 1.667e\+08 sampling intervals of 6 s, more than 20,000"),
+        (1e300, {"sampling_interval": 1e-300}, "which is inf sampling intervals"),
+        (60.0, {"sampling_interval": 1e-9}, "or give a larger sampling_interval"),
+        (
+            60.0,
+            {"horizon": 10**9},
+            "cannot be sampled 1,000,000,002 times, more than 20,000: give a smaller horizon",
+        ),
+    ],
+)
+def test_a_flight_of_too_many_scans_is_refused_at_once(last, keywords, message):
+    flight = Trajectory(np.array([0.0, 5.0, last]), np.array([[1000.0, 0.0], [1100.0, 0.0], [2000.0, 500.0]]))
+    with pytest.raises(ValueError, match=message):
+        make_task("ManeuveringTarget", scenario=flight, **keywords)

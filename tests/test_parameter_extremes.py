@@ -186,7 +186,10 @@ def main(count, *chosen):
             if said and not said.startswith("refused: "):
                 failed += 1
                 print(f"{env_id} {keywords}: {said}", flush=True)
-        print(f"{env_id}: {len(cases)} tried ({len(alone)} alone), {refused} refused, {failed} failed", flush=True)
+        print(
+            f"{env_id}: {len(cases)} tried ({len(alone)} alone), {refused} refused, {failed} failed",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

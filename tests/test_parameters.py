@@ -90,7 +90,11 @@ TARGET, NAVIGATION = "ManeuveringTarget", "TightlyCoupledNavigation"
         (TARGET, "polar_measurements=false", "polar_measurements must be True or False, got 'false'"),
         (NAVIGATION, "urban=true", "urban must be True or False, got 'true'"),
         (NAVIGATION, "aperture=1", "aperture must be True or False, got 1"),
-        (TARGET, "maneuver_steps=[1.5,2.5]", r"maneuver_steps\[0\] must be an integer of at least 1, got 1.5"),
+        (
+            TARGET,
+            "maneuver_steps=[1.5,2.5]",
+            r"maneuver_steps\[0\] must be an integer of at least 1, got 1.5",
+        ),
         (TARGET, "track=5", "track must be a sequence of rows, got 5"),
         (TARGET, "legs=5", "legs must be a sequence of rows, got 5"),
         (NAVIGATION, "satellites=2", "satellites must be a sequence of integers, got 2"),

@@ -10,7 +10,6 @@ There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. P
 """
 
 import importlib
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any, Literal
 
 from ...envs.catalogue import nearest
 from ...evaluation.figures import save
-from ...evaluation.files import write_text
+from ...evaluation.files import whole_files, write_text
 from ..catalogue import packages
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
@@ -124,9 +123,7 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list
 
 def save_reproduction(result: Reproduction, folder: Path) -> None:
     """Write ``report.md`` and the figures into an existing folder, all of them or none."""
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-") as waiting:
+    with whole_files(folder) as waiting:
         for name, (figure, _) in result.figures.items():
-            save(figure, Path(waiting) / f"{name}.png")
-        write_text(Path(waiting) / "report.md", as_markdown(result))
-        for path in Path(waiting).iterdir():
-            path.replace(folder / path.name)
+            save(figure, waiting / f"{name}.png")
+        write_text(waiting / "report.md", as_markdown(result))

@@ -124,7 +124,7 @@ class ManeuveringTarget(Task):
                 f"trajectory {trajectory.name!r} goes {farthest / 1e3:,.0f} km from the radar at the origin; "
                 f"its range ends at {FARTHEST_RANGE / 1e3:,.0f} km (positions are metres)"
             )
-        scans = int(trajectory.duration / interval + 1e-9)
+        scans = trajectory.intervals(interval)
         if scans < 2:
             raise ValueError(
                 f"trajectory {trajectory.name!r} lasts {trajectory.duration:g} s, which is less than two scans "

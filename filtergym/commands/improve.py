@@ -10,7 +10,7 @@ from ..agents.export import export_run
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
-from ..evaluation.files import writable_folder
+from ..evaluation.files import writable_file
 from ..reports.tables import tuned_table
 from .terminal import Environment, TrainingScenario, Trust, console, progress_bar
 
@@ -31,8 +31,8 @@ def tune_policy(
     tunable = baselines_of(cls.id).tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
-    writable_folder(out)
-    read_table(table_path(cls.id, out))  # a file that cannot take the values is refused before the work
+    table = writable_file(table_path(cls.id, out))
+    read_table(table)  # a file that cannot take the values is refused before the work
     with progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
@@ -44,9 +44,9 @@ def tune_policy(
             seed,
             progress=lambda steps: bar.update(line, advance=steps),
         )
-    console.print(tuned_table(outcome, tunable[policy].start))
     command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
+    console.print(tuned_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
@@ -67,7 +67,7 @@ def train(
     ] = None,
     trust: Trust = False,
 ) -> None:
-    """Train an agent; Ctrl-C stops it with a checkpoint that --resume goes on from.
+    """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one also takes --trust. One of bptt
     cannot.

@@ -8,7 +8,7 @@ import typer
 from ..baselines.catalogue import baselines_of
 from ..envs.catalogue import catalogue, check_names, short_name, task_class
 from ..evaluation.figures import evaluation_figures, save
-from ..evaluation.files import writable_folder
+from ..evaluation.files import whole_files, writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..names import competitor, evaluate, tidy_records
 from ..reports.benchmark import Cell, run_benchmark
@@ -72,7 +72,7 @@ def evaluate_policies(
     if out is not None:
         writable_folder(out)
     if json is not None:
-        writable_folder(json.parent)
+        writable_file(json)
     names = policy or list(known.benchmark or known.names)
     keywords = parsed_settings(settings or [])
     check_names(cls, keywords)
@@ -91,13 +91,15 @@ def evaluate_policies(
             **keywords,
         )
     records = tidy_records(dataset)
-    console.print(results_table(records))
     if json is not None:
         write_records(json, records)
     if out is not None:
-        write_records(out / "records.json", records)
-        for name, figure in evaluation_figures(dataset):
-            save(figure, out / f"{name}.png")
+        with whole_files(out) as waiting:
+            write_records(waiting / "records.json", records)
+            for name, figure in evaluation_figures(dataset):
+                save(figure, waiting / f"{name}.png")
+    console.print(results_table(records))
+    if out is not None:
         console.print(f"figures and records in {out}")
 
 
@@ -151,7 +153,7 @@ def animate(
     cls = task_class(environment)
     writable_folder(out)
     for name in policy:
-        path = out / f"{cls.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
+        path = writable_file(out / f"{cls.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif")
         maker = competitor(cls.id, name, trust=trust)
         write_animation(episode_frames(cls.id, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

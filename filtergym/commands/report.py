@@ -8,10 +8,10 @@ import typer
 from ..baselines.reproduction import paper_module, papers, save_reproduction
 from ..envs.catalogue import find_scenario, importable_name, short_name, task_class
 from ..evaluation.figures import save
-from ..evaluation.files import writable_folder
+from ..evaluation.files import whole_files, writable_file, writable_folder
 from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
-from ..reports.pages import insert_between_markers, split_at_markers
+from ..reports.pages import check_markers, insert_between_markers
 from ..reports.records import write_records
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table, results_table
@@ -32,18 +32,22 @@ def comparison_page(
     found = comparison.read_benchmark(records)
     markers = {id: f"comparison {short_name(id)}" for id in found}
     if into is not None:
-        for marker in markers.values():
-            split_at_markers(into, marker)
-    for id, own in found.items():
-        compared = comparison.compare_environment(own)
-        for grid in compared.grids:
+        check_markers(into, markers.values())
+    compared = {id: comparison.compare_environment(own) for id, own in found.items()}
+    if into is not None:
+        texts = {}
+        with whole_files(into.parent / "images") as images:
+            for id, own in found.items():
+                picture = f"comparison_{short_name(id)}.png"
+                save(compared[id].figure, images / picture)
+                command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
+                texts[markers[id]] = comparison.comparison_markdown(
+                    compared[id], own, f"images/{picture}", command
+                )
+        insert_between_markers(into, texts)
+    for each in compared.values():
+        for grid in each.grids:
             console.print(grid_table(grid))
-        if into is not None:
-            picture = f"images/comparison_{short_name(id)}.png"
-            save(compared.figure, writable_folder(into.parent / "images") / Path(picture).name)
-            command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
-            text = comparison.comparison_markdown(compared, own, picture, command)
-            insert_between_markers(into, markers[id], text)
 
 
 def room(
@@ -58,14 +62,14 @@ def room(
     """
     cls = task_class(environment)
     if into is not None:
-        split_at_markers(into, MARKER)  # a page that cannot take the table is refused before the work
+        check_markers(into, [MARKER])  # a page that cannot take the table is refused before the work
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
-    console.print(results_table(records))
     if into is not None:
         command = f"filtergym room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
-        insert_between_markers(into, MARKER, room_markdown(records, command))
+        insert_between_markers(into, {MARKER: room_markdown(records, command)})
+    console.print(results_table(records))
 
 
 def page(
@@ -100,9 +104,10 @@ def reproduce(
     with progress_bar() as bar:
         line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
         result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
-    console.print(claims_table(result))
     if out is not None:
         save_reproduction(result, out)
+    console.print(claims_table(result))
+    if out is not None:
         console.print(f"report and figures in {out}")
 
 
@@ -136,9 +141,9 @@ def seeds(
     marker = f"seeds {short_name(cls.id)}"
     for file in (out, curves):
         if file is not None:
-            writable_folder(file.parent)
+            writable_file(file)
     if into is not None:
-        split_at_markers(into, marker)
+        check_markers(into, [marker])
     if curves is not None:
         save(training_seeds.learning_curves(found), curves)
     with progress_bar() as bar:
@@ -153,12 +158,12 @@ def seeds(
             lambda done: bar.update(line, advance=done),
             trust,
         )
-    for grid in grids:
-        console.print(grid_table(grid))
     if out is not None:
         write_records(out, records)
     if into is not None:
         command = f"filtergym seeds RUN ... {' '.join(f'--scenario {name}' for name in scenarios)} "
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
-        insert_between_markers(into, marker, training_seeds.grids_as_markdown(grids, found, command))
+        insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
+    for grid in grids:
+        console.print(grid_table(grid))

@@ -1,6 +1,8 @@
 """What the commands share: the terminal, and the arguments that several of them take."""
 
 import ast
+import io
+import os
 import sys
 from typing import Annotated, Any
 
@@ -26,9 +28,52 @@ Trust = Annotated[
 ]
 Split = Annotated[str, typer.Option(help="test, validation or train.")]
 
+
+class Output(Console):
+    """Standard output that never stops the work: where it takes no more, the rest is not printed."""
+
+    refusal: OSError | None = None
+    """Why it took no more; None also where the reader of a pipe has left, who wanted no more."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print, unless standard output takes no more."""
+        try:
+            super().print(*objects, **options)
+        except OSError as error:
+            self.refusal = error
+            self._end()
+
+    def on_broken_pipe(self) -> None:
+        """Go on without a reader."""
+        self._end()
+
+    def _end(self) -> None:
+        self.quiet = True
+        # What is still buffered would be refused again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 # Wide enough for the results table where the output is a file; a terminal keeps its own width. No markup: names and
 # paths are printed as they are.
-console = Console(width=None if sys.stdout.isatty() else 150, markup=False, emoji=False)
+console = Output(width=None if sys.stdout and sys.stdout.isatty() else 150, markup=False, emoji=False)
+
+
+def open_output() -> None:
+    """Let a standard output of few characters, such as ASCII, escape what it has none for."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def close_output(*_: Any) -> None:
+    """Say at the end of a command what became of its standard output.
+
+    Raises:
+        ValueError: if it could not be written.
+    """
+    if console.refusal is not None:
+        raise ValueError(
+            f"cannot write to standard output: {console.refusal.strerror or console.refusal}"
+        ) from console.refusal
 
 
 def progress_bar() -> Progress:

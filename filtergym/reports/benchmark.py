@@ -13,7 +13,7 @@ from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
 from ..evaluation.figures import evaluation_figures, save
-from ..evaluation.files import writable_folder
+from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..names import evaluate, tidy_records
 from .records import read_records, write_records
@@ -126,9 +126,10 @@ def run_benchmark(
     """
     wanted = cells(full, environments, split)
     unfinished = writable_folder(folder / "unfinished")
+    waiting = [unfinished / f"{cell.name}.{cell.episodes}.{split}{seed}.json" for cell in wanted]
+    writable_file(folder / "benchmark.json")
     records: list[Record] = []
-    for cell in wanted:
-        path = unfinished / f"{cell.name}.{cell.episodes}.{split}{seed}.json"
+    for cell, path in zip(wanted, waiting, strict=True):
         tick = started(cell, cell.measurements)
         done = read_records(path) if path.exists() else []
         if {record.policy for record in done} == set(cell.policies):
@@ -139,7 +140,9 @@ def run_benchmark(
         finished(done)
         records += done
     write_records(folder / "benchmark.json", records)
-    for path in unfinished.iterdir():
-        path.unlink()
-    unfinished.rmdir()
+    # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
+    for path in waiting:
+        path.unlink(missing_ok=True)
+    if not any(unfinished.iterdir()):
+        unfinished.rmdir()
     return records

@@ -188,6 +188,5 @@ def put_tables(id: str, page: Path) -> Sequence[str]:
             f"{page} has none of the markers {', '.join(tables)}: write <!-- {first}: begin --> and "
             f"<!-- {first}: end --> where that table should stand"
         )
-    for name in wanted:
-        insert_between_markers(page, name, tables[name])
+    insert_between_markers(page, {name: tables[name] for name in wanted})
     return list(wanted)

@@ -1,0 +1,151 @@
+"""What cannot be printed or written loses nothing else, and ends in one sentence."""
+
+import io
+import json
+import os
+import shutil
+
+import pytest
+from filtergym.agents.learned_policy import PRETRAINED
+
+from filtergym.__main__ import main
+from filtergym.commands.terminal import console
+from filtergym.reports import benchmark
+
+from filtergym import evaluate, tidy_records
+
+EVALUATE = ("evaluate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--episodes", 4)
+
+
+def closed_pipe():
+    reading, writing = os.pipe()
+    os.close(reading)
+    return open(writing, "w", encoding="utf-8")
+
+
+def full_disk():
+    return open("/dev/full", "w", encoding="utf-8")
+
+
+def ascii_only():
+    return io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+
+
+class Drawn:
+    """A figure that costs nothing."""
+
+    def savefig(self, path, **_):
+        path.write_bytes(b"drawn")
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return evaluate("ManeuveringTarget", ["imm"], "paper", episodes=4)
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path, dataset):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("filtergym.commands.measure.evaluate", lambda *_, **__: dataset)
+    monkeypatch.setattr("filtergym.commands.measure.evaluation_figures", lambda _: [("figure", Drawn())])
+
+    def command(*words, output=None):
+        if output is not None:
+            monkeypatch.setattr("sys.stdout", output)
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, capsys.readouterr().err
+
+    yield command
+    console.quiet, console.refusal = True, None
+    console.print()  # nothing: what is left from a refused print goes
+    console.quiet = False
+
+
+@pytest.mark.parametrize(
+    ("output", "code"), [(closed_pipe, 0), (full_disk, 2), (ascii_only, 0), (lambda: None, 0)]
+)
+def test_results_are_written_whatever_becomes_of_standard_output(output, code, run, tmp_path, monkeypatch):
+    if output is full_disk and not os.path.exists("/dev/full"):
+        pytest.skip("this system has no full device")
+    stream = output()
+    if stream is None:
+        monkeypatch.setattr("sys.stdout", None)
+    ended, error = run(*EVALUATE, "--json", "a.json", "--out", "out", output=stream)
+    assert ended == code
+    expected = "Error: cannot write to standard output: No space left on device\n" if code else ""
+    assert error == expected
+    assert json.loads((tmp_path / "a.json").read_text()) == json.loads(
+        (tmp_path / "out/records.json").read_text()
+    )
+    assert (tmp_path / "out" / "figure.png").read_bytes() == b"drawn"
+    if stream is not None:
+        stream.close()
+
+
+def test_work_goes_on_after_a_print_that_failed(run, dataset, tmp_path, monkeypatch):
+    records = tidy_records(dataset)
+    cells = [benchmark.Cell("ManeuveringTarget", name, 4, ("imm",)) for name in ("paper", "random")]
+    monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
+    monkeypatch.setattr(
+        benchmark, "run_cell", lambda cell, *_: [r._replace(scenario=cell.scenario) for r in records]
+    )
+    with closed_pipe() as output:
+        assert run("benchmark", "--out", "out", output=output) == (0, "")
+    kept = json.loads((tmp_path / "out" / "benchmark.json").read_text())
+    assert {record["scenario"] for record in kept} == {"paper", "random"}
+
+
+def test_what_has_no_character_is_escaped(run):
+    output = ascii_only()
+    run("list", "UavAutopilot", output=output)
+    output.flush()
+    text = output.buffer.getvalue().decode("ascii")
+    assert "filtergym/UavAutopilot-v0" in text
+    console.print("σ = 3°")
+    output.flush()
+    assert output.buffer.getvalue().decode("ascii").endswith("\\u03c3 = 3\\xb0\n")
+
+
+def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_path, monkeypatch):
+    def unexpected(*_, **__):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("filtergym.commands.measure.evaluate", unexpected)
+    monkeypatch.setattr("filtergym.reports.benchmark.run_cell", unexpected)
+    monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
+    shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
+    for name in ("folder.png", "out/benchmark.json", "tuned/ManeuveringTarget-v0.json"):
+        (tmp_path / name).mkdir(parents=True)
+    best.mkdir(parents=True)
+    shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")
+    shutil.copyfile(shipped.with_suffix(".json"), best.parent / "run.json")
+    for words in (
+        (*EVALUATE, "--json", "folder.png"),
+        (*EVALUATE, "--json", "."),
+        (*EVALUATE, "--json", "/dev/null"),
+        ("benchmark", "--out", "out"),
+        ("seeds", "run", "--curves", "folder.png"),
+        ("seeds", "run", "--out", "folder.png"),
+        ("tune", "ManeuveringTarget", "--policy", "imm", "--out", "tuned"),
+    ):
+        code, error = run(*words)
+        assert (code, error.count("\n")) == (2, 1), words
+        assert "a folder or device has that name" in error, words
+    assert run(*EVALUATE, "--json", "n" * 300 + ".json")[1].endswith("File name too long\n")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() and "run" not in path.parts]
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_the_results_before(run, tmp_path, monkeypatch):
+    assert run(*EVALUATE, "--json", "a.json", "--out", "out")[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    def no_space(figure, path):
+        path.write_bytes(b"half")
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr("filtergym.commands.measure.save", no_space)
+    code, error = run(*EVALUATE, "--seed", 1, "--out", "out")
+    assert (code, error) == (2, "Error: cannot write to folder out: No space left on device\n")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
