@@ -63,7 +63,8 @@ distributions: $(VENV)/.dev  ## build what would be published; try the wheel, an
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
-	$(BIN)/python -m pip install --quiet --no-deps --force-reinstall --target $(VENV)/typed .
+	rm -rf $(VENV)/typed
+	$(BIN)/python -m pip install --quiet --no-deps --target $(VENV)/typed .
 	MYPYPATH=$(VENV)/typed $(BIN)/mypy -p filtergym
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 

@@ -1,4 +1,4 @@
-"""Try what would be published: run by `make package`, in a clean environment that has the wheel and no torch."""
+"""Try what would be published: run by `make distributions`, in a clean environment that has the wheel and no torch."""
 
 import importlib.util
 import subprocess
@@ -9,9 +9,9 @@ from pathlib import Path
 
 import gymnasium
 import numpy
+from filtergym.envs.catalogue import catalogue
 
 import filtergym
-from filtergym.envs.catalogue import catalogue
 
 ROOMS = ("filters", "envs", "evaluation", "baselines", "agents", "filtergym")
 
@@ -32,7 +32,8 @@ def check_source_distribution(archive: Path, source: Path) -> None:
     listed = subprocess.run(
         ["git", "ls-files"], cwd=source, capture_output=True, text=True, check=True
     ).stdout
-    held = {name.partition("/")[2] for name in tarfile.open(archive).getnames()}
+    with tarfile.open(archive) as opened:
+        held = {name.partition("/")[2] for name in opened.getnames()}
     assert not (missing := set(listed.split()) - held - {".gitignore"}), sorted(missing)
 
 

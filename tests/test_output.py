@@ -8,11 +8,10 @@ import shutil
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 
+from filtergym import evaluate, tidy_records
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console
 from filtergym.reports import benchmark
-
-from filtergym import evaluate, tidy_records
 
 EVALUATE = ("evaluate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--episodes", 4)
 

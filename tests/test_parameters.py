@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from filtergym.commands.terminal import parsed_settings
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.parameters import TaskParameters, parameter, sized, square_matrix
+
+from filtergym.commands.terminal import parsed_settings
 
 
 @dataclass(frozen=True)
