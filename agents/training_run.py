@@ -17,13 +17,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
-import xarray
+import numpy
 
 from ..baselines.catalogue import baselines_of
 from ..baselines.names import evaluate
 from ..envs.catalogue import find_scenario, importable_name, nearest, task_class
+from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
-from ..evaluation.metrics import tidy_records
 from ..evaluation.stored import read_json, restored
 
 FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
@@ -270,30 +270,29 @@ class Validation:
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
         self.paper = baselines_of(run.environment).score_paper
+        self.bootstrap = Bootstrap(VALIDATION_EPISODES)
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_dataset = self._evaluated(self.paper, self.paper) if self.paper else None
+        self.paper_cost = self._costs(self.paper, self.paper) if self.paper else None
 
-    def _evaluated(self, name: str, policy: Any) -> xarray.Dataset:
+    def _costs(self, name: str, policy: Any) -> numpy.ndarray:
+        """Mean cost over the episodes and over every resample of them."""
         run = self.run
-        return evaluate(
+        dataset = evaluate(
             run.environment, {name: policy}, run.scenario, VALIDATION_EPISODES, split="validation"
         )
+        return self.bootstrap.means(dataset["cost"].sel(policy=name).values.mean(axis=1))
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
-        dataset = self._evaluated("agent", policy)
-        if self.paper_dataset is not None:
-            dataset = xarray.concat([dataset, self.paper_dataset], "policy", combine_attrs="override")
-        found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
-        entry: Validated = {"steps": self.run.steps_done, "cost": found["agent", "cost"].value}
-        if not self.paper:
+        cost = self._costs("agent", policy)
+        entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
+        if self.paper is None or self.paper_cost is None:
             return entry
-        difference = found["agent", "relative_cost_difference"]
         return {
             **entry,
             "paper": self.paper,
-            "paper_cost": found[self.paper, "cost"].value,
-            "relative_cost_difference": [difference.value, difference.low, difference.high],
+            "paper_cost": float(self.paper_cost[0]),
+            "relative_cost_difference": list(self.bootstrap.interval(cost / self.paper_cost - 1.0)),
         }
 
 

@@ -155,11 +155,12 @@ def learning_curves(runs: Sequence[SeedRun]) -> Any:
     first = runs[0].run
     paper = paper_of(first.environment)
     for member in runs:
-        if not all(entry.get("relative_cost_difference") for entry in member.run.validation or [{}]):
+        entries = member.run.validation
+        if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
             raise ValueError(f"the record of {member.name} has no validations against {paper!r} to draw")
     curves: dict[str, list[tuple[list[float], list[float]]]] = {}
     for member in runs:
-        steps = [entry["steps"] for entry in member.run.validation]
+        steps = [float(entry["steps"]) for entry in member.run.validation]
         values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
         curves.setdefault(member.algorithm, []).append((steps, values))
     title = f"{first.environment}, scenario {first.scenario}; dots: best agents"

@@ -1,0 +1,102 @@
+"""Whether the environments stand random actions: every step of every environment, control and scenario is looked at.
+
+    python benchmarks/endurance.py [--environment ID] [--steps N] [--size N] [--seed S]
+
+**What is looked at.** Observations and rewards of the vector environment and the estimator's covariance after every
+step (``decision_interval`` 1): is everything finite, and is the covariance, scaled to correlations, positive
+semidefinite to 1e-9? Half of the actions lie on the edge of the action space, where an estimator is steered hardest.
+``--steps`` are shared evenly among the combinations of an environment. What fails is printed with its seed, and the
+command ends with exit code 1.
+"""
+
+import argparse
+import os
+import sys
+import time
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
+
+import gymnasium
+import numpy
+from filtergym.envs.catalogue import catalogue
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+CHECKED_EVERY = 10
+"""Steps between two looks at the eigenvalues, which cost more than the step does."""
+
+
+def actions(space: gymnasium.Space, generator: numpy.random.Generator, size: int) -> numpy.ndarray:
+    """Random actions, half of the continuous ones on the edge of the space."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return generator.integers(space.n, size=size)
+    assert isinstance(space, gymnasium.spaces.Box)
+    shape = (size, *space.shape)
+    edge = generator.choice([space.low, space.high], size=size)
+    inside = generator.uniform(space.low, space.high, shape)
+    on_edge = generator.random((size, 1)) < 0.5
+    return numpy.where(on_edge, edge, inside).astype(space.dtype)
+
+
+def lowest_correlation(covariance: numpy.ndarray) -> float:
+    """Smallest eigenvalue of ``(n, n, N)`` covariances, scaled to correlations."""
+    P = numpy.moveaxis(covariance, -1, 0)
+    sigma = numpy.sqrt(numpy.einsum("nii->ni", P))
+    return float(numpy.linalg.eigvalsh(P / sigma[:, :, None] / sigma[:, None, :]).min())
+
+
+def endure(id: str, control: str, scenario: str, steps: int, size: int, seed: int) -> tuple[int, str]:
+    """Step one combination; returns how many steps were done, and what failed."""
+    env: Any = gymnasium.make_vec(
+        id, num_envs=size, control=control, scenario=scenario, decision_interval=1
+    ).unwrapped
+    generator = numpy.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    done = 0
+    while done < steps:
+        observation, reward, *_ = env.step(actions(env.single_action_space, generator, size))
+        done += size
+        covariance = env.task.covariance(env.lanes.state)
+        for name, values in (("observation", observation), ("reward", reward), ("covariance", covariance)):
+            if not numpy.isfinite(values).all():
+                return done, f"{name} is not finite after {done // size} steps, seed {seed}"
+        if done // size % CHECKED_EVERY == 0 and (lowest := lowest_correlation(covariance)) < -1e-9:
+            return done, f"an eigenvalue of {lowest:.2g} after {done // size} steps, seed {seed}"
+    return done, ""
+
+
+def main() -> None:
+    """Step everything that was asked for and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--environment", choices=sorted(catalogue()), help="default: all of them")
+    parser.add_argument("--steps", type=int, default=1_000_000, help="of each environment")
+    parser.add_argument("--size", type=int, default=1024, help="environments side by side")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    table = Table("environment", "combinations", "steps", "minutes", "failed")
+    failures: list[str] = []
+    for id, cls in catalogue().items():
+        if given.environment not in (None, id):
+            continue
+        combinations = [(control, scenario) for control in cls.controls for scenario in cls.scenarios]
+        share = given.steps / len(combinations)
+        began, done, failed = time.monotonic(), 0, 0
+        for control, scenario in track(combinations, id, console=Console(stderr=True), transient=True):
+            steps, wrong = endure(id, control, scenario, share, given.size, given.seed)
+            done += steps
+            if wrong:
+                failed += 1
+                failures.append(f"{id}, control {control}, scenario {scenario}: {wrong}")
+        minutes = (time.monotonic() - began) / 60.0
+        table.add_row(id, str(len(combinations)), f"{done:,}", f"{minutes:.1f}", str(failed))
+    console = Console(width=110)
+    console.print(table)
+    for line in failures:
+        console.print(line, style="red")
+    sys.exit(bool(failures))
+
+
+if __name__ == "__main__":
+    main()
