@@ -83,7 +83,8 @@ def test_policy_of_another_environment_is_refused(tmp_path):
     save_file(arrays, tmp_path / "other.safetensors", header | {"environment": "filtergym/Other-v0"})
     with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
         stored_policy(ID, tmp_path / "other.safetensors")
-    save_file(arrays, tmp_path / "fields.safetensors", header | {"fields": '["range"]'})
+    fields = header["fields"].replace(json.loads(header["fields"])[0], "range")
+    save_file(arrays, tmp_path / "fields.safetensors", header | {"fields": fields})
     with pytest.raises(ValueError, match="was trained on other fields"):
         evaluate(ID, [str(tmp_path / "fields.safetensors")], episodes=1)
 

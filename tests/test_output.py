@@ -115,7 +115,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
     monkeypatch.setattr("filtergym.reports.benchmark.run_cell", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
-    for name in ("folder.png", "out/benchmark.json", "tuned/ManeuveringTarget-v0.json"):
+    for name in ("folder.png", "out/benchmark.json", "values/ManeuveringTarget-v0.json"):
         (tmp_path / name).mkdir(parents=True)
     best.mkdir(parents=True)
     shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")
@@ -127,7 +127,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
         ("benchmark", "--out", "out"),
         ("seeds", "run", "--curves", "folder.png"),
         ("seeds", "run", "--out", "folder.png"),
-        ("tune", "ManeuveringTarget", "--policy", "imm", "--out", "tuned"),
+        ("tune", "ManeuveringTarget", "--policy", "imm", "--out", "values"),
     ):
         code, error = run(*words)
         assert (code, error.count("\n")) == (2, 1), words

@@ -159,7 +159,7 @@ def test_training_with_default_hyperparameters(package, algorithm):
     record = json.loads((package / "run" / "run.json").read_text())
     assert record["environment"] == ID
     assert list(record["validation"][-1]) == ["steps", "cost"]
-    result = run("export", "run", cwd=package)
+    result = run("export", "run", "--trust", cwd=package)  # its record names the module to import
     assert result.returncode == 0, result.stderr
     result = run("evaluate", ID, "--policy", "run/agent.safetensors", "--episodes", "3", cwd=package)
     assert result.returncode == 0, result.stderr

@@ -63,7 +63,7 @@ def test_a_model_is_not_unpickled(stranger, command):
     folder, sprung = stranger
     record = json.loads((folder / "run.json").read_text())
     train = (
-        "train", ID, "--out", folder, "--algo", "ppo", "--resume", "--steps", record["steps"],
+        "train", ID, "--out", folder, "--algo", "ppo", "--resume", "--steps", 2 * record["steps"],
         "--envs", record["envs"], "--seed", record["seed"],
     )  # fmt: skip
     model = folder / "best" / "model.zip"

@@ -99,7 +99,8 @@ def design(parameters: UavAutopilotParameters) -> Design:
     if parameters.plant == "P":
         model = true_model = constant_rate(parameters)
     else:
-        model, true_model = pitch_channel(parameters), pitch_channel(parameters, parameters.actuator_lag)
+        with numpy.errstate(over="ignore", invalid="ignore"):  # refused below, in a sentence
+            model, true_model = pitch_channel(parameters), pitch_channel(parameters, parameters.actuator_lag)
     if not all(numpy.isfinite(part).all() for part in (*model, *true_model)):
         raise ValueError(
             f"the plant must move finitely in one sampling_interval, {parameters.value('sampling_interval')} s: "

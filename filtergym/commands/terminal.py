@@ -64,7 +64,7 @@ def open_output() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
-def close_output(*_: Any) -> None:
+def close_output(*_: Any, **__: Any) -> None:
     """Say at the end of a command what became of its standard output.
 
     Raises:

@@ -133,7 +133,8 @@ class _SideBySide(Policy):
         posterior = imm.mode_posterior(
             self.log_predicted(observation).T, self.log_likelihood(observation).T
         ).T
-        return numpy.where(self.fixed[:, None], self.weights, posterior), None
+        lanes = numpy.minimum(numpy.arange(len(observation)), len(self.fixed) - 1)  # filled up with the last
+        return numpy.where(self.fixed[lanes, None], self.weights[lanes], posterior), None
 
 
 def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict[str, Run]:
