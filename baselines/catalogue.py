@@ -10,7 +10,7 @@ from functools import cache
 from types import ModuleType
 
 from ..envs.catalogue import nearest, task_class
-from ..evaluation.competitors import RandomPolicy, kind_of
+from ..evaluation.competitors import RANKED, RandomPolicy, kind_of
 from .table import Baselines
 
 ADDED: dict[str, Baselines] = {}
@@ -78,13 +78,18 @@ def add_baselines(table: Baselines) -> None:
         control = getattr(maker, "control", None)
         if control is not None and control not in cls.controls:
             raise nearest(f"control of policy {name!r}", control, cls.controls)
-    tables = {"policy": table.policies, "reference": table.references, "bound": table.bounds}
+    tables = {
+        "policy": table.policies,
+        "estimator": table.estimators,
+        "reference": table.references,
+        "bound": table.bounds,
+    }
     for kind, makers in tables.items():
         for name, maker in makers.items():
             if kind_of(maker) != kind:
                 raise ValueError(
                     f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
                 )
-            if kind != "policy" and not getattr(maker, "knows", ""):
+            if kind not in RANKED and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
     ADDED[cls.id] = table

@@ -17,13 +17,14 @@ def own_names(id: str) -> list[str]:
 
 
 def own_competitor(id: str, name: str) -> Any:
-    """Return what makes one of an environment's own policies, tuned or not, references or bounds for a task.
+    """Return what makes one of an environment's own policies or estimators, tuned or not, references or bounds for a
+    task.
 
     Raises:
         ValueError: if there is no such name.
     """
     known = baselines_of(id)
-    for table in (known.policies, known.references, known.bounds):
+    for table in (known.policies, known.estimators, known.references, known.bounds):
         if name in table:
             return table[name]
     if name.endswith("-tuned"):

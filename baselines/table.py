@@ -9,16 +9,16 @@ from ..evaluation.competitors import Policy
 
 @dataclass(frozen=True)
 class Tunable:
-    """What can be tuned in a policy, and what a choice of values means."""
+    """What can be tuned in a policy or an estimator, and what a choice of values means."""
 
-    control: str
-    """The control of the policy."""
+    control: str | None
+    """The control of the policy; None for an estimator."""
     limits: Mapping[str, tuple[float, float]]
     """Lower and upper limit of each value, in the order of the search."""
     start: Mapping[str, float]
     """The values in force without tuning."""
-    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]
-    """From values to keywords of the task and what makes the policy for it."""
+    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]]
+    """From values to keywords of the task and what makes the policy or estimator for it."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Baselines:
     environment: str
     """Gymnasium id."""
     policies: Mapping[str, Callable[[Any], Policy]]
+    estimators: Mapping[str, Any] = field(default_factory=dict)
+    """Classes that keep the protocol :class:`.Estimator`."""
     references: Mapping[str, Any] = field(default_factory=dict)
     """Classes that keep the protocol :class:`.Reference`."""
     bounds: Mapping[str, Any] = field(default_factory=dict)
@@ -46,7 +48,7 @@ class Baselines:
     """Time that a policy takes for one measurement, on one core; dear environments get fewer episodes in the
     full benchmark."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
-    """Policies that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     best_constant: str = ""
     """The tunable policy that stands for the best constant action in the room table."""
     metrics: Callable[[Any, Any], list[Any]] | None = None
@@ -55,4 +57,4 @@ class Baselines:
     @property
     def names(self) -> tuple[str, ...]:
         """Every name, policies first."""
-        return (*self.policies, *self.references, *self.bounds)
+        return (*self.policies, *self.estimators, *self.references, *self.bounds)

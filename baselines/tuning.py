@@ -1,4 +1,4 @@
-"""Tuning of classical policies on training episodes, so that nothing learned is compared with a straw man.
+"""Tuning of classical policies and estimators on training episodes, so that nothing learned is compared with a straw man.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
 values; every candidate meets the same episodes of the training split, so differences are not noise. The
@@ -18,8 +18,9 @@ import numpy
 
 from ..envs.catalogue import find_scenario, make_task, nearest, short_name, task_class
 from ..envs.task import Task
+from ..evaluation.competitors import Kind
 from ..evaluation.files import write_text
-from ..evaluation.rollout import run_policy
+from ..evaluation.rollout import run_estimator, run_policy
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import fits, read_json
 from .catalogue import baselines_of, package_of
@@ -56,7 +57,8 @@ def mean_cost(
         nonlocal total
         total += float(task.cost(state)[: len(seeds)].sum())
 
-    run_policy(task, make(task), seeds, record, lambda _: None)
+    run = run_policy if tunable.control else run_estimator
+    run(task, make(task), seeds, record, lambda _: None)
     return total / (len(seeds) * task.horizon)
 
 
@@ -208,14 +210,19 @@ def _places(id: str) -> list[Any]:
 
 
 class TunedPolicy(NamedTuple):
-    """A policy with tuned values, some of which belong to the task."""
+    """A policy or estimator with tuned values, some of which belong to the task."""
 
     task_keywords: dict[str, Any]
-    control: str
+    control: str | None
     make: Callable[[Task], Any]
 
+    @property
+    def kind(self) -> Kind:
+        """What it makes."""
+        return "policy" if self.control else "estimator"
+
     def __call__(self, task: Task) -> Any:
-        """Make the policy for a task."""
+        """Make the policy or estimator for a task."""
         return self.make(task)
 
 

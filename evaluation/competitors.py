@@ -1,11 +1,13 @@
-"""What a policy, a reference estimator and a bound are.
+"""What a policy, an estimator, a reference and a bound are.
 
 A **policy** sees observations and returns actions; learned or classical, it answers Stable-Baselines3's
-call. A **reference** estimates from the measurements, never through actions, and may be told what no
-competitor knows; it is never ranked with policies. A **bound** is computed. Each says what it is by its ``kind``;
-what says nothing is a policy, such as a model of Stable-Baselines3.
+call. An **estimator** sees what a policy's filters see, the start of the track and every measurement, and answers with
+mean and covariance; it is ranked with the policies, and marked. A **reference** is an estimator that may be told what
+no competitor knows; it is never ranked. A **bound** is computed. Each says what it is by its ``kind``; what says
+nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of Stable-Baselines3.
 """
 
+import inspect
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
@@ -13,26 +15,53 @@ import numpy
 
 from ..envs.task import Array, Task
 
-Kind = Literal["policy", "reference", "bound"]
+Kind = Literal["policy", "estimator", "reference", "bound"]
+RANKED: tuple[Kind, ...] = ("policy", "estimator")
+"""What is ranked: it knows nothing that is hidden."""
 
 
 def kind_of(competitor: Any) -> Kind:
     """Say what a competitor is, or what a maker makes."""
-    return getattr(competitor, "kind", "policy")
+    estimates = not hasattr(competitor, "predict") and _has(competitor, "start", "update")
+    return getattr(competitor, "kind", "estimator" if estimates else "policy")
 
 
-def check_competitor(name: str, found: Any) -> Any:
-    """Return what a user has named, if it can compete; it is not called yet.
+def _has(found: Any, *methods: str) -> bool:
+    return all(callable(getattr(found, method, None)) for method in methods)
+
+
+def made(maker: Any, task: Task) -> Any:
+    """Make a competitor for a task.
+
+    Args:
+        maker: a class or function that takes the task, or nothing; or the competitor itself.
+        task: the problem.
+    """
+    if not callable(maker):
+        return maker
+    try:
+        takes_task = bool(inspect.signature(maker).parameters)
+    except ValueError:  # of a class that is compiled
+        takes_task = True
+    return maker(task) if takes_task else maker()
+
+
+def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
+    """Return what a user has named or made, if it can compete; it is not called yet.
+
+    Args:
+        name: in the table.
+        found: a competitor, or a class of one.
+        kind: as which it must compete; default: what it says it is.
 
     Raises:
-        ValueError: if it is neither an object or a class with ``predict``, nor the class of a reference or a bound.
+        ValueError: if it has not the methods of its kind: ``predict``, or ``start`` and ``update``.
     """
-    kind = kind_of(found)
+    kind = kind or kind_of(found)
     methods = ("predict",) if kind == "policy" else ("start", "update")
-    if kind not in get_args(Kind) or not all(callable(getattr(found, method, None)) for method in methods):
+    if kind not in get_args(Kind) or not _has(found, *methods):
         raise ValueError(
-            f"{name!r} is no policy, reference or bound: a policy has a method predict, the others say their kind and "
-            "have start and update"
+            f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update"
         )
     return found
 
@@ -119,6 +148,39 @@ class RandomPolicy(Policy):
         if hasattr(space, "n"):
             return numpy.array([generator.integers(space.n) for generator in generators]), generators
         return numpy.stack([generator.uniform(space.low, space.high) for generator in generators]), generators
+
+
+class Estimator(Protocol):
+    """An estimator that a user brings: any object with these two methods.
+
+    A class is made for the task if its constructor takes an argument: ``task.parameters`` holds every constant,
+    ``task.components`` what is estimated, in which unit. Nothing else of the task is needed.
+
+    N episodes are estimated side by side, batch on the last axis. N is a multiple of eight: the last episode is
+    repeated to fill up, so that rounding in matrix products does not depend on how many there are.
+    """
+
+    kind: ClassVar[Kind] = "estimator"
+
+    def start(self, initial: Any, N: int) -> Any:
+        """Memory at the start of the track.
+
+        Args:
+            initial: what everyone is told of it: :class:`~filtergym.envs.task.Initial` or a NamedTuple with its fields,
+                ``mean`` ``(C, N)`` and ``covariance`` ``(C, C, N)``.
+            N: number of episodes.
+        """
+
+    def update(self, measurement: Any, memory: Any) -> tuple[Array, Array, Any]:
+        """Estimate after a measurement.
+
+        Args:
+            measurement: the task's ``Measurement``, arrays with N as their last axis; not to be changed in place.
+            memory: what the last call returned.
+
+        Returns:
+            Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory.
+        """
 
 
 class Reference(Protocol):

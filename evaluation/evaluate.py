@@ -13,8 +13,8 @@ from ..envs.catalogue import find_scenario, make_task, nearest, task_class
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
-from .competitors import kind_of
-from .rollout import Progress, run_bound, run_policy, run_reference
+from .competitors import check_competitor, kind_of, made
+from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference
 from .seeds import episode_seeds
 
 CHUNK = 2048
@@ -40,7 +40,7 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
 
 
 def _run_chunk(
-    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress
+    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress, name: str, first_episode: int
 ) -> dict[str, numpy.ndarray]:
     """Errors and records of some episodes, ``(episodes, time, ...)``."""
     series: dict[str, list[numpy.ndarray]] = {}
@@ -59,6 +59,8 @@ def _run_chunk(
 
     if kind == "policy":
         run_policy(task, actor, seeds, record, tick)
+    elif kind == "estimator":
+        run_estimator(task, actor, seeds, record, tick, name, first_episode)
     elif kind == "reference":
         run_reference(task, actor, seeds, record, tick)
     else:
@@ -80,12 +82,12 @@ def evaluate(
     reference: str = "",
     **keywords: Any,
 ) -> xarray.Dataset:
-    """Run policies, reference estimators and bounds over the same episodes.
+    """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: by the name that stands in the tables: each a class or function that makes it for a task,
-            or an object with a ``predict`` method.
+            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
@@ -132,9 +134,16 @@ def evaluate(
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in competitors.items():
-        make = maker if callable(maker) else lambda _task, maker=maker: maker
         chunks = [
-            _run_chunk(tasks[name], make(tasks[name]), kinds[name], seeds[i : i + CHUNK], tick)
+            _run_chunk(
+                tasks[name],
+                check_competitor(name, made(maker, tasks[name]), kinds[name]),
+                kinds[name],
+                seeds[i : i + CHUNK],
+                tick,
+                name,
+                i,
+            )
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}

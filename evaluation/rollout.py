@@ -1,12 +1,15 @@
 """Episodes from their seeds to their end, with a policy, a reference estimator or a bound in the loop."""
 
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy
 
 from ..envs.environment import checked_action
-from ..envs.lanes import Lanes
+from ..envs.lanes import LANE_MULTIPLE, Lanes
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
 from .competitors import Policy
@@ -78,27 +81,160 @@ def run_policy(
         tick(lanes.count * task.decision_interval)
 
 
+def _run_outside(
+    task: Task,
+    start: Callable[[Episode], None],
+    update: Callable[[Episode], tuple[Array, Array]],
+    seeds: Sequence[int],
+    record: Callable[[Any], None],
+    tick: Progress,
+) -> None:
+    """Run episodes in which ``update`` estimates in place of a bank."""
+    task = task.estimated_outside()
+
+    def estimated(episode: Episode) -> Episode:
+        mean, covariance = update(episode)
+        feedback = task.feedback(mean, episode.measurement)
+        return episode._replace(bank=Outside(mean, covariance, feedback))
+
+    lanes = started_lanes(task, seeds, start)
+    for _ in range(lanes.decisions_per_episode):
+        lanes.step(estimated, lambda episode, _: record(episode))
+        tick(lanes.count * task.decision_interval)
+
+
 def run_reference(
     task: Task, reference: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
 ) -> None:
     """Run a reference in place of actions; arguments as in :func:`run_policy`."""
-    task = task.estimated_outside()
     memory: Any = None
 
-    def begun(episode: Episode) -> None:
+    def start(episode: Episode) -> None:
         nonlocal memory
         memory = reference.start(episode.measurement, episode.truth)
 
-    def update(episode: Episode) -> Episode:
+    def update(episode: Episode) -> tuple[Array, Array]:
         nonlocal memory
         mean, covariance, memory = reference.update(episode.measurement, episode.truth, memory)
-        feedback = task.feedback(mean, episode.measurement)
-        return episode._replace(bank=Outside(mean, covariance, feedback))
+        return mean, covariance
 
-    lanes = started_lanes(task, seeds, begun)
-    for _ in range(lanes.decisions_per_episode):
-        lanes.step(update, lambda episode, _: record(episode))
-        tick(lanes.count * task.decision_interval)
+    _run_outside(task, start, update, seeds, record, tick)
+
+
+def run_estimator(
+    task: Task,
+    estimator: Any,
+    seeds: Sequence[int],
+    record: Callable[[Any], None],
+    tick: Progress,
+    name: str = "estimator",
+    first_episode: int = 0,
+) -> None:
+    """Run an estimator in place of actions, and check what it says.
+
+    Args:
+        task: the estimation problem.
+        estimator: keeps the protocol :class:`~.competitors.Estimator`.
+        seeds: as in :func:`run_policy`, likewise ``record`` and ``tick``.
+        record: likewise.
+        tick: likewise.
+        name: of the estimator, in errors.
+        first_episode: number of the first episode, in errors.
+
+    Raises:
+        ValueError: if the estimator raises, or returns what is no mean and covariance.
+    """
+    width = -(-len(seeds) // LANE_MULTIPLE) * LANE_MULTIPLE
+    filled = numpy.minimum(numpy.arange(width), len(seeds) - 1)  # the last episode is repeated
+    memory: Any = None
+    step = 0
+
+    def start(episode: Episode) -> None:
+        nonlocal memory
+        with _told(f"estimator {name!r} failed at the start of the track"):
+            memory = estimator.start(chosen_lanes(episode.measurement, filled), width)
+
+    def update(episode: Episode) -> tuple[Array, Array]:
+        nonlocal memory, step
+        step += 1
+        with _told(f"estimator {name!r} failed at measurement {step}"):
+            answer = estimator.update(chosen_lanes(episode.measurement, filled), memory)
+            try:
+                mean, covariance, memory = answer
+            except (TypeError, ValueError):
+                raise TypeError(
+                    "update must return mean, covariance and memory, not " + type(answer).__name__
+                ) from None
+        return _checked_estimate(task, name, step, first_episode, mean, covariance, width)
+
+    _run_outside(task, start, update, seeds, record, tick)
+
+
+def chosen_lanes(part: Any, lanes: numpy.ndarray) -> Any:
+    """Return nested tuples of arrays with some entries of their last axis, each an array of its own."""
+    if isinstance(part, tuple):
+        parts = [chosen_lanes(item, lanes) for item in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+    return None if part is None else part[..., lanes]
+
+
+@contextmanager
+def _told(what: str) -> Iterator[None]:
+    """Turn whatever somebody else's code raises into one sentence with the line that raised it."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        # The last line outside installed libraries: one of their own says less.
+        own = [f for f in frames[1:] if "site-packages" not in f.filename] or frames
+        line = f"{Path(own[-1].filename).name}, line {own[-1].lineno}"
+        raise ValueError(f"{what}: {type(error).__name__}: {error} ({line})") from error
+
+
+def _checked_estimate(
+    task: Task, name: str, step: int, first_episode: int, mean: Any, covariance: Any, width: int
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Return an estimate as float64, or raise ValueError that names episode and measurement."""
+    count = len(task.components)
+    found = []
+    for word, values, shape in (
+        ("mean", mean, (count, width)),
+        ("covariance", covariance, (count, count, width)),
+    ):
+        try:
+            array = numpy.asarray(values, dtype=numpy.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"estimator {name!r}: the {word} at measurement {step} is no array: {error}"
+            ) from None
+        if array.shape != shape:
+            components = ", ".join(c.name for c in task.components)
+            raise ValueError(
+                f"estimator {name!r}: the {word} at measurement {step} must have shape {shape}, {count} components "
+                f"({components}) of {width} episodes, got {array.shape}"
+            )
+        finite = numpy.isfinite(array).reshape(-1, width).all(axis=0)
+        if not finite.all():
+            raise ValueError(_where(name, word, "is not finite", first_episode, finite, step))
+        found.append(array)
+    P = numpy.moveaxis(found[1], -1, 0)
+    try:
+        numpy.linalg.cholesky(P)
+    except numpy.linalg.LinAlgError:
+        definite = numpy.array([numpy.linalg.eigvalsh(p)[0] > 0.0 for p in P])
+        if not definite.all():
+            wrong = "is not positive definite"
+            raise ValueError(_where(name, "covariance", wrong, first_episode, definite, step)) from None
+    asymmetry = numpy.abs(P - P.transpose(0, 2, 1)).max(axis=(1, 2))
+    symmetric = asymmetry <= 1e-6 * numpy.abs(P).max(axis=(1, 2))
+    if not symmetric.all():
+        raise ValueError(_where(name, "covariance", "is not symmetric", first_episode, symmetric, step))
+    return found[0], found[1]
+
+
+def _where(name: str, word: str, wrong: str, first_episode: int, fine: numpy.ndarray, step: int) -> str:
+    episode = first_episode + int(numpy.argmin(fine))
+    return f"estimator {name!r}: the {word} {wrong} in episode {episode} at measurement {step}"
 
 
 def run_bound(

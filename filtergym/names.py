@@ -16,7 +16,7 @@ from .evaluation.rollout import Progress
 
 
 def competitor(env: str, name: str, *, trust: bool = False) -> Any:
-    """Return what makes a policy, reference estimator or bound for a task.
+    """Return what makes a policy, estimator, reference or bound for a task.
 
     Args:
         env: environment id.
@@ -55,12 +55,13 @@ def evaluate(
     trust: bool = False,
     **keywords: Any,
 ) -> xarray.Dataset:
-    """Run policies, reference estimators and bounds over the same episodes.
+    """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        competitors: names, or a mapping from a name to a name, a class, or an object with a ``predict``
-            method; see :func:`competitor` for what a name can be.
+        competitors: names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
+            (:class:`~filtergym.evaluation.competitors.Policy`), or with ``start`` and ``update``
+            (:class:`~filtergym.evaluation.competitors.Estimator`); see :func:`competitor` for what a name can be.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
@@ -75,9 +76,14 @@ def evaluate(
         :func:`.evaluation.evaluate.evaluate`.
 
     Raises:
-        ValueError: for unknown names, or a policy that does not fit the control.
+        ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
+            an estimator that does not answer with mean and covariance.
     """
     named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
+    id = task_class(env).id
+    for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
+        if named[name] != name:
+            raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
     objects = {
         name: competitor(env, entry, trust=trust) if isinstance(entry, str) else entry
         for name, entry in named.items()

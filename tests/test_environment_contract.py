@@ -297,6 +297,7 @@ def test_stable_baselines3_evaluates_a_baseline(env_id, short):
 def test_baselines_are_named_consistently(env_id):
     known = baselines_of(env_id)
     assert known.score_paper in known.policies
+    assert {maker.kind for maker in known.estimators.values()} <= {"estimator"}
     assert known.score_bound in known.references or known.score_bound in known.bounds
     assert set(known.benchmark) <= set(known.names)
     assert len(set(known.names)) == len(known.names)

@@ -113,7 +113,7 @@ def test_what_is_no_policy_is_not_called(command):
     for name in ("os:system", "os:path", "sys:argv", "math:pi"):
         code, _, errors = command("evaluate", ID, "--policy", name, "--episodes", 1)
         assert code == 2
-        assert f"'{name}' is no policy, reference or bound" in errors
+        assert f"'{name}' is no competitor" in errors
     found = competitor(ID, "filtergym.baselines.maneuvering_target.references:KnownTurn")
     assert found.kind == "reference"
 

@@ -15,7 +15,8 @@ from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, Tunable
-from .references import KalmanInteractingMultipleModel, KnownInputBound, KnownTurn
+from .estimators import KalmanInteractingMultipleModel
+from .references import KnownInputBound, KnownTurn
 
 
 class InteractingMultipleModel(Policy):
@@ -202,7 +203,8 @@ BASELINES = Baselines(
         "fixed-best": FixedBest,
         "random": RandomPolicy,
     },
-    references={"known-turn": KnownTurn, "kalman-imm": KalmanInteractingMultipleModel},
+    estimators={"kalman-imm": KalmanInteractingMultipleModel},
+    references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
     score_bound="known-turn",

@@ -1,26 +1,13 @@
 """Reference estimators and the bound of ManeuveringTarget."""
 
-from typing import ClassVar, NamedTuple
-
-from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...envs.observation import Array
 from ...envs.task import Initial
-from ...filters import bounds, imm, kalman, polar
+from ...filters import bounds, kalman, polar
+from .estimators import KalmanModel
 
 
-class _KalmanReference:
-    """Matrices of the constant-velocity model in x and y."""
-
-    def __init__(self, task: ManeuveringTarget) -> None:
-        self.task, self.xp = task, task.xp
-        F, Q = kalman.white_acceleration(task.parameters.sampling_interval, 1.0, axes=2)
-        self.F, self.unit_Q = task.constant(F), task.constant(Q)
-        self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-        self.identity = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
-
-
-class KnownTurn(_KalmanReference):
+class KnownTurn(KalmanModel):
     """A Kalman filter that is told in which scans the target manoeuvres, not how.
 
     Inside a manoeuvre its acceleration noise is as large as the manoeuvre's acceleration, elsewhere zero.
@@ -62,53 +49,7 @@ class KnownTurn(_KalmanReference):
         return result.mean, result.covariance, Initial(result.mean, result.covariance)
 
 
-class KalmanBank(NamedTuple):
-    """Memory of the IMM over Kalman filters."""
-
-    mean: Array
-    covariance: Array
-    probabilities: Array
-
-
-class KalmanInteractingMultipleModel(_KalmanReference):
-    """The usual IMM over two Kalman filters: no manoeuvre, and white acceleration of 2.775 m/s^2."""
-
-    kind = "reference"
-    knows = "nothing hidden, but its filters are outside what the action can steer"
-    sigmas: ClassVar[tuple[float, float]] = (0.0, 2.775)
-
-    def start(self, initial: Initial, truth: Truth) -> KalmanBank:
-        """Start both filters where everyone starts."""
-        xp = self.xp
-        half = 0.5 + 0.0 * initial.mean[:2]
-        return KalmanBank(
-            xp.stack([initial.mean] * 2, axis=1), xp.stack([initial.covariance] * 2, axis=2), half
-        )
-
-    def update(
-        self, measurement: Measurement, truth: Truth, memory: KalmanBank
-    ) -> tuple[Array, Array, KalmanBank]:
-        """One IMM cycle."""
-        xp = self.xp
-        transition = self.task.constant([[0.9, 0.1], [0.1, 0.9]])
-        prediction = imm.predict_mode_probabilities(transition, memory.probabilities)
-        mean, covariance = imm.mix(memory.mean, memory.covariance, prediction.mixing)
-        R = self.identity * measurement.variance
-        results = []
-        for j, sigma in enumerate(self.sigmas):
-            predicted = kalman.predict(mean[:, j], covariance[:, :, j], self.F, sigma**2 * self.unit_Q)
-            results.append(kalman.update(*predicted, measurement.position, self.H, R))
-        log_likelihood = xp.stack([r.log_likelihood for r in results])
-        probabilities = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
-        bank = KalmanBank(
-            xp.stack([r.mean for r in results], axis=1),
-            xp.stack([r.covariance for r in results], axis=2),
-            probabilities,
-        )
-        return *imm.combine(*bank), bank
-
-
-class KnownInputBound(_KalmanReference):
+class KnownInputBound(KalmanModel):
     """Posterior Cramér-Rao bound of an estimator that is told the whole acceleration: no process noise."""
 
     kind = "bound"

@@ -51,13 +51,13 @@ def _horizon(id: str, scenario: str) -> int:
 def benchmark_policies(id: str, full: bool) -> tuple[str, ...]:
     """Names that a cell compares.
 
-    Full: paper, every other policy as it is, those that were tuned, shipped agents, references, bounds.
+    Full: paper, every other policy and estimator as it is, those that were tuned, shipped agents, references, bounds.
     """
     known = baselines_of(id)
     if not full:
         return known.benchmark or known.names
     tuned = tuned_names(id)
-    everything = (known.score_paper, *known.policies, *tuned, *shipped_agents(id))
+    everything = (known.score_paper, *known.policies, *known.estimators, *tuned, *shipped_agents(id))
     names = dict.fromkeys((*everything, *known.references, *known.bounds))
     return tuple(name for name in names if name)
 

@@ -151,6 +151,8 @@ def _policies(cls: type[Task]) -> list[str]:
         rows.append(
             (f"`{name}`{roles.get(name, '')}", getattr(maker, "control", "any"), _first_sentence(maker))
         )
+    for name, maker in known.estimators.items():
+        rows.append((f"`{name}`", "(estimator)", _first_sentence(maker)))
     for kind, table in (("reference", known.references), ("bound", known.bounds)):
         for name, maker in table.items():
             text = f"{_first_sentence(maker)} Knows {maker.knows}."

@@ -19,6 +19,7 @@ def environment_lines(id: str) -> Iterator[str]:
     rows = {
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
+        "estimators": list(known.estimators),
         "tuned": tuned_names(id),
         "learned": shipped_agents(id),
         "parameters": parameter_names(cls),

@@ -21,7 +21,7 @@ def room_policies(id: str) -> list[str]:
     constant = f"{known.best_constant}-tuned"
     first = [constant] if constant in tuned else []
     others = [name for name in tuned if name != constant]
-    return [*first, paper_of(id), *others, *known.references, *known.bounds]
+    return [*first, paper_of(id), *others, *known.estimators, *known.references, *known.bounds]
 
 
 def measure_room(id: str, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
