@@ -1,4 +1,4 @@
-"""Tuning of classical policies and estimators on training episodes, so that nothing learned is compared with a straw man.
+"""Tuning of classical competitors on training episodes, so that nothing learned is compared with a straw man.
 
 The search is SciPy's differential evolution over the limits that a policy declares, started from its untuned
 values; every candidate meets the same episodes of the training split, so differences are not noise. The
