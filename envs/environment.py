@@ -89,11 +89,15 @@ class _Face:
         def record(state: Any, paper_state: Any) -> None:
             rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
             if self.detailed_info:
-                batch_last = {"error": task.error(state), "cost": task.cost(state), **task.records(state)}
+                batch_last = {
+                    "error": task.error(state),
+                    "cost": task.cost(state),
+                    **task.track(state),
+                    **task.records(state),
+                }
                 # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 for name, values in batch_last.items():
-                    batch_first = values.T if values.ndim == 2 else values
-                    info[name] = task.xp.asarray(batch_first, copy=True)
+                    info[name] = task.xp.asarray(task.xp.moveaxis(values, -1, 0), copy=True)
             if watch is not None:
                 watch(state)
 
@@ -118,7 +122,8 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         scenario: name of a scenario, or a :class:`~filtergym.envs.trajectory.Trajectory`.
         reward: "cost" (default), "log-likelihood" or "relative"; see :mod:`.reward`.
         render_mode: None, "rgb_array" or "human".
-        detailed_info: whether ``info`` carries truth error, cost and what an evaluation records.
+        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
+            cost and what else an evaluation records.
         **keywords: parameters of the task.
 
     Raises:
@@ -232,7 +237,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
-        detailed_info: whether ``info`` carries truth error, cost and what an evaluation records.
+        detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
+            cost and what else an evaluation records.
         **keywords: parameters of the task.
 
     Raises:

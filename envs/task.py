@@ -36,7 +36,7 @@ of its own, on the same noise.
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -450,10 +450,31 @@ class Task(ABC):
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
         return self._estimating(episode).covariance(episode.bank)
 
+    def track(self, episode: Episode) -> dict[str, Array]:
+        """What a track is drawn from: ``truth`` and ``estimate`` ``(C, N)``, ``covariance`` ``(C, C, N)``, and every
+        array of the measurement, named ``measurement_NAME``.
+        """
+        said = {f"measurement_{name}": values for name, values in _named_arrays(episode.measurement)}
+        return {
+            "truth": self.world.state(episode.truth),
+            "estimate": self.mean(episode),
+            "covariance": self.covariance(episode),
+            **said,
+        }
+
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""
         own = self._estimating(episode).records(episode.bank, episode.measurement)
         return {**own, **self.world.records(episode.truth)}
+
+
+def _named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
+    """Arrays of nested NamedTuples, with the names that lead to them."""
+    for name, value in part._asdict().items():
+        if isinstance(value, tuple):
+            yield from _named_arrays(value, f"{prefix}{name}_")
+        elif value is not None:
+            yield prefix + name, value
 
 
 def huber(cost: Array, bound: float, xp: ModuleType) -> Array:

@@ -1,8 +1,6 @@
 """A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
 
 import io
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -155,45 +153,3 @@ def read_trajectory(path: Path) -> Trajectory:
         return Trajectory(columns["time"], position, velocity, name=path.stem)
     except (ValueError, TypeError) as error:  # columns of words, of other lengths, of more dimensions
         raise ValueError(f"trajectory {path}: {error}") from error
-
-
-def flown_legs(
-    position: Sequence[float],
-    velocity: Sequence[float],
-    legs: Sequence[Sequence[float]],
-    interval: float,
-    count: int,
-) -> numpy.ndarray:
-    """State at ``count`` times of a flight of constant speed: straight legs and exact circular turns.
-
-    Args:
-        position: x and y at the start, m.
-        velocity: at the start, m/s.
-        legs: duration (s) and turn rate (deg/s, anticlockwise positive, 0 = straight) of each leg; after the
-            last one the flight goes straight on.
-        interval: sampling interval, s.
-        count: number of samples; the first is the start.
-
-    Returns:
-        x, y (m) and their rates (m/s), ``(4, count)``.
-    """
-    # Complex numbers carry a turn as one factor: v(t) = v e^{i w t}, and its integral is exact.
-    place, rate = complex(*position), complex(*velocity)
-    states: list[tuple[complex, complex]] = []
-    begin = 0.0
-    for duration, degrees in [*legs, (math.inf, 0.0)]:
-        turn = math.radians(degrees)
-
-        def after(time: float, turn: float = turn, place: complex = place, rate: complex = rate) -> tuple:
-            if turn == 0.0:
-                return place + rate * time, rate
-            rotation = complex(math.cos(turn * time), math.sin(turn * time))
-            return place + rate * (rotation - 1.0) / complex(0.0, turn), rate * rotation
-
-        while len(states) < count and len(states) * interval < begin + duration:
-            states.append(after(len(states) * interval - begin))
-        if len(states) == count:
-            break
-        place, rate = after(duration)
-        begin += duration
-    return numpy.array([(p.real, p.imag, v.real, v.imag) for p, v in states]).T

@@ -50,6 +50,17 @@ class Bootstrap:
         flat = values.reshape(len(values), -1)
         return (self.weights @ flat).reshape(-1, *values.shape[1:])
 
+    def medians(self, values: numpy.ndarray) -> numpy.ndarray:
+        """Medians over the episodes and over every resample of them, ``(1 + resamples,)``.
+
+        Args:
+            values: one for each episode, ``(episodes,)``.
+        """
+        order = numpy.argsort(values)
+        # The smallest value that at least half of the sample does not exceed; a little off for rounding.
+        below = numpy.cumsum(self.weights[:, order], axis=1)
+        return values[order][(below >= 0.5 - 1e-9).argmax(axis=1)]
+
     def interval(self, statistics: numpy.ndarray) -> Estimate:
         """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""
         tail = 50.0 * (1.0 - CONFIDENCE)

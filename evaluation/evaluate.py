@@ -40,7 +40,14 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
 
 
 def _run_chunk(
-    task: Task, actor: Any, kind: str, seeds: Sequence[int], tick: Progress, name: str, first_episode: int
+    task: Task,
+    actor: Any,
+    kind: str,
+    seeds: Sequence[int],
+    tick: Progress,
+    name: str,
+    first_episode: int,
+    tracks: bool,
 ) -> dict[str, numpy.ndarray]:
     """Errors and records of some episodes, ``(episodes, time, ...)``."""
     series: dict[str, list[numpy.ndarray]] = {}
@@ -54,7 +61,7 @@ def _run_chunk(
         keep("cost", task.cost(state))
         keep("capped_cost", capped_cost(task, state))
         keep("nees", log_density(error, covariance)[1])
-        for name, values in task.records(state).items():
+        for name, values in {**(task.track(state) if tracks else {}), **task.records(state)}.items():
             keep(name, values)
 
     if kind == "policy":
@@ -78,6 +85,7 @@ def evaluate(
     control: str | None = None,
     progress: Progress | None = None,
     *,
+    tracks: bool = False,
     paper: str = "",
     reference: str = "",
     **keywords: Any,
@@ -94,6 +102,7 @@ def evaluate(
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
+        tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
         paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
         reference: name of the competitor whose score is 1; kept likewise.
         **keywords: parameters of the task.
@@ -143,12 +152,26 @@ def evaluate(
                 tick,
                 name,
                 i,
+                tracks,
             )
             for i in range(0, episodes, CHUNK)
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
     dataset = _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
     return dataset.assign_attrs(paper=paper, reference=reference)
+
+
+def _further_dimensions(key: str, count: int) -> list[str]:
+    """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
+    if count < 0:
+        return []
+    if key == "covariance":
+        return ["component", "other_component"]
+    if key in ("error", "mean_square", "truth", "estimate"):
+        return ["component"]
+    if key.startswith("measurement_"):
+        return [f"{key}_axis{i}" for i in range(count + 1)]
+    return ["mode" if "mode" in key else key]
 
 
 def _dataset(
@@ -173,8 +196,7 @@ def _dataset(
             if key in per_policy[name]:
                 stacked[i] = per_policy[name][key]
         dims = ["policy", "episode", "time"]
-        if example.ndim == 3:
-            dims.append("component" if key in ("error", "mean_square") else "mode" if "mode" in key else key)
+        dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)
     dataset = xarray.Dataset(
         variables,

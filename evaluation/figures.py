@@ -9,7 +9,7 @@ import xarray
 
 from .bootstrap import Bootstrap
 from .files import whole_file
-from .metrics import reported_components, squared_errors
+from .metrics import chi_square_band, consistency_degrees, reported_components, squared_errors
 
 LINES = ("-", "--", "-.", ":")
 # Okabe and Ito's palette: distinguishable for colour-blind readers.
@@ -102,6 +102,49 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
     axes[-1].set_xlabel("measurement")
     title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
     return _titled(figure, f"{title}: {dataset.sizes['episode']} episodes, 95 % bands")
+
+
+def draw_consistency(dataset: xarray.Dataset) -> Any:
+    """Mean NEES and NIS over their dimensions at every measurement, with the 95 % chi-square band of that mean."""
+    shown = [metric for metric in ("nees", "nis") if metric in dataset]
+    figure, axes = _axes(len(shown))
+    names = dataset["policy"].values.tolist()
+    for axis, metric in zip(axes, shown, strict=True):
+        _shade_windows(axis, dataset)
+        bands = []
+        for name, style in styles(names).items():
+            run = dataset.sel(policy=name)
+            values, degrees = run[metric].values, consistency_degrees(run, metric)
+            present = ~numpy.isnan(values)
+            if not present.any():
+                continue
+            total, dimension = numpy.where(present, values, 0.0).sum(axis=0), (degrees * present).sum(axis=0)
+            there = dimension > 0.0
+            mean = numpy.where(there, total / numpy.where(there, dimension, 1.0), numpy.nan)
+            axis.plot(dataset["time"], mean, label=name, **style)
+            low, high = chi_square_band(dimension)
+            bands.append((numpy.where(there, low, numpy.nan), numpy.where(there, high, numpy.nan), dimension))
+        if bands:
+            # Where some measurements are missing the bands differ little; the widest is drawn.
+            low, high, dimension = min(bands, key=lambda band: band[2].sum())
+            wide = numpy.where(dimension > 0.0, dimension, 1.0)
+            axis.fill_between(
+                dataset["time"], low / wide, high / wide, color="0.6", alpha=0.5, lw=0, zorder=0
+            )
+        axis.axhspan(0.5, 2.0, color="0.92", lw=0, zorder=-1)
+        axis.axhline(1.0, color="0.3", lw=0.8)
+        axis.set_yscale("log")
+        _logarithmic(axis.yaxis)
+        axis.set_ylabel(f"mean {metric.upper()} over its dimension")
+        axis.grid(alpha=0.25, which="both", lw=0.4)
+        axis.margins(x=0.01)
+    axes[-1].set_xlabel("measurement")
+    title = f"{dataset.attrs['environment']}, scenario {dataset.attrs['scenario']}"
+    return _titled(
+        figure,
+        f"{title}: {dataset.sizes['episode']} episodes\n"
+        "consistent in the dark band (95 %, chi-square); light: a factor of two",
+    )
 
 
 def draw_error_distribution(dataset: xarray.Dataset) -> Any:
@@ -272,6 +315,8 @@ def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
     """Every figure of an evaluation with the name of its file."""
     yield "rmse_over_time", draw_error_over_time(dataset)
     yield "error_distribution", draw_error_distribution(dataset)
+    if "nees" in dataset:
+        yield "consistency", draw_consistency(dataset)
     if "true_class_probability" in dataset:
         # Where the truth differs from episode to episode, a mean over episodes of each mode says nothing.
         yield "true_class_probability", draw_true_class_probability(dataset)

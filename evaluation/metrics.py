@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy
 import xarray
+from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
 from .bootstrap import Bootstrap, Estimate
+from .competitors import RANKED
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -24,7 +26,7 @@ class Record(NamedTuple):
     scenario: str
     policy: str
     kind: str
-    """"policy", "reference" or "bound"."""
+    """"policy", "estimator", "reference" or "bound"."""
     metric: str
     component: str
     window: str
@@ -100,16 +102,9 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
                 yield Measure(
                     "mean_error", component, window, bootstrap.estimate(signed[:, times].mean(axis=1)), unit
                 )
-    for metric in ("nees", "nis"):
-        if metric in run and not numpy.isnan(run[metric].values).all():
-            for window, times in slices.items():
-                yield Measure(
-                    metric,
-                    "state" if metric == "nees" else "measurement",
-                    window,
-                    mean_of_present(run[metric].values[:, times], bootstrap),
-                    "1",
-                )
+    if not is_bound:
+        for window, times in slices.items():
+            yield from _consistency(run.isel(time=times), window, bootstrap)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             probability = run["mode_probability"].sel(mode=mode).values
@@ -125,15 +120,63 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         yield Measure("beyond_huber_bound", "", "all", bootstrap.estimate(beyond), "1")
 
 
+def _consistency(run: xarray.Dataset, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
+    """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
+
+    The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
+    interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
+    """
+    for metric, component in (("nees", "state"), ("nis", "measurement")):
+        if metric not in run or numpy.isnan(run[metric].values).all():
+            continue
+        values = run[metric].values
+        degrees = consistency_degrees(run, metric)
+        normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
+        yield Measure(f"a{metric}", component, window, mean_of_present(normalised, bootstrap), "1")
+        low, high = chi_square_band(degrees)
+        inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
+        yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
+
+
+def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:
+    """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
+    if metric == "nees":
+        return numpy.full(run["nees"].shape, float(run.sizes["component"]))
+    return numpy.nan_to_num(run["nis_degrees"].values)
+
+
+def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    # Few different ones, and the quantile is dear.
+    different, which = numpy.unique(degrees, return_inverse=True)
+    low, high = (2.0 * gammaincinv(0.5 * runs * different, p) / runs for p in (0.025, 0.975))
+    return low[which].reshape(degrees.shape), high[which].reshape(degrees.shape)
+
+
 def score(
     cost: numpy.ndarray, paper: numpy.ndarray, reference: numpy.ndarray, bootstrap: Bootstrap
 ) -> Estimate:
     """(C_paper - C) / (C_paper - C_reference), from means and resampled means of the three costs."""
     room = paper - reference
-    interval = bootstrap.interval(room)
-    # Where the room may be nothing, a ratio to it says nothing: "no room".
-    has_room = interval.low > 0.0 or interval.high < 0.0
-    return bootstrap.interval((paper - cost) / room) if has_room else NOTHING
+    # Where the reference is not significantly better than the paper, a ratio to the room says nothing, and where it is
+    # worse it would praise what is worse still: "no room".
+    return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
+
+
+def best_of(dataset: xarray.Dataset) -> str:
+    """Name of the ranked competitor with the lowest mean cost; empty where none is ranked."""
+    ranked = dataset.isel(policy=numpy.isin(dataset["kind"].values, RANKED))
+    if not ranked.sizes["policy"]:
+        return ""
+    return str(ranked["policy"].values[ranked["cost"].mean(["episode", "time"]).values.argmin()])
+
+
+def _behind_best(dataset: xarray.Dataset, name: str, best: str, bootstrap: Bootstrap) -> Iterator[Measure]:
+    """Paired relative difference of the cost to the best one's."""
+    if not best or str(dataset["kind"].sel(policy=name).values) not in RANKED:
+        return
+    own, lowest = (bootstrap.means(dataset["cost"].sel(policy=p).values.mean(axis=1)) for p in (name, best))
+    yield Measure("behind_best", best, "all", bootstrap.interval(own / lowest - 1.0), "1")
 
 
 def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
@@ -142,13 +185,20 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
     present = dataset["policy"].values.tolist()
     if paper_name not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
-    cost = {
-        p: bootstrap.means(dataset["cost"].sel(policy=p).values.mean(axis=1))
+    each = {
+        p: dataset["cost"].sel(policy=p).values.mean(axis=1)
         for p in {name, paper_name, reference_name} & set(present)
     }
+    cost = {p: bootstrap.means(values) for p, values in each.items()}
     paper = cost[paper_name]
     yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
     yield Measure("relative_cost_difference", "", "all", bootstrap.interval(cost[name] / paper - 1.0), "1")
+    ratio = each[name] / each[paper_name]
+    yield Measure("median_cost_ratio", "", "all", bootstrap.interval(bootstrap.medians(ratio)), "1")
+    # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
+    draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
+    wins = numpy.where(draw, 0.5, ratio < 1.0)
+    yield Measure("win_rate", "", "all", bootstrap.estimate(wins), "1")
     if reference_name in cost:
         yield Measure("score", "", "all", score(cost[name], paper, cost[reference_name], bootstrap), "1")
 
@@ -159,16 +209,19 @@ def tidy_records(
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
-    ``mean_error``, ``nees``, ``nis``, ``mean_mode_probability``, ``cost`` (uncapped mean), ``return`` (of
-    the capped reward), ``beyond_huber_bound`` (share of measurements where the cap binds),
-    ``cost_difference`` and ``relative_cost_difference`` to the paper's algorithm (paired), ``score``
-    = (C_paper - C) / (C_paper - C_reference), and the environment's own metrics.
+    ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
+    and ``nis_inside`` (share inside the 95 % chi-square interval); ``mean_mode_probability``; ``cost`` (uncapped mean),
+    ``return`` (of the capped reward), ``beyond_huber_bound`` (share of measurements where the cap binds).
+
+    Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
+    and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
+    ranked ``behind_best`` (paired; the component names the best). And the environment's own metrics.
 
     Args:
         dataset: from an evaluation.
         metrics: the environment's own, from one policy's part of the dataset.
     """
-    bootstrap = Bootstrap(dataset.sizes["episode"])
+    bootstrap, best = Bootstrap(dataset.sizes["episode"]), best_of(dataset)
     attrs = dataset.attrs
 
     def finite(value: float) -> float | None:
@@ -177,6 +230,7 @@ def tidy_records(
     records = []
     for name in dataset["policy"].values.tolist():
         measures: list[Any] = [*_measures(dataset, name, bootstrap), *_comparisons(dataset, name, bootstrap)]
+        measures += _behind_best(dataset, name, best, bootstrap)
         if metrics is not None:
             measures += metrics(dataset.sel(policy=name), bootstrap)
         for m in measures:

@@ -79,6 +79,29 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
     )
 
 
+def left_by_acceleration(
+    P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float
+) -> Covariance:
+    """Covariance after an update when the target has accelerated since the measurement before.
+
+    An acceleration ``a`` over one interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
+    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``.
+
+    Args:
+        P: covariance after the update without it.
+        mean_square: of ``d``, m^2.
+        alpha: position gain of the update.
+        beta: its velocity gain.
+        T: sampling interval, s.
+    """
+    rest, rate = 1.0 - alpha, (2.0 - beta) / T
+    return Covariance(
+        P.position + rest * rest * mean_square,
+        P.cross + rest * rate * mean_square,
+        P.velocity + rate * rate * mean_square,
+    )
+
+
 class VarianceReduction(NamedTuple):
     """Steady error variances per unit variance of a white measurement noise."""
 

@@ -45,7 +45,7 @@ def test_progress_bar_says_nothing_where_nobody_looks(capsys):
 def test_list_names_everything(tmp_path):
     result = run("list", cwd=tmp_path)
     assert result.returncode == 0
-    for word in (ENV, "evidence", "benchmark-s2", "adaptive-rearm", "imm-tuned", "bptt"):
+    for word in (ENV, "evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt"):
         assert word in result.stdout
     # What a reader needs to judge a number: whose algorithm it is, and what a reference is told.
     for word in ("Bakulev", "knows the scans of every manoeuvre", "knows the acceleration in every scan"):

@@ -270,7 +270,7 @@ def test_recovery_is_reported_for_outages_only(on_paper):
     assert found["time-varying", "recovery_time"] < found["plain-white", "recovery_time"] <= 1.0
     assert found["plain-white", "not_recovered"] > found["time-varying", "not_recovered"]
     assert ("matched-covariance", "recovery_time") not in found
-    nis = {(r.policy, r.window): r.value for r in records if r.metric == "nis"}
+    nis = {(r.policy, r.window): r.value for r in records if r.metric == "anis"}
     assert nis["time-varying", "during"] is None
     assert nis["time-varying", "after"] == pytest.approx(1.0, abs=0.05)
 
@@ -282,7 +282,7 @@ def test_records_name_the_position(axes):
     assert "position" in rmse
     if axes == 2:
         assert rmse == {"position", "position_x", "position_y"}
-        assert next(r.value for r in records if r.metric == "nis") == pytest.approx(2.0, abs=0.1)
+        assert next(r.value for r in records if r.metric == "anis") == pytest.approx(1.0, abs=0.05)
     assert {r.window for r in records if r.metric == "mean_error"} == {"all", "late"}
 
 

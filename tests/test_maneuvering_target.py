@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.trajectory import Trajectory, flown_legs, read_trajectory
+from filtergym.envs.trajectory import Trajectory, read_trajectory
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from scipy.stats import multivariate_normal
@@ -366,12 +366,44 @@ def test_random_flights_keep_their_limits():
     assert 0.45 < turns / (turns + thrusts) < 0.55
 
 
-@pytest.mark.parametrize("scenario", ["atc", "benchmark-s1", "benchmark-s2"])
-def test_legs_are_flown_exactly(scenario):
+def begun(task, episodes, seed=0):
+    """Episodes at the start of the track."""
+    rng, noise = np.random.default_rng(seed), task.noise
+    return task.begin(
+        rng.random((noise.uniforms, episodes)), rng.normal(size=(noise.initial_normals, episodes))
+    )
+
+
+@pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])
+def test_legs_are_drawn_around_the_stated_ones(scenario):
     task = make_task(ID, "gain", scenario)
+    p, legs = task.parameters, begun(task, 4000).truth.maneuvers
+    stated = np.array(p.legs)
+    share = np.diff(legs.time, axis=0) / stated[:, :1]
+    assert (np.abs(share - 1.0) <= p.leg_spread).all()
+    assert np.ptp(share, axis=1).min() > 1.9 * p.leg_spread
+    side = np.sign(np.radians(stated[stated[:, 1] != 0.0][:, 1:])) * np.sign(
+        legs.turn[:-1][stated[:, 1] != 0.0]
+    )
+    assert (side == side[0]).all()
+    assert 0.45 < (side[0] < 0.0).mean() < 0.55
+    np.testing.assert_allclose(
+        np.abs(legs.turn[:-1]).T, np.radians(np.abs(stated[:, 1]))[None] * np.ones((4000, 1))
+    )
+    away = legs.position[0] - np.array(p.initial_position)[:, None]
+    assert (np.abs(away) <= p.start_spread).all()
+    course = np.degrees(np.arctan2(*legs.velocity[0][::-1]) - np.arctan2(*p.initial_velocity[::-1]))
+    assert np.abs((course + 180.0) % 360.0 - 180.0).max() <= p.course_spread
+    np.testing.assert_allclose(np.hypot(*legs.velocity[-1]), math.hypot(*p.initial_velocity), rtol=1e-12)
+
+
+@pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])
+def test_legs_are_flown_exactly(scenario):
+    task = make_task(ID, "gain", scenario, leg_spread=0.0, start_spread=0.0, course_spread=0.0, mirrored=0.0)
     p = task.parameters
     interval, count = p.sampling_interval, p.horizon + 2
-    track = flown_legs(p.initial_position, p.initial_velocity, p.legs, interval, count)
+    legs = begun(task, 1).truth.maneuvers
+    track = np.concatenate(task.world.on_legs(legs, np.arange(count) + 0.0 * legs.time[:1, 0]))
     times = interval * np.arange(count)
     ends = np.cumsum([duration for duration, _ in p.legs])
     rates = np.radians([rate for _, rate in p.legs])
@@ -406,8 +438,8 @@ def test_legs_are_flown_exactly(scenario):
         else:
             centre = place + np.stack([-v[1], v[0]]) / rate
             np.testing.assert_allclose(centre, centre[:, :1] * np.ones_like(centre), rtol=0, atol=1e-7)
-    # The task flies this table.
-    state = task.begin(np.zeros((0, 8)), np.zeros((4, 8))).truth
+    # That is where the task flies.
+    state = begun(task, 8).truth
     for k in range(1, p.horizon + 1):
         state, _ = task.world.advance(state, np.zeros((2, 8)), None)
         np.testing.assert_array_equal(state.position[:, 0], track[:2, k])

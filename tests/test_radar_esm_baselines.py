@@ -406,11 +406,11 @@ def test_metrics_of_the_ideal_filter_and_of_a_bound(records):
     _, found = records
     ratio = found["ideal", "calibration_ratio", "acceleration", "all"]
     assert ratio.low < 1.0 < ratio.high
-    nees = found["ideal", "nees", "state", "all"]
-    assert nees.low < 3.0 < nees.high
+    nees = found["ideal", "anees", "state", "all"]
+    assert nees.low < 1.0 < nees.high
     of_classes = {"rmse_by_class", "calibration_ratio"}
     assert {key[1] for key in found if key[0] == "ideal"} >= of_classes
-    beliefs = {"mean_true_class_probability", "sure_and_wrong", "confidence_excess", "nis"}
+    beliefs = {"mean_true_class_probability", "sure_and_wrong", "confidence_excess", "anis"}
     assert not [key for key in found if key[0] == "ideal" and key[1] in beliefs]
     assert not [key for key in found if key[0] == "known-class-bound" and key[1] in of_classes | beliefs]
 

@@ -95,12 +95,11 @@ def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
-    whose mean a few lost tracks rule; ``nis_per_degree``, mean NIS over the mean number of observations, 1
-    for a consistent filter; ``adaptation_time`` (mean) from the first step that carries a new motion to the
+    whose mean a few lost tracks rule; ``adaptation_time`` (mean) from the first step that carries a new motion to the
     first on which its hypothesis has more than one half and keeps it for ten steps, and
     ``adaptation_censored``, the share of switches where that never comes; ``track_loss_rate`` and
     ``track_loss_time`` (median of the tracks lost) of ten steps in a row with a pseudorange rate further than
-    the aperture from the combined prediction, from the first change of motion on. Those from ``nis_per_degree``
+    the aperture from the combined prediction, from the first change of motion on. Those from ``adaptation_time``
     on need the records of a bank: references have none.
     """
     if numpy.isnan(run["cost"].values).all():
@@ -129,12 +128,6 @@ def _errors(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
 def _of_bank(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
     true_mode = run["true_mode"].values.astype(int)
     step = float(run["seconds"].values[0, 0])
-    for window, (first, last) in run.attrs["windows"].items():
-        times = slice(first - 1, last)
-        nis = run["nis"].values[:, times].mean(axis=1)
-        degrees = run["nis_degrees"].values[:, times].mean(axis=1)
-        yield Measure("nis_per_degree", "", window, _ratio(bootstrap, nis, degrees), "1")
-
     episodes = len(true_mode)
     changes = switches(true_mode, run["mode_probability"].values)
     for before, after in sorted({(s.before, s.after) for s in changes}):

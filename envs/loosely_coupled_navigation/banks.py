@@ -276,7 +276,10 @@ class GainBank(_KalmanBucyBank):
     def records(self, state: Steered, measurement: Measurement) -> dict[str, Array]:
         """NIS (NaN without a measurement), gain and K."""
         nis = ordered_sum(state.seen.normalised * state.seen.normalised)
-        found = {"nis": self.xp.where(measurement.available > 0.0, nis, math.nan)}
+        found = {
+            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
+            "nis_degrees": self.parameters.axes * measurement.available,
+        }
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
             found[f"gain_rate{ending}"] = state.gain[i] / self.parameters.sampling_interval
@@ -379,5 +382,6 @@ class SchemeBank(_KalmanBucyBank):
         nis = weighted_sum(state.weights, ordered_sum(squares))
         return {
             "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
+            "nis_degrees": self.parameters.axes * measurement.available,
             "mode_probability": state.weights,
         }

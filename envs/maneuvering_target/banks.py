@@ -36,6 +36,8 @@ class AlphaBeta(NamedTuple):
     """m, ``(2, N)``."""
     innovation_variance: Array
     """m^2, ``(2, N)``."""
+    average_excess: Array
+    """Exponential average of what the squared innovations have beyond their variance, m^2, ``(2, N)``."""
     average_innovation: Array
     """Exponential average of the normalised innovations, ``(2, N)``."""
     log_squared: Array
@@ -181,6 +183,7 @@ class GainBank(_RadarBank):
             covariance=alpha_beta.Covariance(variance, zero, velocity_variance),
             innovation=zero,
             innovation_variance=variance,
+            average_excess=zero,
             average_innovation=zero,
             log_squared=zero[0],
             average_log_squared=zero[0],
@@ -203,6 +206,7 @@ class GainBank(_RadarBank):
             covariance,
             innovation,
             S,
+            self.averaged(f.average_excess, innovation * innovation - S),
             self.averaged(f.average_innovation, normalised),
             log_squared,
             self.averaged(f.average_log_squared, log_squared),
@@ -232,8 +236,14 @@ class GainBank(_RadarBank):
         return state.mean
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Covariance that belongs to the gains used."""
-        xp, P = self.xp, state.covariance
+        """Covariance that belongs to the gains used, and what an acceleration since the last scan would leave of which
+        these know nothing: one as large as usual, and as the last innovations say.
+        """
+        xp, f, T = self.xp, state, self.T
+        usual = (0.5 * T**2 * self.parameters.unmodelled_acceleration) ** 2
+        beta = alpha_beta.benedict_bordner_beta(f.alpha)
+        told = usual + xp.clip(f.average_excess, 0.0, None)
+        P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(
@@ -245,7 +255,11 @@ class GainBank(_RadarBank):
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
         """Normalised innovation squared, and the gain."""
-        return {"nis": self.xp.expm1(state.log_squared), "alpha": state.alpha}
+        return {
+            "nis": self.xp.expm1(state.log_squared),
+            "nis_degrees": 2.0 + 0.0 * state.alpha,
+            "alpha": state.alpha,
+        }
 
 
 class FilterBank(_RadarBank):
@@ -397,4 +411,5 @@ class FilterBank(_RadarBank):
         """NIS of the combined prediction, and the weights."""
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
-        return {"nis": log_density(innovation, S)[1], "mode_probability": state.probabilities}
+        nis = log_density(innovation, S)[1]
+        return {"nis": nis, "nis_degrees": 2.0 + 0.0 * nis, "mode_probability": state.probabilities}

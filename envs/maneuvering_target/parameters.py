@@ -37,6 +37,9 @@ class ManeuveringTargetParameters(TaskParameters):
     """Nats that an evidence of one adds to a mode's log-posterior (ours)."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
+    unmodelled_acceleration: float = parameter(0.87, at_least=0.0)
+    """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
+    the covariance that control ``gain`` reports (ours)."""
     flight: str = parameter("random", choices=("maneuver", "random", "legs", "track"))
     """"maneuver": one manoeuvre at stated scans (paper). "random": drawn for each episode. "legs": straight
     legs and exact turns. "track": a table of states."""
@@ -50,7 +53,16 @@ class ManeuveringTargetParameters(TaskParameters):
     """First and last scan that carry it. Reading: x(k) = F x(k-1) + B w(k) with w at k = 50 to 55, six
     steps, because five would not turn the velocity by 90 degrees."""
     legs: tuple[tuple[float, float], ...] = ()
-    """Duration (s) and turn rate (deg/s) of each leg of flight "legs"."""
+    """Duration (s) and turn rate (deg/s, anticlockwise positive, 0 = straight) of each leg of flight "legs"; after the
+    last one it goes straight on."""
+    leg_spread: float = parameter(0.0, at_least=0.0, below=1.0)
+    """Each leg lasts from 1 minus this to 1 plus this times as long, drawn for each episode (ours)."""
+    start_spread: float = parameter(0.0, at_least=0.0)
+    """Each coordinate of the start of flight "legs" is drawn within this of ``initial_position``, m (ours)."""
+    course_spread: float = parameter(0.0, at_least=0.0, at_most=180.0)
+    """Its course is drawn within this of that of ``initial_velocity``, deg (ours)."""
+    mirrored: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability that all of its turns go to the other side (ours)."""
     track: tuple[tuple[float, ...], ...] = ()
     """Rows x, y, vx, vy, each with horizon + 2 values one scan apart, of flight "track"."""
     start_range: tuple[float, float] = parameter((5e3, 60e3), above=0.0, ascending=True)

@@ -1,20 +1,24 @@
 """Scenarios of ManeuveringTarget: the paper's flight, the training distribution, and held-out flights.
 
-Windows are scan numbers, first and last included. The flights of ``atc`` and the two ``benchmark`` scenarios
-are fixed legs that no training episode contains: time straight or turning (s) and turn rate (deg/s,
-anticlockwise positive), flown exactly.
+Windows are scan numbers, first and last included. The flights of ``atc``, ``cruise`` and ``descent``
+are legs that no training episode contains: time straight or turning (s) and turn rate (deg/s, anticlockwise positive),
+flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
+learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart.
 """
 
 from collections.abc import Mapping
 
 from ..task import Scenario
 
+_AROUND = {"start_spread": 5e3, "course_spread": 30.0, "mirrored": 0.5, "leg_spread": 0.5}
+
 SCENARIOS: Mapping[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
         Scenario(
             "paper",
-            "The paper's flight: straight at 100 m/s, one 90-degree turn at scans 50 to 55, straight again.",
+            "The paper's flight: straight at 100 m/s, one 90-degree turn at scans 50 to 55, straight again. It is "
+            "always the same and can be learned by heart.",
             {"flight": "maneuver"},
             {
                 "pre": (30, 49),
@@ -40,40 +44,37 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "initial_position": (25e3, 10e3),
                 "initial_velocity": (-120.0, 0.0),
                 "legs": ((125.0, 0.0), (90.0, 1.0), (125.0, 0.0), (30.0, -3.0), (125.0, 0.0)),
+                **_AROUND,
             },
-            {
-                "straight-1": (11, 25),
-                "slow-turn": (26, 43),
-                "straight-2": (49, 68),
-                "fast-turn": (69, 74),
-                "straight-3": (80, 98),
-            },
+            {"start": (1, 10), "settled": (11, 98)},
         ),
         Scenario(
-            "benchmark-s1",
-            "A fast aircraft turning at 3.74 deg/s (about 2 g) from 61 s to 106 s.",
+            "cruise",
+            "A fast airliner: straight but for one gentle turn of a third of g.",
             {
                 "flight": "legs",
                 "sampling_interval": 5.0,
-                "horizon": 30,
+                "horizon": 60,
                 "initial_position": (30e3, 30e3),
                 "initial_velocity": (-172.0, -246.0),
-                "legs": ((61.0, 0.0), (45.0, 3.74), (44.0, 0.0)),
+                "legs": ((120.0, 0.0), (60.0, 0.7), (120.0, 0.0)),
+                **_AROUND,
             },
-            {"straight-1": (6, 12), "turn": (13, 21), "straight-2": (25, 30)},
+            {"start": (1, 10), "settled": (11, 60)},
         ),
         Scenario(
-            "benchmark-s2",
-            "A fast aircraft turning at 4.68 deg/s (about 2.5 g) from 61 s to 96 s, seen from further off.",
+            "descent",
+            "An airliner at half the speed: a turn of a quarter of g, later a short one to the other side.",
             {
                 "flight": "legs",
                 "sampling_interval": 5.0,
-                "horizon": 30,
-                "initial_position": (20e3, 50e3),
-                "initial_velocity": (-172.0, -246.0),
-                "legs": ((61.0, 0.0), (35.0, 4.68), (54.0, 0.0)),
+                "horizon": 80,
+                "initial_position": (30e3, 30e3),
+                "initial_velocity": (-90.0, -120.0),
+                "legs": ((100.0, 0.0), (60.0, 1.0), (150.0, 0.0), (20.0, -1.5), (100.0, 0.0)),
+                **_AROUND,
             },
-            {"straight-1": (6, 12), "turn": (13, 19), "straight-2": (23, 30)},
+            {"start": (1, 10), "settled": (11, 80)},
         ),
     )
 }

@@ -8,7 +8,6 @@ from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws
 from ..observation import Array
 from ..task import Initial, Task, World
-from ..trajectory import flown_legs
 from .parameters import ManeuveringTargetParameters
 
 
@@ -49,6 +48,19 @@ class Maneuvers(NamedTuple):
         return self.effect[4:]
 
 
+class Legs(NamedTuple):
+    """A flight of straight legs and exact turns, each with what it begins with."""
+
+    time: Array
+    """s since the start of the track, ``(legs + 1, N)``; the last one is straight and never ends."""
+    turn: Array
+    """Turn rate, rad/s, anticlockwise positive, ``(legs + 1, N)``."""
+    position: Array
+    """m, ``(legs + 1, 2, N)``."""
+    velocity: Array
+    """m/s, ``(legs + 1, 2, N)``."""
+
+
 class Truth(NamedTuple):
     """The aircraft."""
 
@@ -58,7 +70,7 @@ class Truth(NamedTuple):
     """m, ``(2, N)``."""
     velocity: Array
     """m/s, ``(2, N)``."""
-    maneuvers: Maneuvers | None
+    maneuvers: Maneuvers | Legs | None
     """None where the flight is a table."""
 
 
@@ -89,19 +101,19 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Manoeuvres that a flight may have."""
         self.table: Array = None
         """Rows x, y, vx, vy of a flight that is a table, ``(4, horizon + 2)``."""
-        if p.flight == "legs":
-            self.table = task.constant(
-                flown_legs(p.initial_position, p.initial_velocity, p.legs, p.sampling_interval, p.horizon + 2)
-            )
-        elif p.flight == "track":
+        if p.flight == "track":
             self.table = task.constant(p.track)
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""
         xp, p, constant = self.xp, self.parameters, self.task.constant
         ones = xp.ones_like(normals[0])
+        maneuvers: Maneuvers | Legs | None
         if p.flight == "random":
             position, velocity, maneuvers = self._random_flight(draws)
+        elif p.flight == "legs":
+            maneuvers = self._drawn_legs(draws, ones)
+            position, velocity = maneuvers.position[0], maneuvers.velocity[0]
         elif self.table is not None:
             position = self.table[:2, 0, None] * ones
             velocity = self.table[2:, 0, None] * ones
@@ -176,9 +188,65 @@ class RadarWorld(World[Task, Truth, Measurement]):
             Maneuvers(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))),
         )
 
+    def _drawn_legs(self, draws: Draws, ones: Array) -> Legs:
+        """Draw start, course, side and times of a flight around the stated ones."""
+        xp, p = self.xp, self.parameters
+        spread, course = p.start_spread, math.radians(p.course_spread)
+        position = xp.stack(
+            [
+                start + draws.uniform(f"start_{axis}", (-spread, spread))
+                for axis, start in zip("xy", p.initial_position, strict=True)
+            ]
+        )
+        turned = draws.uniform("course", (-course, course))
+        velocity = self._rotated(self.task.constant(p.initial_velocity)[:, None] * ones, turned)
+        side = xp.where(draws.event("mirrored", p.mirrored), -1.0, 1.0)
+        time = 0.0 * ones
+        found: list[tuple[Array, ...]] = []
+        for i, (duration, rate) in enumerate(p.legs):
+            turn = (math.radians(rate) * side) * ones
+            flown = duration * draws.uniform(f"leg_{i}", (1.0 - p.leg_spread, 1.0 + p.leg_spread))
+            found.append((time, turn, position, velocity))
+            position, velocity = self._after(flown, turn, position, velocity)
+            time = time + flown
+        found.append((time, 0.0 * ones, position, velocity))
+        return Legs(*(xp.stack(parts) for parts in zip(*found, strict=True)))
+
+    def _rotated(self, vector: Array, angle: Array) -> Array:
+        """Turn ``(2, N)`` anticlockwise."""
+        xp = self.xp
+        cosine, sine = xp.cos(angle), xp.sin(angle)
+        return xp.stack([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
+
+    def _after(self, time: Array, turn: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
+        """Position and velocity after a time on a circle, or a straight line, at constant speed."""
+        xp, angle = self.xp, turn * time
+        turning = xp.abs(turn) > 0.0
+        divisor = xp.where(turning, turn, 1.0)
+        along = xp.where(turning, xp.sin(angle) / divisor, time)
+        # 1 - cos, in a form that keeps its digits for small angles.
+        across = xp.where(turning, 2.0 * xp.sin(0.5 * angle) ** 2 / divisor, 0.0)
+        flown = xp.stack(
+            [along * velocity[0] - across * velocity[1], across * velocity[0] + along * velocity[1]]
+        )
+        return position + flown, self._rotated(velocity, angle)
+
+    def on_legs(self, legs: Legs, scan: Array) -> tuple[Array, Array]:
+        """Position and velocity at a scan."""
+        xp, now = self.xp, self.parameters.sampling_interval * scan
+        time, turn, position, velocity = (part[0] for part in legs)
+        for i in range(1, int(legs.time.shape[0])):
+            there = now >= legs.time[i]
+            time, turn = xp.where(there, legs.time[i], time), xp.where(there, legs.turn[i], turn)
+            position = xp.where(there, legs.position[i], position)
+            velocity = xp.where(there, legs.velocity[i], velocity)
+        return self._after(now - time, turn, position, velocity)
+
     def _flown(self, truth: Truth, scan: Array) -> tuple[Array, Array]:
         """Position and velocity at the next scan."""
         xp, T, m = self.xp, self.parameters.sampling_interval, truth.maneuvers
+        if isinstance(m, Legs):
+            return self.on_legs(m, scan)
         if m is None:
             last = int(self.table.shape[1]) - 1
             row = xp.clip(xp.astype(scan, xp.int64), None, last)

@@ -269,10 +269,8 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         calibrated its expectation is 2, that of the true class's filter.
         """
         squared = ordered_sum(state.innovation * state.innovation)
-        return {
-            "mode_probability": state.probabilities,
-            "nis": weighted_sum(imm.normalised_exponential(state.log_predicted), squared),
-        }
+        nis = weighted_sum(imm.normalised_exponential(state.log_predicted), squared)
+        return {"mode_probability": state.probabilities, "nis": nis, "nis_degrees": 2.0 + 0.0 * nis}
 
 
 def one_hot(index: Array, count: int, xp: ModuleType) -> Array:

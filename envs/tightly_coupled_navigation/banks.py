@@ -314,3 +314,12 @@ class NoiseBank(HypothesisBank):
         )
         probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
         return self._weighed(state, probabilities, exponent)
+
+    def covariance(self, state: Filters) -> Array:
+        """Of the combination, times the short average of the NIS per reading where that is above one.
+
+        Whether the action is right about the sensors, only the innovations tell.
+        """
+        groups = int(state.average_nis.shape[0])
+        average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
+        return super().covariance(state) * self.xp.clip(average, 1.0, None)

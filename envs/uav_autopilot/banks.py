@@ -265,12 +265,17 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return state.control
 
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
-        """NIS per available reading, and the innovation over its sigma of the output's sensor (of the first
-        where the output is not measured).
+        """NIS (NaN in a dropout of all sensors) with the number of its readings, and the innovation over its sigma of
+        the output's sensor (of the first where the output is not measured).
         """
-        task = self.task
+        task, xp = self.task, self.xp
+        count = ordered_sum(measurement.available)
         shown = task.measured.index(task.output) if task.output in task.measured else 0
-        return {"nis": state.nis, "innovation": state.innovation[shown]}
+        return {
+            "nis": xp.where(count > 0.0, state.nis * count, math.nan),
+            "nis_degrees": count,
+            "innovation": state.innovation[shown],
+        }
 
 
 class GainBank(_AutopilotFilter):
@@ -285,6 +290,12 @@ class GainBank(_AutopilotFilter):
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
+
+    def covariance(self, state: Filter) -> Array:
+        """Covariance of the filter, times the short average of the NIS where that is above one: the filter itself is
+        told neither of the noise nor whether the action is right about it.
+        """
+        return super().covariance(state) * self.xp.clip(state.mean_nis, 1.0, None)
 
 
 class ModeBank(_AutopilotFilter):

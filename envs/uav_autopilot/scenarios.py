@@ -45,24 +45,24 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "gust-front",
-            "Gusts go from light to severe (four times) at one measurement, unreported.",
+            "Gusts go from light to severe (four times) at one measurement, drawn from 150 to 350, unreported.",
             {
                 **_NOMINAL_WITH_COMMANDS,
                 "disturbance_levels": ((1.0, 1.0), (4.0, 4.0)),
-                "disturbance_times": ((200, 200),),
+                "disturbance_times": ((150, 350),),
             },
-            {"before": (100, 199), "front": (200, 249), "after": (250, 600)},
+            {"before": (50, 149), "front": (150, 350), "after": (351, 600)},
         ),
         Scenario(
             "sensor-degradation",
-            "The noise of the rate sensor grows fivefold, unreported.",
+            "The noise of the rate sensor grows fivefold at one measurement, drawn from 150 to 350, unreported.",
             {
                 **_NOMINAL_WITH_COMMANDS,
                 "sensor_levels": ((1.0, 1.0), (5.0, 5.0)),
-                "sensor_times": ((200, 200),),
+                "sensor_times": ((150, 350),),
                 "changing_sensors": ("rate",),
             },
-            {"before": (100, 199), "after": (200, 600)},
+            {"before": (50, 149), "after": (351, 600)},
         ),
         Scenario(
             "actuator-lag",

@@ -1,6 +1,6 @@
 """The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,9 +10,12 @@ from ..baselines.reproduction import Grid, markdown_table
 from ..envs.catalogue import task_class
 from ..evaluation.figures import draw_differences
 from ..evaluation.metrics import Record
+from .ranking import ranking, ranking_sentence
 from .records import read_records
-from .tables import with_interval
+from .tables import INCONSISTENT, against_paper, consistency, with_interval
 
+STRONGEST = 4
+"""Classical competitors that the page shows."""
 DIFFERENCE = "relative_cost_difference"
 
 
@@ -41,16 +44,20 @@ def read_benchmark(path: Path) -> dict[str, list[Record]]:
 def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
     """Names that the page shows, of those in the records.
 
-    The tuned policies (the paper's first, the best constant action last), learned agents, and the reference
-    whose score is 1. The other untuned ones stand in the records.
+    What costs least in the training distribution, of any control and kind; learned agents; the paper's algorithm and
+    the best constant action, tuned; the reference whose score is 1. The others stand in the records.
     """
-    known = baselines_of(id)
-    adaptive = [name for name in known.tunable if name not in (known.score_paper, known.best_constant)]
-    tuned = [f"{name}-tuned" for name in (known.score_paper, *adaptive, known.best_constant)]
-    present = {record.policy for record in records}
-    return [
-        name for name in (*known.compared, *tuned, *shipped_agents(id), known.score_bound) if name in present
+    known, cls = baselines_of(id), task_class(id)
+    of_default = [record for record in records if record.scenario == cls.default_scenario]
+    classical = [
+        place.name
+        for place in ranking(of_default or records)
+        if place.role != "learned" and place.name != known.score_paper
     ]
+    tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
+    present = {record.policy for record in records}
+    wanted = dict.fromkeys((*classical[:STRONGEST], *shipped_agents(id), *tuned, known.score_bound))
+    return [name for name in wanted if name in present]
 
 
 def compare_environment(records: Sequence[Record]) -> Comparison:
@@ -83,6 +90,21 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             for scenario in sizes
         ]
 
+    def of_each(text: Callable[[str, str], str]) -> list[list[str]]:
+        return [
+            [
+                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
+                *(text(scenario, name) for name in (paper, *columns)),
+            ]
+            for scenario in sizes
+        ]
+
+    by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
+
+    def typical(scenario: str, name: str) -> str:
+        median, wins = against_paper(by_window, name, (scenario,))
+        return "-" if median == "-" else f"{median}<br>{wins}"
+
     shown = [
         *columns,
         *(name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found),
@@ -100,6 +122,18 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             f"{quantity}, {units[0]}",
             ["scenario", *(heads[name] for name in (paper, *shown))],
             rows(metric, component, (paper, *shown)),
+        ),
+        Grid(
+            f"Episode by episode: median difference of the cost to `{paper}`, %, and share of episodes with a lower "
+            "cost, %",
+            ["scenario", *(heads[name] for name in (paper, *columns))],
+            of_each(typical),
+        ),
+        Grid(
+            "Consistency: mean NEES over the dimension; 1 is consistent, "
+            f"{INCONSISTENT} off by more than a factor of two",
+            ["scenario", *(heads[name] for name in (paper, *columns))],
+            of_each(lambda scenario, name: consistency(found.get((scenario, name, "anees", "state")))),
         ),
     ]
     differences: dict[str, dict[str, tuple[float, ...]]] = {}
@@ -138,7 +172,11 @@ def comparison_markdown(comparison: Comparison, records: Sequence[Record], pictu
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
-    lines: list[str] = []
+    scenarios = dict.fromkeys(record.scenario for record in records)
+    lines: list[str] = [
+        f"* {ranking_sentence([r for r in records if r.scenario == scenario])}" for scenario in scenarios
+    ]
+    lines.append("")
     for grid in comparison.grids:
         lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
     lines += [

@@ -1,27 +1,34 @@
-"""The room table: how much there is to win on an environment's training distribution."""
+"""The room table: who is best on an environment's training distribution, and how much there is to win."""
 
 from collections.abc import Callable
 
+from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import markdown_table
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import task_class
 from ..evaluation.metrics import Record
 from ..names import evaluate, tidy_records
-from .tables import main_components, with_interval
+from .ranking import ranking_sentence
+from .tables import (
+    INCONSISTENT,
+    against_paper,
+    consistency,
+    main_components,
+    ranked,
+    score_text,
+    with_interval,
+)
 
 MARKER = "room table"
 """What the markers of a page are called, between which the table stands."""
 
 
 def room_policies(id: str) -> list[str]:
-    """Names in the room table: best constant action, paper, tuned policies, references, bounds."""
+    """Names in the room table: everything that has a name, but random actions."""
     known = baselines_of(id)
-    tuned = tuned_names(id)
-    constant = f"{known.best_constant}-tuned"
-    first = [constant] if constant in tuned else []
-    others = [name for name in tuned if name != constant]
-    return [*first, paper_of(id), *others, *known.estimators, *known.references, *known.bounds]
+    names = [*known.names, *tuned_names(id), *shipped_agents(id)]
+    return [name for name in names if name != "random"]
 
 
 def measure_room(id: str, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
@@ -41,21 +48,32 @@ def room_markdown(records: list[Record], command: str) -> str:
         "policy",
         "control",
         "mean cost",
+        f"cost against `{paper_of(first.environment)}`, %",
+        "median, %",
+        "wins, %",
         *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown),
+        "ANEES",
         "score",
     ]
     rows = []
-    for name, kind, control in dict.fromkeys((r.policy, r.kind, r.control) for r in records):
+    for name, kind, control in ranked(records):
         rows.append(
             [
                 f"`{name}`",
                 control if kind == "policy" else f"({kind})",
                 with_interval(found.get((name, "cost", "", "all"))),
+                with_interval(
+                    found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+                ),
+                *against_paper(found, name),
                 *(with_interval(found.get((name, "rmse", c, "all"))) for c in shown),
-                with_interval(found.get((name, "score", "", "all"))),
+                consistency(found.get((name, "anees", "state", "all"))),
+                score_text(found.get((name, "score", "", "all"))),
             ]
         )
     note = (
+        f"{ranking_sentence(records)} Lowest cost first; median and wins are of the cost of each episode. ANEES is the "
+        f"mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
         f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
         f"95 % bootstrap intervals. Made by `{command}`."
     )

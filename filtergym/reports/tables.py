@@ -1,5 +1,6 @@
 """Tables of results for the terminal."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,10 @@ from rich.table import Table
 from ..baselines.catalogue import baselines_of
 from ..baselines.reproduction import Grid, Reproduction
 from ..baselines.tuning import Tuned
+from ..evaluation.competitors import RANKED
+
+INCONSISTENT = "!"
+"""Marks a covariance that is off by more than a factor of two."""
 
 
 def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: float = 0.0) -> str:
@@ -33,6 +38,30 @@ def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: 
     return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
 
 
+def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...] = ()) -> list[str]:
+    """Median difference of the episodes' costs to the paper's algorithm, %, and the share of them that are lower, %."""
+    median, wins = (
+        found.get((*scenario, name, metric, "", "all")) for metric in ("median_cost_ratio", "win_rate")
+    )
+    if median is None or median.value is None:
+        return ["-", "-"]
+    return [f"{100.0 * (median.value - 1.0):+.1f}", f"{100.0 * wins.value:.0f}"]
+
+
+def consistency(record: Any) -> str:
+    """Mean NEES over the dimension, marked where it is inconsistent by more than a factor of two."""
+    if record is None or record.value is None:
+        return "-"
+    return f"{record.value:.3g}" + ("" if 0.5 <= record.value <= 2.0 else f" {INCONSISTENT}")
+
+
+def score_text(record: Any) -> str:
+    """Score with its interval, or that there is no room."""
+    if record is None or record.value is not None:
+        return with_interval(record, negligible=1e-9)
+    return "no room"
+
+
 def main_components(records: Sequence[Any]) -> list[str]:
     """Components that a table shows: groups such as "position" where there are any, else the first three."""
     first = records[0]
@@ -48,8 +77,20 @@ def shown_components(names: Sequence[str]) -> list[str]:
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
 
+def ranked(records: Sequence[Any]) -> list[tuple[str, str, str]]:
+    """Name, kind and control of every competitor: those that are ranked by their cost, then references and bounds."""
+    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
+    found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
+
+    def place(entry: tuple[str, str, str]) -> tuple[bool, float]:
+        value = cost.get(entry[0])
+        return entry[1] not in RANKED, math.inf if value is None else value
+
+    return sorted(found, key=place)
+
+
 def results_table(records: Sequence[Any]) -> Table:
-    """Compare policies: errors over the whole run, cost against the paper's algorithm, score.
+    """Compare competitors, lowest cost first: errors over the whole run, cost against the paper's, consistency, score.
 
     Args:
         records: tidy records of one environment and scenario.
@@ -66,24 +107,31 @@ def results_table(records: Sequence[Any]) -> Table:
     table.add_column("control")
     for component in shown:
         table.add_column(f"RMSE {component.replace('_', ' ')}, {units[component]}", justify="right")
-    table.add_column("cost vs paper, %", justify="right")
-    table.add_column("score", justify="right")
+    for title in ("cost vs paper, %", "median, %", "wins, %", "ANEES", "score"):
+        table.add_column(title, justify="right")
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
-    names = list(dict.fromkeys((r.policy, r.kind, r.control) for r in records))
-    section = "policy"
+    names = ranked(records)
+    section = "ranked"
     for name, kind, control in names:
-        if kind != section:
+        if kind not in RANKED and kind != section:
             table.add_section()
             section = kind
         row = [name, control if kind == "policy" else f"({kind})"]
         row += [with_interval(found.get((name, "rmse", component, "all"))) for component in shown]
-        row.append(with_interval(found.get((name, "relative_cost_difference", "", "all")), 100.0))
-        score = found.get((name, "score", "", "all"))
-        row.append("no room" if score is not None and score.value is None else with_interval(score))
+        row.append(
+            with_interval(found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005)
+        )
+        row += [*against_paper(found, name), consistency(found.get((name, "anees", "state", "all")))]
+        row.append(score_text(found.get((name, "score", "", "all"))).partition(" [")[0])
         table.add_row(*row)
     known = baselines_of(first.environment)
     told = {**known.references, **known.bounds}
-    notes = ["score: 0 = the paper's algorithm, 1 = the reference that it is measured against."]
+    notes = [
+        "median, wins: of the cost of each episode against the paper's algorithm. "
+        f"ANEES: 1 if errors are as large as the covariance says; {INCONSISTENT}: off by more than a factor of two.",
+        "score: 0 = the paper's algorithm, 1 = the reference that it is measured against; no room where that is not "
+        "significantly better.",
+    ]
     notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
     table.caption = "\n".join(notes)
     table.caption_justify = "left"

@@ -1,0 +1,79 @@
+"""No held-out flight can be learned by heart: what is a function of the step number alone wins little.
+
+The strongest such schedule of gains is found by gradient through the filter, on training episodes of the very scenario.
+Here with few of them; ``python tests/test_open_loop.py`` does it thoroughly for every held-out scenario of ManeuveringTarget.
+"""
+
+import sys
+
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.lanes import Lanes
+from filtergym.evaluation.competitors import Policy
+from filtergym.evaluation.seeds import episode_seeds
+
+from filtergym import evaluate, tidy_records
+
+ID = "filtergym/ManeuveringTarget-v0"
+
+
+def best_schedule(scenario, episodes, iterations):
+    """Actions by step number that cost least on average over training episodes, ``(decisions, actions)``."""
+    import torch
+
+    task = make_task(ID, "gain", scenario, torch)
+    seeds = episode_seeds("train", 0, episodes)
+    decisions = task.horizon // task.decision_interval
+    actions = torch.zeros((decisions, task.action_space.shape[0]), dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Adam([actions], lr=0.15)
+    for _ in range(iterations):
+        lanes = Lanes(task, episodes)
+        for lane, seed in enumerate(seeds):
+            lanes.seed(lane, np.random.default_rng(seed))
+        lanes.restart()
+        costs = []
+        for k in range(decisions):
+            action = actions[k][:, None].expand(-1, lanes.width)
+            lanes.step(
+                lambda state, action=action: task.act(state, action),
+                lambda state, _: costs.append(task.cost(state).mean()),
+            )
+        optimiser.zero_grad()
+        # The logarithm, so that the step does not depend on the size of the cost.
+        torch.stack(costs).mean().log().backward()
+        optimiser.step()
+        with torch.no_grad():
+            actions.clamp_(-1.0, 1.0)
+    return actions.detach().numpy()
+
+
+class OpenLoop(Policy):
+    """Plays a schedule."""
+
+    control = "gain"
+    schedule: np.ndarray
+
+    def act(self, observation, state, start):
+        step = np.where(start, 0, 0 if state is None else state + 1)
+        return self.schedule[step], step
+
+
+def scores(scenario, episodes, training_episodes, iterations):
+    """Scores of the best schedule and of the shipped agents."""
+    player = type("Player", (OpenLoop,), {"schedule": best_schedule(scenario, training_episodes, iterations)})
+    names = {name: name for name in ("imm", "bptt", "ppo", "known-turn")}
+    records = tidy_records(evaluate(ID, {"schedule": player, **names}, scenario, episodes=episodes))
+    return {r.policy: r.value for r in records if r.metric == "score"}
+
+
+def test_a_schedule_wins_less_than_half_of_what_an_agent_wins():
+    pytest.importorskip("torch")
+    found = scores("cruise", 300, 32, 20)
+    assert found["schedule"] < 0.5 * max(found["bptt"], found["ppo"])
+
+
+if __name__ == "__main__":
+    for scenario in sys.argv[1:] or [s.name for s in catalogue()[ID].scenarios.values() if not s.training]:
+        rounded = {name: round(value, 2) for name, value in scores(scenario, 2000, 128, 100).items()}
+        print(scenario, rounded, flush=True)
