@@ -37,7 +37,7 @@ def best_schedule(scenario, episodes, iterations):
             action = actions[k][:, None].expand(-1, lanes.width)
             lanes.step(
                 lambda state, action=action: task.act(state, action),
-                lambda state, _: costs.append(task.cost(state).mean()),
+                lambda state, _, costs=costs: costs.append(task.cost(state).mean()),
             )
         optimiser.zero_grad()
         # The logarithm, so that the step does not depend on the size of the cost.
