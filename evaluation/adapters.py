@@ -39,8 +39,8 @@ class SingleTrackEstimator(ABC):
         missing = [name for name in components if name not in self.state]
         if missing:
             raise ValueError(
-                f"the state of {type(self).__name__}, {', '.join(self.state)}, lacks {', '.join(missing)} of {task.id}: "
-                "`state` names its numbers in their order"
+                f"the state of {type(self).__name__}, {', '.join(self.state)}, lacks {', '.join(missing)} of "
+                f"{task.id}: `state` names its numbers in their order"
             )
         self._places = [self.state.index(name) for name in components]
 

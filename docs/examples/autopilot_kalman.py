@@ -4,8 +4,8 @@ filtergym evaluate filtergym/UavAutopilot-v0 --policy autopilot_kalman:Kalman --
 """
 
 import numpy
-from filterpy.kalman import KalmanFilter
 from filtergym.adapters import FilterpyEstimator
+from filterpy.kalman import KalmanFilter
 
 
 class Kalman(FilterpyEstimator):

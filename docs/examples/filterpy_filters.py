@@ -4,6 +4,7 @@ filtergym evaluate filtergym/ManeuveringTarget-v0 --policy filterpy_filters:Imm 
 """
 
 import numpy
+from filtergym.adapters import FilterpyEstimator
 from filterpy.kalman import (
     ExtendedKalmanFilter,
     IMMEstimator,
@@ -11,7 +12,6 @@ from filterpy.kalman import (
     MerweScaledSigmaPoints,
     UnscentedKalmanFilter,
 )
-from filtergym.adapters import FilterpyEstimator
 from scipy.linalg import block_diag
 
 
@@ -55,9 +55,9 @@ class Unscented(FilterpyEstimator):
         points = MerweScaledSigmaPoints(5, alpha=0.1, beta=2.0, kappa=-2.0)
         ukf = UnscentedKalmanFilter(5, 2, T, lambda x: x[[0, 2]], coordinated_turn, points)
         ukf.x, ukf.P = initial.mean, initial.covariance
-        ukf.P[4, 4] = 0.02**2
-        axis = 2.0**2 * numpy.outer([T**2 / 2, T], [T**2 / 2, T])
-        ukf.Q = block_diag(axis, axis, 0.005**2)
+        ukf.P[4, 4] = 0.01**2
+        axis = 1.0**2 * numpy.outer([T**2 / 2, T], [T**2 / 2, T])
+        ukf.Q = block_diag(axis, axis, 0.003**2)
         return ukf
 
 
