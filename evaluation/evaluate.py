@@ -4,6 +4,7 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy
@@ -13,12 +14,19 @@ from ..envs.catalogue import find_scenario, make_task, nearest, task_class
 from ..envs.reward import capped_cost
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
-from .competitors import check_competitor, kind_of, made
-from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference
+from .competitors import Kind, check_competitor, kind_of, made
+from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference, told
 from .seeds import episode_seeds
 
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
+
+
+def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
+    """Make a competitor for its task; what a user's estimator raises then is told like what it raises later."""
+    with told(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
+        competitor = made(maker, task)
+    return check_competitor(name, competitor, kind)
 
 
 def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
@@ -146,7 +154,7 @@ def evaluate(
         chunks = [
             _run_chunk(
                 tasks[name],
-                check_competitor(name, made(maker, tasks[name]), kinds[name]),
+                _made(name, maker, kinds[name], tasks[name]),
                 kinds[name],
                 seeds[i : i + CHUNK],
                 tick,

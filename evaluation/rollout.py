@@ -151,13 +151,13 @@ def run_estimator(
 
     def start(episode: Episode) -> None:
         nonlocal memory
-        with _told(f"estimator {name!r} failed at the start of the track"):
+        with told(f"estimator {name!r} failed at the start of the track"):
             memory = estimator.start(chosen_lanes(episode.measurement, filled), width)
 
     def update(episode: Episode) -> tuple[Array, Array]:
         nonlocal memory, step
         step += 1
-        with _told(f"estimator {name!r} failed at measurement {step}"):
+        with told(f"estimator {name!r} failed at measurement {step}"):
             answer = estimator.update(chosen_lanes(episode.measurement, filled), memory)
             try:
                 mean, covariance, memory = answer
@@ -170,8 +170,10 @@ def run_estimator(
     _run_outside(task, start, update, seeds, record, tick)
 
 
-def chosen_lanes(part: Any, lanes: numpy.ndarray) -> Any:
-    """Return nested tuples of arrays with some entries of their last axis, each an array of its own."""
+def chosen_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
+    """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
+    entry, without that axis.
+    """
     if isinstance(part, tuple):
         parts = [chosen_lanes(item, lanes) for item in part]
         return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
@@ -179,7 +181,7 @@ def chosen_lanes(part: Any, lanes: numpy.ndarray) -> Any:
 
 
 @contextmanager
-def _told(what: str) -> Iterator[None]:
+def told(what: str) -> Iterator[None]:
     """Turn whatever somebody else's code raises into one sentence with the line that raised it."""
     try:
         yield

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.catalogue import baselines_of
-from ..envs.catalogue import catalogue, check_names, short_name, task_class
+from ..envs.catalogue import catalogue, check_names, make_task, short_name, task_class
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import whole_files, writable_file, writable_folder
 from ..evaluation.metrics import Record
@@ -49,7 +49,7 @@ def evaluate_policies(
     environment: Environment,
     policy: Annotated[
         list[str] | None,
-        typer.Option(help="Policy, reference or bound; repeat for several. Also module:Class."),
+        typer.Option(help="Policy, estimator, reference or bound; repeat for several. Also module:Class."),
     ] = None,
     scenario: ScenarioName = None,
     control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
@@ -76,8 +76,9 @@ def evaluate_policies(
     names = policy or list(known.benchmark or known.names)
     keywords = parsed_settings(settings or [])
     check_names(cls, keywords)
+    measurements = len(set(names)) * episodes * make_task(cls.id, control, scenario, **keywords).horizon
     with progress_bar() as bar:
-        line = bar.add_task("evaluating", total=None)
+        line = bar.add_task("evaluating", total=measurements)
         dataset = evaluate(
             cls.id,
             names,

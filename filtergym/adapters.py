@@ -1,0 +1,29 @@
+"""Adapters: filters of other libraries, and of one's own that know one track only, as estimators.
+
+See docs/own_estimator.md. ``pip install 'filtergym[adapters]'`` brings filterpy and Stone Soup.
+"""
+
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+from .evaluation.adapters import SingleTrackEstimator
+
+if TYPE_CHECKING:
+    from .evaluation.adapters import FilterpyEstimator
+    from .evaluation.stone_soup import StoneSoupEstimator
+
+__all__ = ["FilterpyEstimator", "SingleTrackEstimator", "StoneSoupEstimator"]
+
+LIBRARIES = {"FilterpyEstimator": ("filterpy", "adapters"), "StoneSoupEstimator": ("stonesoup", "stone_soup")}
+"""What an adapter needs, and its module."""
+
+
+def __getattr__(name: str) -> Any:
+    # On first use: who has one of the libraries does not need the other.
+    if name not in LIBRARIES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    library, module = LIBRARIES[name]
+    if importlib.util.find_spec(library) is None:
+        raise ImportError(f"{name} needs {library}: pip install {library}, or 'filtergym[adapters]'")
+    return getattr(importlib.import_module(f".evaluation.{module}", __package__), name)

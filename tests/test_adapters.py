@@ -1,0 +1,267 @@
+"""Filters of other libraries as estimators: filterpy and Stone Soup against ours, and every example of the page."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.maneuvering_target.estimators import KalmanModel
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.task import Initial
+from filtergym.evaluation.rollout import run_estimator
+from filtergym.filters import kalman
+
+import filtergym
+from filtergym import adapters
+from filtergym.adapters import SingleTrackEstimator
+
+ID = "filtergym/ManeuveringTarget-v0"
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+LIBRARIES = {"filterpy_filters": "filterpy", "autopilot_kalman": "filterpy", "stone_soup_kalman": "stonesoup"}
+"""What the examples need; `mine` needs nothing."""
+
+
+def example(name):
+    """Module of docs/examples."""
+    if name in LIBRARIES:
+        pytest.importorskip(LIBRARIES[name], reason=f"{LIBRARIES[name]} is in filtergym[adapters]")
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def estimates(maker, scenario="random", episodes=8, **keywords):
+    """Mean, (time, 4, episodes), and covariance over its largest entry, (time, 4, 4, episodes)."""
+    task, said = make_task(ID, scenario=scenario, **keywords), []
+
+    def record(episode):
+        said.append((task.mean(episode), task.covariance(episode)))
+
+    run_estimator(task, maker(task), range(episodes), record, lambda _: None)
+    means, covariances = map(np.stack, zip(*said, strict=True))
+    return means, covariances / abs(covariances).max(axis=(1, 2), keepdims=True)
+
+
+def compare(one, other, growth=1.0, **keywords):
+    """Assert equality up to rounding, of positions of some 10^4 m, and ``growth`` of it.
+
+    Covariances are relative to their largest entry.
+    """
+    (mean, covariance), (expected, theirs) = estimates(one, **keywords), estimates(other, **keywords)
+    np.testing.assert_allclose(mean[:, :2], expected[:, :2], rtol=0, atol=growth * 1e-10)  # m
+    np.testing.assert_allclose(mean[:, 2:], expected[:, 2:], rtol=0, atol=growth * 1e-11)  # m/s
+    np.testing.assert_allclose(covariance, theirs, rtol=0, atol=growth * 1e-14)
+
+
+class OurKalman(KalmanModel):
+    """filters/kalman.py over the model of the examples."""
+
+    def __init__(self, task):
+        super().__init__(task)
+        self.Q = 2.0**2 * self.unit_Q
+
+    def start(self, initial, N):
+        return initial.mean, initial.covariance
+
+    def update(self, measurement, memory):
+        predicted = kalman.predict(*memory, self.F, self.Q)
+        result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
+        return result.mean, result.covariance, (result.mean, result.covariance)
+
+
+class OurContinuousKalman(OurKalman):
+    """The same for acceleration that is white in continuous time, of 24 m^2/s^3."""
+
+    def __init__(self, task):
+        super().__init__(task)
+        T, identity = task.parameters.sampling_interval, np.eye(2)
+        third, half = T**3 / 3 * identity, T**2 / 2 * identity
+        self.Q = 24.0 * np.block([[third, half], [half, T * identity]])
+
+
+@pytest.mark.parametrize("scenario", ["random", "paper", "benchmark-s2"])
+def test_imm_of_filterpy_is_ours_at_every_step(scenario):
+    """An IMM amplifies rounding: 7e-10 m were the most in 32 flights of each scenario."""
+    ours = baselines_of(ID).estimators["kalman-imm"]
+    compare(example("filterpy_filters").Imm, ours, growth=20.0, scenario=scenario)
+
+
+def test_kalman_filters_are_ours():
+    filters = example("filterpy_filters")
+    compare(filters.Kalman, OurKalman)
+
+    class Extended(filters.Kalman):
+        """Of a linear measurement."""
+
+        def begin(self, initial):
+            ekf = filters.constant_velocity(filters.ExtendedKalmanFilter(4, 2), 6.0, 2.0)
+            ekf.x, ekf.P = initial.mean, initial.covariance
+            return ekf
+
+        def step(self, track, measurement):
+            z, R = self.reading(measurement)
+            track.predict()
+            track.update(z, lambda x: np.eye(2, 4), lambda x: x[:2], R)
+
+    compare(Extended, OurKalman)
+
+    class Unscented(filters.Kalman):
+        """Of a linear motion and measurement, and a state in another order."""
+
+        state = ("velocity_x", "position_x", "velocity_y", "position_y")
+
+        def begin(self, initial):
+            T, G = 6.0, np.array([6.0, 18.0])
+            F, Q = np.kron(np.eye(2), [[1.0, 0.0], [T, 1.0]]), np.kron(np.eye(2), 4.0 * np.outer(G, G))
+            points = filters.MerweScaledSigmaPoints(4, 1.0, 2.0, -1.0)
+            ukf = filters.UnscentedKalmanFilter(4, 2, T, lambda x: x[[1, 3]], lambda x, T: F @ x, points)
+            ukf.x, ukf.P, ukf.Q = initial.mean, initial.covariance, Q
+            return ukf
+
+    compare(Unscented, OurKalman, growth=20.0)  # sums over sigma points cancel
+
+
+def test_kalman_filter_of_stone_soup_is_ours():
+    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman)
+
+
+def test_plain_kalman_filter_of_the_page_is_ours():
+    compare(example("mine").Mine, OurKalman)
+
+
+def test_extended_filter_follows_a_radar_that_measures_range_and_azimuth():
+    filters = example("filterpy_filters")
+    makers = {"extended": filters.Extended, "kalman": filters.Kalman}
+    result = filtergym.evaluate(ID, makers, episodes=8, horizon=40, polar_measurements=True)
+    cost = result.cost.mean(["episode", "time"]).values
+    # At these ranges the two are nearly the same filter.
+    assert abs(cost[0] / cost[1] - 1.0) < 0.2
+
+
+@pytest.mark.parametrize("plant", ["U", "P"])
+def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
+    competitors = {"mine": example("autopilot_kalman").Kalman, "kalman": "kalman"}
+    result = filtergym.evaluate("UavAutopilot", competitors, episodes=3, horizon=150, plant=plant)
+    for name in ("error", "cost", "control_signal", "nees"):
+        mine, paper = result[name].values
+        np.testing.assert_allclose(mine, paper, rtol=1e-11, atol=1e-12, err_msg=name)
+
+
+def test_every_example_is_tried():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*LIBRARIES, "mine", "inverted_pendulum"}
+
+
+def test_unscented_filter_of_the_page_runs():
+    result = filtergym.evaluate(
+        ID, {"ukf": example("filterpy_filters").Unscented, "imm": "imm"}, episodes=2, horizon=20
+    )
+    assert np.isfinite(result.nees.values[0]).all()
+
+
+class Permuted(SingleTrackEstimator):
+    """Keeps the start, in an order of its own and with a number that nobody asks for."""
+
+    state = ("turn_rate", "velocity_y", "position_x", "position_y", "velocity_x")
+
+    def begin(self, initial):
+        self.began = initial
+        covariance = initial.covariance.copy()
+        covariance[0, 0] = 1.0
+        return [initial.mean, covariance]
+
+    def step(self, track, measurement):
+        track[0] = track[0] + 1.0  # in place, so that nothing is returned
+
+    def estimate(self, track):
+        return track
+
+
+def test_states_are_mapped_both_ways():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(4, 4))
+    initial = Initial(rng.normal(size=(4, 3)), np.repeat((root @ root.T)[:, :, None], 3, axis=-1))
+    estimator = Permuted(make_task(ID))
+    memory = estimator.start(initial, 3)
+    np.testing.assert_array_equal(estimator.began.mean, [0.0, *initial.mean[[3, 0, 1, 2], 2]])
+    np.testing.assert_array_equal(estimator.began.covariance[0], 0.0)
+    assert estimator.began.covariance[1, 4] == initial.covariance[3, 2, 2]
+
+    class Measured(NamedTuple):
+        position: np.ndarray
+
+    mean, covariance, memory = estimator.update(Measured(np.zeros((2, 3))), memory)
+    np.testing.assert_array_equal(mean, initial.mean + 1.0)
+    np.testing.assert_array_equal(covariance, initial.covariance)
+
+
+def test_a_state_that_does_not_fit_is_a_sentence():
+    class Lacking(Permuted):
+        state = ("position_x", "velocity_x", "position_y")
+
+    with pytest.raises(ValueError, match=r"the state of Lacking, .* lacks velocity_y of filtergym/Man"):
+        filtergym.evaluate(ID, {"mine": Lacking}, episodes=1, horizon=2)
+
+    class Wide(Permuted):
+        def estimate(self, track):
+            return np.zeros(6), np.eye(6)
+
+    with pytest.raises(
+        ValueError, match=r"Wide has 6 numbers and a covariance .* `state` names 5: turn_rate"
+    ):
+        filtergym.evaluate(ID, {"mine": Wide}, episodes=1, horizon=2)
+
+    class Elsewhere(Permuted):
+        state = ()
+
+        def begin(self, initial):
+            return [initial.mean, initial.covariance + np.eye(len(initial.mean))]
+
+        def step(self, track, measurement):
+            self.reading(measurement)
+
+    with pytest.raises(
+        ValueError, match=r"RadarEsmTracking-v0 measures scan, radar, .*: Elsewhere must say by a"
+    ):
+        filtergym.evaluate("RadarEsmTracking", {"mine": Elsewhere}, episodes=1, horizon=2)
+
+
+def test_without_a_measurement_filterpy_only_predicts():
+    filters = example("filterpy_filters")
+
+    class Deaf(filters.Kalman):
+        def reading(self, measurement):
+            return None, np.eye(2)
+
+    class Predicting(OurKalman):
+        def update(self, measurement, memory):
+            memory = kalman.predict(*memory, self.F, self.Q)
+            return *memory, memory
+
+    compare(Deaf, Predicting, horizon=5)
+
+
+@pytest.mark.parametrize(
+    ("library", "adapter"), [("stonesoup", "StoneSoupEstimator"), ("filterpy", "FilterpyEstimator")]
+)
+def test_a_library_that_is_not_installed_is_a_sentence(library, adapter, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, library, None)  # as if it were not there
+    with pytest.raises(
+        ImportError, match=rf"{adapter} needs {library}: pip install .*'filtergym\[adapters\]'"
+    ):
+        getattr(adapters, adapter)
+    (tmp_path / "wants_library.py").write_text(f"from filtergym.adapters import {adapter}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "wants_library", raising=False)
+    with pytest.raises(
+        ValueError, match=f"cannot load policy 'wants_library:Mine': ImportError: {adapter} needs"
+    ):
+        filtergym.evaluate(ID, ["wants_library:Mine"], episodes=1)
+
+
+def test_there_are_no_other_adapters():
+    with pytest.raises(AttributeError, match="no attribute 'PykalmanEstimator'"):
+        adapters.PykalmanEstimator  # noqa: B018

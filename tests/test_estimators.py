@@ -1,0 +1,260 @@
+"""An estimator that a user brings: the same noise, the same start, and a sentence for whatever goes wrong."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.catalogue import make_task
+from filtergym.evaluation import evaluate as evaluation
+
+import filtergym
+from filtergym.__main__ import main
+
+ID = "filtergym/ManeuveringTarget-v0"
+EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
+
+
+class Start:
+    """Reports the start for ever; where it is exact, with a variance of one."""
+
+    def start(self, initial, N):
+        assert N % 8 == 0
+        identity = np.eye(len(initial.mean))[:, :, None]
+        return initial.mean, initial.covariance + identity
+
+    def update(self, measurement, memory):
+        return *memory, memory
+
+
+class Recording(Start):
+    """Keeps what it was given and has said."""
+
+    def __init__(self, task):
+        self.task, self.said = task, []
+
+    def estimate(self, measurement, memory):
+        return memory[0]
+
+    def update(self, measurement, memory):
+        mean = self.estimate(measurement, memory)
+        self.said.append((measurement, mean))
+        return mean, memory[1], memory
+
+
+class Raw(Recording):
+    """UavAutopilot on raw readings, held during dropouts; zero for what no sensor reads."""
+
+    def estimate(self, measurement, memory):
+        mean = np.zeros_like(memory[0])
+        mean[list(self.task.measured)] = measurement.reading
+        return mean
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run the command line in a folder of one's own; returns exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(tmp_path))])
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return run
+
+
+def test_a_plain_estimator_works_everywhere(env_id, short):
+    paper = baselines_of(env_id).score_paper
+    told = []
+    result = filtergym.evaluate(
+        env_id, {"class": Start, "object": Start(), paper: paper}, episodes=3, progress=told.append, **short
+    )
+    assert result.kind.values.tolist() == ["estimator", "estimator", "policy"]
+    assert np.isfinite(result.error.values).all()
+    assert np.isfinite(result.cost.values).all()
+    assert np.isfinite(result.nees.values).all()
+    np.testing.assert_array_equal(result.error.values[0], result.error.values[1])
+    assert sum(told) == 3 * 3 * short["horizon"]
+    measured = {r.metric for r in filtergym.tidy_records(result) if r.policy == "class"}
+    assert {"cost", "nees", "relative_cost_difference"} <= measured
+
+
+def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
+    env, episodes = "filtergym/UavAutopilot-v0", 8
+    task = make_task(env)
+    competitors = {"start": Recording(task), "raw": Raw(task)}
+    result = filtergym.evaluate(env, competitors, episodes=episodes, horizon=100)
+    measured, noise, truths = list(task.measured), [], []
+    for name, recording in competitors.items():
+        measurements, means = zip(*recording.said, strict=True)
+        errors = result.error.sel(policy=name).transpose("time", "component", "episode").values
+        truth = np.stack(means) - errors
+        there = np.stack([m.available for m in measurements])
+        noise.append(there * (np.stack([m.reading for m in measurements]) - truth[:, measured]))
+        truths.append(truth)
+        # What it estimates is flown: the control that follows is in force until the next measurement.
+        commanded = [task.autopilot(mean, m.command) for m, mean in recording.said]
+        np.testing.assert_array_equal([m.control for m, _ in recording.said[1:]], commanded[:-1])
+    assert abs(truths[0] - truths[1]).max() > 1.0
+    # Rounding of truths of some hundred degrees.
+    np.testing.assert_allclose(noise[0], noise[1], rtol=0, atol=1e-11)
+
+
+def wrong_at(step, lane, change):
+    """An estimator whose answer is wrong once."""
+
+    class Wrong(Start):
+        def start(self, initial, N):
+            return (*super().start(initial, N), 0)
+
+        def update(self, measurement, memory):
+            mean, covariance, k = memory
+            k += 1
+            said = mean.copy(), covariance.copy()
+            if k == step:
+                said = change(*said, lane) or said
+            return *said, (mean, covariance, k)
+
+    return Wrong
+
+
+def set_mean(mean, covariance, lane):
+    mean[1, lane] = np.nan
+
+
+def set_covariance(mean, covariance, lane):
+    covariance[0, 0, lane] = np.inf
+
+
+def make_indefinite(mean, covariance, lane):
+    covariance[0, 1, lane] = covariance[1, 0, lane] = 2.0 * np.sqrt(
+        covariance[0, 0, lane] * covariance[1, 1, lane]
+    )
+
+
+def make_semidefinite(mean, covariance, lane):
+    covariance[:, :, lane] = 0.0
+
+
+def make_asymmetric(mean, covariance, lane):
+    covariance[0, 1, lane] += 0.01 * np.sqrt(covariance[0, 0, lane] * covariance[1, 1, lane])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (set_mean, "the mean is not finite in episode {} at measurement 3"),
+        (set_covariance, "the covariance is not finite in episode {} at measurement 3"),
+        (make_indefinite, "the covariance is not positive definite in episode {} at measurement 3"),
+        (make_semidefinite, "the covariance is not positive definite in episode {} at measurement 3"),
+        (make_asymmetric, "the covariance is not symmetric in episode {} at measurement 3"),
+        (lambda m, P, _: (m[:3], P), r"the mean at measurement 3 must have shape \(4, 16\), 4 components"),
+        (lambda m, P, _: (m, P[0]), r"the covariance at measurement 3 must have shape \(4, 4, 16\)"),
+        (lambda m, P, _: ("north", P), "the mean at measurement 3 is no array"),
+    ],
+)
+def test_a_wrong_answer_is_named_with_episode_and_measurement(change, message):
+    wrong = wrong_at(3, 9, change)
+    with pytest.raises(ValueError, match=f"estimator 'mine': {message.format(9)}"):
+        filtergym.evaluate(ID, {"mine": wrong}, episodes=12, horizon=5)
+
+
+def test_episodes_are_counted_over_all_chunks(monkeypatch):
+    monkeypatch.setattr(evaluation, "CHUNK", 8)
+    chunks = []
+
+    class Late(Start):
+        def start(self, initial, N):
+            chunks.append(N)
+            return super().start(initial, N)
+
+        def update(self, measurement, memory):
+            mean = memory[0].copy()
+            if len(chunks) == 2:
+                mean[0, 3] = np.nan
+            return mean, memory[1], memory
+
+    with pytest.raises(ValueError, match="in episode 11 at measurement 1"):
+        filtergym.evaluate(ID, {"mine": Late}, episodes=20, horizon=3)
+
+
+def test_an_estimate_in_place_of_three_is_refused():
+    class Short(Start):
+        def update(self, measurement, memory):
+            return memory[0]
+
+    with pytest.raises(ValueError, match="must return mean, covariance and memory"):
+        filtergym.evaluate(ID, {"mine": Short}, episodes=2, horizon=3)
+
+
+RAISING = """class AtUpdate:
+    def start(self, initial, N):
+        return initial
+    def update(self, measurement, memory):
+        return self.gain(measurement)
+    def gain(self, measurement):
+        return measurement.doppler
+
+
+class AtStart(AtUpdate):
+    def start(self, initial, N):
+        return {}["lost"]
+
+
+class AtBirth(AtUpdate):
+    def __init__(self, task):
+        1 / 0
+
+
+class Nothing:
+    pass
+"""
+
+
+def test_what_an_estimator_raises_is_told_with_its_own_line(command, monkeypatch):
+    monkeypatch.delitem(sys.modules, "raising", raising=False)
+    Path("raising.py").write_text(RAISING)
+    words = ("evaluate", ID, "--episodes", 2, "--set", "horizon=3", "--policy")
+    for name, message in (
+        (
+            "AtUpdate",
+            "failed at measurement 1: AttributeError: 'Measurement' object has no attribute 'doppler'",
+        ),
+        ("AtStart", "failed at the start of the track: KeyError: 'lost'"),
+        ("AtBirth", "cannot be made: ZeroDivisionError: division by zero"),
+    ):
+        code, _, errors = command(*words, f"raising:{name}")
+        assert (code, errors.count("\n")) == (2, 1), errors
+        assert f"estimator 'raising:{name}' {message}" in errors
+        line = {"AtUpdate": 7, "AtStart": 12, "AtBirth": 17}[name]
+        assert errors.rstrip().endswith(f"(raising.py, line {line})")
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words), f"raising:{name}", "--debug"])
+        with pytest.raises(ValueError, match=name) as caught:
+            main()
+        assert caught.value.__cause__ is not None
+    code, _, errors = command(*words, "raising:Nothing")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert "an estimator the methods start and update" in errors
+
+
+@pytest.mark.parametrize("name", ["imm", "kalman-imm", "known-turn", "imm-tuned", "bptt"])
+def test_a_name_that_is_taken_is_refused(name):
+    with pytest.raises(ValueError, match=f"'{name}' is the name of what {ID} has already"):
+        filtergym.evaluate(ID, {name: Start}, episodes=2, horizon=3)
+
+
+def test_a_class_of_ones_own_is_found_from_the_working_directory(command, monkeypatch):
+    """The example of the page, as the page runs it."""
+    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    monkeypatch.chdir(EXAMPLES)
+    assert len(Path("mine.py").read_text().splitlines()) < 35
+    words = [word for name in ("mine:Mine", "imm", "bptt", "known-turn") for word in ("--policy", name)]
+    code, output, errors = command("evaluate", ID, "--episodes", 3, "--set", "horizon=10", *words)
+    assert code == 0, errors
+    [row] = [line for line in output.splitlines() if "mine:Mine" in line]
+    assert "(estimator)" in row
+    monkeypatch.delitem(sys.modules, "mine")
