@@ -1,7 +1,7 @@
 """No held-out flight can be learned by heart: what is a function of the step number alone wins little.
 
 The strongest such schedule of gains is found by gradient through the filter, on training episodes of the very scenario.
-Here with few of them; ``python tests/test_open_loop.py`` does it thoroughly for every held-out scenario of ManeuveringTarget.
+Here with few of them; ``python tests/test_open_loop.py`` does it thoroughly for all held-out flights and ``paper``.
 """
 
 import sys
