@@ -102,9 +102,10 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
                 yield Measure(
                     "mean_error", component, window, bootstrap.estimate(signed[:, times].mean(axis=1)), unit
                 )
-    if not is_bound:
-        for window, times in slices.items():
-            yield from _consistency(run.isel(time=times), window, bootstrap)
+    for metric in ("nees", "nis"):
+        if metric in run and not numpy.isnan(run[metric].values).all():
+            for window, times in slices.items():
+                yield from _consistency(run.isel(time=times), metric, window, bootstrap)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             probability = run["mode_probability"].sel(mode=mode).values
@@ -120,22 +121,19 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         yield Measure("beyond_huber_bound", "", "all", bootstrap.estimate(beyond), "1")
 
 
-def _consistency(run: xarray.Dataset, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
+def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
 
     The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
     interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
     """
-    for metric, component in (("nees", "state"), ("nis", "measurement")):
-        if metric not in run or numpy.isnan(run[metric].values).all():
-            continue
-        values = run[metric].values
-        degrees = consistency_degrees(run, metric)
-        normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
-        yield Measure(f"a{metric}", component, window, mean_of_present(normalised, bootstrap), "1")
-        low, high = chi_square_band(degrees)
-        inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
-        yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
+    component = "state" if metric == "nees" else "measurement"
+    values, degrees = run[metric].values, consistency_degrees(run, metric)
+    normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
+    yield Measure(f"a{metric}", component, window, mean_of_present(normalised, bootstrap), "1")
+    low, high = chi_square_band(degrees)
+    inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
+    yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
 
 
 def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:

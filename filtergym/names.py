@@ -82,7 +82,7 @@ def evaluate(
     named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
     id = task_class(env).id
     for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
-        if named[name] != name:
+        if named[name] not in (name, competitor(id, name)):
             raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
     objects = {
         name: competitor(env, entry, trust=trust) if isinstance(entry, str) else entry

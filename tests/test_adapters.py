@@ -83,7 +83,7 @@ class OurContinuousKalman(OurKalman):
         self.Q = 24.0 * np.block([[third, half], [half, T * identity]])
 
 
-@pytest.mark.parametrize("scenario", ["random", "paper", "benchmark-s2"])
+@pytest.mark.parametrize("scenario", ["random", "paper", "cruise"])
 def test_imm_of_filterpy_is_ours_at_every_step(scenario):
     """An IMM amplifies rounding: 7e-10 m were the most in 32 flights of each scenario."""
     ours = baselines_of(ID).estimators["kalman-imm"]

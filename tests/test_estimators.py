@@ -80,7 +80,7 @@ def test_a_plain_estimator_works_everywhere(env_id, short):
     np.testing.assert_array_equal(result.error.values[0], result.error.values[1])
     assert sum(told) == 3 * 3 * short["horizon"]
     measured = {r.metric for r in filtergym.tidy_records(result) if r.policy == "class"}
-    assert {"cost", "nees", "relative_cost_difference"} <= measured
+    assert {"cost", "anees", "relative_cost_difference"} <= measured
 
 
 def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from filtergym.envs.backend import array_backend
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.lanes import Lanes
 from filtergym.evaluation.competitors import Policy
@@ -22,7 +23,8 @@ def best_schedule(scenario, episodes, iterations):
     """Actions by step number that cost least on average over training episodes, ``(decisions, actions)``."""
     import torch
 
-    task = make_task(ID, "gain", scenario, torch)
+    xp, device = array_backend("torch", None)
+    task = make_task(ID, "gain", scenario, xp, device)
     seeds = episode_seeds("train", 0, episodes)
     decisions = task.horizon // task.decision_interval
     actions = torch.zeros((decisions, task.action_space.shape[0]), dtype=torch.float64, requires_grad=True)

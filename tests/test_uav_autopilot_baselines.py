@@ -307,8 +307,8 @@ def test_adaptive_policy_follows_gusts_and_is_misled_by_a_worse_sensor() -> None
     for scenario in ("gust-front", "sensor-degradation"):
         seen.clear()
         dataset = evaluate(ID, {"kalman": module.Kalman, "watched": Watched}, scenario, 50)
-        assert numpy.mean(seen[300:]) > numpy.mean(seen[100:199]) + 0.02
-        after = dataset["cost"].values[:, :, 300:].mean(axis=2)
+        assert numpy.mean(seen[400:]) > numpy.mean(seen[50:149]) + 0.02
+        after = dataset["cost"].values[:, :, 400:].mean(axis=2)
         difference = after[1] - after[0]
         t = difference.mean() / (difference.std(ddof=1) / math.sqrt(50))
         assert t < -4.0 if scenario == "gust-front" else t > 4.0

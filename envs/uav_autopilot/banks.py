@@ -292,10 +292,13 @@ class GainBank(_AutopilotFilter):
         return shown, xp.exp(shown[0] * (self.parameters.gain_decades * math.log(10.0)))
 
     def covariance(self, state: Filter) -> Array:
-        """Covariance of the filter, times the short average of the NIS where that is above one: the filter itself is
-        told neither of the noise nor whether the action is right about it.
+        """Covariance of the filter, when it is steered times the short average of the NIS where that is above one.
+
+        Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter with
+        the paper's covariance.
         """
-        return super().covariance(state) * self.xp.clip(state.mean_nis, 1.0, None)
+        told = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
+        return super().covariance(state) * told
 
 
 class ModeBank(_AutopilotFilter):
