@@ -4,7 +4,20 @@ import inspect
 
 import numpy as np
 import pytest
-from filtergym.filters import alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices
+from filtergym.filters import (
+    alpha_beta,
+    bounds,
+    coordinated_turn,
+    gaussian,
+    imm,
+    kalman,
+    noise_adaptation,
+    ordered_sums,
+    polar,
+    predicted_covariance,
+    small_matrices,
+    unscented,
+)
 
 torch = pytest.importorskip("torch")
 
@@ -30,7 +43,11 @@ S2, X4, P4, Z2 = (
     rng.normal(size=(2, N)),
 )
 F4, Q4, H24, R2 = rng.normal(size=(4, 4)), positive_definite(4), rng.normal(size=(2, 4)), positive_definite(2)
+X5, P5 = rng.normal(size=(5, N)), positive_definite(5, N)
 ALPHA, BETA = rng.uniform(0.1, 0.9, N), rng.uniform(0.1, 0.9, N)
+LEVEL = noise_adaptation.Level(np.abs(Z2) + 0.5, np.abs(Z2) + 1.0)
+WINDOW = rng.normal(size=(3, 2, N))
+THERE = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 
 CALLS = [
     (alpha_beta.benedict_bordner_beta, (ALPHA,)),
@@ -47,6 +64,10 @@ CALLS = [
     (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
     (bounds.predicted_bound, (P4, F4[..., None], Q4[..., None])),
     (bounds.posterior_cramer_rao_bound, (P4, H24, R2)),
+    (coordinated_turn.turned, (X5, 0.7)),
+    (coordinated_turn.jacobian, (X5, 0.7)),
+    (coordinated_turn.predict, (X5, P5, 0.7, P5)),
+    (coordinated_turn.augmented, (X4, P4, 0.1)),
     (gaussian.log_density, (Z2, S2)),
     (imm.predict_mode_probabilities, (TRANSITION, MU)),
     (imm.predict_mode_probabilities, (np.array([[1.0, 0.0, 0.0]] * 3), MU)),
@@ -57,15 +78,30 @@ CALLS = [
     (imm.mode_posterior, (np.log(MU), -1e5 + MEANS[0])),
     (kalman.predict, (X4, P4, F4, Q4, X4)),
     (kalman.update, (X4, P4, Z2, H24, R2)),
+    (noise_adaptation.faded, (LEVEL, Z2, 0.9, THERE)),
+    (noise_adaptation.sage_husa, (LEVEL, Z2, LEVEL.value, 0.9, 0.1, THERE)),
+    (noise_adaptation.sage_husa_positive, (LEVEL, Z2, LEVEL.value, 0.9, THERE)),
+    (noise_adaptation.process_noise_factor, (Z2, LEVEL.value, LEVEL.weight, LEVEL.value)),
+    (noise_adaptation.start_window, (Z2, 3)),
+    (noise_adaptation.mehra, (WINDOW, Z2, LEVEL.value, 0.1, THERE)),
+    (noise_adaptation.mehra, (WINDOW, Z2, LEVEL.value, 0.1)),
+    (noise_adaptation.forget, (noise_adaptation.InverseGamma(*LEVEL), 0.9, THERE)),
+    (
+        noise_adaptation.variational_bayes,
+        (noise_adaptation.InverseGamma(*LEVEL), lambda R: (R, R, R), 2, THERE),
+    ),
     (ordered_sums.ordered_sum, (MU,)),
     (ordered_sums.weighted_sum, (MU, COVARIANCES)),
     (polar.cartesian_variances, (1e4 * Z2, 100.0, 0.004)),
+    (predicted_covariance.update, (X4, P4, Z2, H24, R2, 2.0, 3)),
     (small_matrices.product, (P4, P4)),
     (small_matrices.apply, (P4, X4)),
     (small_matrices.transpose, (P4,)),
     (small_matrices.outer, (X4, X4)),
     (small_matrices.cholesky, (P4,)),
     (small_matrices.solve_lower, (small_matrices.cholesky(P4), X4)),
+    (unscented.sigma_points, (X5, P5)),
+    (unscented.transform, (X5, P5, lambda points: points * points)),
 ]
 
 
@@ -114,7 +150,21 @@ def test_gradients_pass_through_every_function():
 
 
 @pytest.mark.parametrize(
-    "module", [alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices]
+    "module",
+    [
+        alpha_beta,
+        bounds,
+        coordinated_turn,
+        gaussian,
+        imm,
+        kalman,
+        noise_adaptation,
+        ordered_sums,
+        polar,
+        predicted_covariance,
+        small_matrices,
+        unscented,
+    ],
 )
 def test_no_function_is_forgotten(module):
     public = {
@@ -123,4 +173,5 @@ def test_no_function_is_forgotten(module):
         if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
     }
     called = {function.__name__ for function, _ in CALLS if function.__module__ == module.__name__}
-    assert public - called <= {"white_acceleration"}  # plain numbers in, nested lists out
+    # Plain numbers in, nested lists out.
+    assert public - called <= {"white_acceleration", "process_noise", "weights"}

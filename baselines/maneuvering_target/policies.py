@@ -15,8 +15,9 @@ from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, Tunable
-from .estimators import KalmanInteractingMultipleModel
 from .references import KnownInputBound, KnownTurn
+from .tunable_estimators import ESTIMATORS
+from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
 
 
 class InteractingMultipleModel(Policy):
@@ -188,6 +189,7 @@ TUNABLE = {
         {"alpha": 0.65},
         lambda values: ({}, lambda task: FixedBest(task, values["alpha"])),
     ),
+    **TUNABLE_ESTIMATORS,
 }
 
 BASELINES = Baselines(
@@ -203,7 +205,7 @@ BASELINES = Baselines(
         "fixed-best": FixedBest,
         "random": RandomPolicy,
     },
-    estimators={"kalman-imm": KalmanInteractingMultipleModel},
+    estimators=ESTIMATORS,
     references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
@@ -220,7 +222,7 @@ BASELINES = Baselines(
         "hard-imm",
         "random",
         "known-turn",
-        "kalman-imm",
+        *ESTIMATORS,
         "known-input-bound",
     ),
 )

@@ -1,0 +1,154 @@
+"""Single Kalman filters of constant velocity that estimate their noise from the innovations."""
+
+from typing import NamedTuple
+
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.world import Measurement
+from ...envs.observation import Array
+from ...envs.task import Initial
+from ...filters import kalman, noise_adaptation, predicted_covariance
+from .estimators import KalmanModel
+
+
+class ProcessNoiseTrack(NamedTuple):
+    """Memory of a filter that estimates its process noise."""
+
+    mean: Array
+    covariance: Array
+    level: noise_adaptation.Level
+
+
+class SageHusa(KalmanModel):
+    """A Kalman filter that estimates its acceleration noise from its own corrections (Sage and Husa 1969).
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration at the start, m/s^2.
+        forgetting: weight of the past against one scan less of it.
+        least: smallest standard deviation of the acceleration, m/s^2.
+    """
+
+    kind = "estimator"
+
+    def __init__(
+        self, task: ManeuveringTarget, acceleration: float = 1.0, forgetting: float = 0.9, least: float = 0.1
+    ) -> None:
+        super().__init__(task)
+        self.variance, self.forgetting, self.least = acceleration**2, forgetting, least**2
+
+    def start(self, initial: Initial, N: int) -> ProcessNoiseTrack:
+        """Start where everyone starts."""
+        nothing = 0.0 * initial.mean[0]
+        level = noise_adaptation.Level(self.variance + nothing, 1.0 + nothing)
+        return ProcessNoiseTrack(initial.mean, initial.covariance, level)
+
+    def update(
+        self, measurement: Measurement, memory: ProcessNoiseTrack
+    ) -> tuple[Array, Array, ProcessNoiseTrack]:
+        """Predict with the noise estimated so far, update, and estimate it anew."""
+        mean, carried = kalman.predict(memory.mean, memory.covariance, self.F, 0.0 * self.unit_Q)
+        predicted = carried + self.unit_Q[:, :, None] * memory.level.value
+        result = self.updated((mean, predicted), measurement)
+        sample = noise_adaptation.process_noise_factor(
+            result.mean - mean,
+            *(self.diagonal(P) for P in (result.covariance, carried, self.unit_Q[:, :, None])),
+        )
+        level = noise_adaptation.faded(memory.level, sample, self.forgetting)
+        level = level._replace(value=self.xp.clip(level.value, self.least, None))
+        return result.mean, result.covariance, ProcessNoiseTrack(result.mean, result.covariance, level)
+
+    def diagonal(self, covariance: Array) -> Array:
+        """Variances, ``(4, N)``."""
+        return self.xp.stack([covariance[i, i] for i in range(4)])
+
+
+class MeasurementNoiseTrack(NamedTuple):
+    """Memory of a filter that estimates its measurement noise."""
+
+    mean: Array
+    covariance: Array
+    noise: noise_adaptation.InverseGamma
+
+
+class VariationalBayes(KalmanModel):
+    """A Kalman filter that estimates its measurement noise by variational Bayes (Särkkä and Nummenmaa 2009).
+
+    What is estimated along x and y is the factor by which the radar's variance is wrong.
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration, m/s^2.
+        forgetting: rho, the share of what is known that lasts another scan.
+        shape: half the number of measurements for which the radar's own variance stands at the start.
+    """
+
+    kind = "estimator"
+    iterations = 3
+
+    def __init__(
+        self,
+        task: ManeuveringTarget,
+        acceleration: float = 2.775,
+        forgetting: float = 0.95,
+        shape: float = 5.0,
+    ) -> None:
+        super().__init__(task)
+        self.Q, self.forgetting, self.shape = acceleration**2 * self.unit_Q, forgetting, shape
+
+    def start(self, initial: Initial, N: int) -> MeasurementNoiseTrack:
+        """Start where everyone starts, and believe the radar."""
+        shape = self.shape + 0.0 * initial.mean[:2]
+        return MeasurementNoiseTrack(
+            initial.mean, initial.covariance, noise_adaptation.InverseGamma(shape, shape)
+        )
+
+    def update(
+        self, measurement: Measurement, memory: MeasurementNoiseTrack
+    ) -> tuple[Array, Array, MeasurementNoiseTrack]:
+        """Predict, and update state and noise together."""
+        xp, variance = self.xp, measurement.variance
+        predicted = kalman.predict(memory.mean, memory.covariance, self.F, self.Q)
+
+        def update(factor: Array) -> tuple[Array, Array, kalman.Update]:
+            result = self.updated(predicted, measurement._replace(variance=factor * variance))
+            updated = xp.stack([result.covariance[0, 0], result.covariance[1, 1]])
+            residual = measurement.position - result.mean[:2]
+            return residual / xp.sqrt(variance), updated / variance, result
+
+        noise, result = noise_adaptation.variational_bayes(
+            noise_adaptation.forget(memory.noise, self.forgetting), update, self.iterations
+        )
+        return result.mean, result.covariance, MeasurementNoiseTrack(result.mean, result.covariance, noise)
+
+
+class VariationalBayesPrediction(KalmanModel):
+    """A Kalman filter that estimates the covariance of its prediction by variational Bayes (Huang and others 2018).
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration in the nominal prediction, m/s^2.
+        strength: measurements for which the nominal prediction's covariance stands.
+    """
+
+    kind = "estimator"
+    iterations = 10
+
+    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, strength: float = 3.0) -> None:
+        super().__init__(task)
+        self.Q, self.strength = acceleration**2 * self.unit_Q, strength
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts."""
+        return initial
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial]:
+        """Predict, and update state and predicted covariance together."""
+        result = predicted_covariance.update(
+            *kalman.predict(memory.mean, memory.covariance, self.F, self.Q),
+            measurement.position,
+            self.H,
+            self.identity * measurement.variance,
+            self.strength,
+            self.iterations,
+        )
+        return result.mean, result.covariance, Initial(result.mean, result.covariance)

@@ -1,0 +1,93 @@
+r"""The scaled unscented transform: mean and covariance of a function of a Gaussian variable.
+
+2n + 1 sigma points carry mean and covariance through the function, which is never differentiated:
+
+    lambda = alpha^2 (n + kappa) - n,  L L^T = (n + lambda) P
+    X_0 = x,  X_i = x + L_i,  X_{n+i} = x - L_i       (L_i: column i of L)
+    W_0 = lambda / (n + lambda),  W_i = 1 / (2 (n + lambda)),  W_0^c = W_0 + 1 - alpha^2 + beta
+    y = sum W_i f(X_i),  P_y = sum W_i^c (f(X_i) - y)(f(X_i) - y)^T
+
+S. J. Julier, The scaled unscented transformation, Proc. American Control Conference (2002), 4555-4559; E. A. Wan and
+R. van der Merwe, The unscented Kalman filter, chapter 7 of S. Haykin, Kalman Filtering and Neural Networks (2001).
+With alpha = 1 and kappa = 0 no weight is negative, so the covariance cannot lose its definiteness.
+
+Shapes: means ``(n, ...)``, covariances ``(n, n, ...)``, batch last.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
+from .small_matrices import cholesky, outer
+
+
+class Spread(NamedTuple):
+    """Parameters of the transform."""
+
+    alpha: float = 1.0
+    """How far the points lie from the mean."""
+    beta: float = 2.0
+    """What is known of the fourth moments; 2 is best for a Gaussian variable."""
+    kappa: float = 0.0
+    """Second scaling; 3 - n is Julier's first choice."""
+
+
+GAUSSIAN = Spread()
+
+
+def sigma_points(mean: Array, covariance: Array, spread: Spread = GAUSSIAN) -> Array:
+    """Sigma points in order: the mean, then the columns of the root added, then subtracted, ``(n, 2n + 1, ...)``.
+
+    Args:
+        mean: ``(n, ...)``.
+        covariance: ``(n, n, ...)``, positive definite.
+        spread: parameters of the transform.
+    """
+    xp = namespace(mean)
+    n = mean.shape[0]
+    scale = spread.alpha * (n + spread.kappa) ** 0.5
+    L, zero = cholesky(covariance), 0.0 * mean[0]
+    columns = [xp.stack([scale * L[i][j] if j <= i else zero for i in range(n)]) for j in range(n)]
+    return xp.stack(
+        [mean, *(mean + column for column in columns), *(mean - column for column in columns)], axis=1
+    )
+
+
+def weights(n: int, spread: Spread = GAUSSIAN) -> tuple[list[float], list[float]]:
+    """Weights of the points for the mean and for the covariance, 2n + 1 each.
+
+    Args:
+        n: dimension of the variable.
+        spread: parameters of the transform.
+    """
+    total = spread.alpha**2 * (n + spread.kappa)
+    others = [0.5 / total] * (2 * n)
+    first = (total - n) / total
+    return [first, *others], [first + 1.0 - spread.alpha**2 + spread.beta, *others]
+
+
+def transform(
+    mean: Array, covariance: Array, function: Callable[[Array], Array], spread: Spread = GAUSSIAN
+) -> tuple[Array, Array]:
+    """Mean and covariance of a function of a Gaussian variable.
+
+    Args:
+        mean: ``(n, ...)``.
+        covariance: ``(n, n, ...)``, positive definite.
+        function: from points ``(n, 2n + 1, ...)`` to ``(m, 2n + 1, ...)``.
+        spread: parameters of the transform.
+
+    Returns:
+        ``(m, ...)`` and ``(m, m, ...)``.
+    """
+    points = function(sigma_points(mean, covariance, spread))
+    for_mean, for_covariance = weights(mean.shape[0], spread)
+    first = points[:, 0]
+    # The weights sum to one, and with a small alpha they are large: differences lose fewer digits than points.
+    shift = ordered_sum(w * (points[:, i] - first) for i, w in enumerate(for_mean) if i)
+    differences = (points[:, i] - first - shift for i in range(len(for_mean)))
+    spread_out = ordered_sum(
+        w * outer(difference, difference) for w, difference in zip(for_covariance, differences, strict=True)
+    )
+    return first + shift, spread_out

@@ -1,0 +1,261 @@
+"""The estimators of ManeuveringTarget against filterpy and naive loops over one episode's matrices."""
+
+import math
+
+import numpy as np
+import pytest
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.maneuvering_target.adaptive_estimators import (
+    SageHusa,
+    VariationalBayes,
+    VariationalBayesPrediction,
+)
+from filtergym.baselines.maneuvering_target.estimators import (
+    KalmanInteractingMultipleModel,
+    KalmanTurnInteractingMultipleModel,
+    UnscentedTurn,
+)
+from filtergym.baselines.tuning import mean_cost, tuned_names
+from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.rollout import run_estimator
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.filters import coordinated_turn
+from scipy.stats import multivariate_normal
+
+from filtergym import evaluate
+
+ID = "filtergym/ManeuveringTarget-v0"
+T, LANES = 6.0, 8
+F = np.kron([[1.0, T], [0.0, 1.0]], np.eye(2))
+UNIT_Q = np.kron(np.outer([T**2 / 2, T], [T**2 / 2, T]), np.eye(2))
+H, H5 = np.eye(2, 4), np.eye(2, 5)
+
+
+@pytest.fixture(scope="module")
+def task():
+    return make_task(ID, None, "random")
+
+
+def estimates(task, estimator, horizon=100):
+    """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
+    given, answers = [], []
+
+    class Watched:
+        def start(self, initial, N):
+            given.append(initial)
+            return estimator.start(initial, N)
+
+        def update(self, measurement, memory):
+            *answer, memory = estimator.update(measurement, memory)
+            given.append(measurement)
+            answers.append(answer)
+            return *answer, memory
+
+    run_estimator(task, Watched(), episode_seeds("train", 3, LANES), lambda _: None, lambda _: None)
+    return given[0], given[1:], *map(np.array, zip(*answers, strict=True))
+
+
+def compare(task, estimator, naive, rtol=1e-9):
+    """Every mean and covariance of three episodes with those of a naive recursion."""
+    initial, measurements, means, covariances = estimates(task, estimator)
+    for b in range(3):
+        track = naive(initial.mean[:, b], initial.covariance[..., b])
+        next(track)
+        for k, m in enumerate(measurements):
+            x, P = track.send((m.position[:, b], np.diag(m.variance[:, b])))
+            # Some 20 km, and rounding that filters of long memory keep.
+            np.testing.assert_allclose(means[k, :, b], x, rtol=rtol, atol=1e4 * rtol)
+            np.testing.assert_allclose(covariances[k, ..., b], P, rtol=10 * rtol, atol=1e4 * rtol)
+
+
+def kalman_update(x, P, z, R, matrix=H):
+    S = matrix @ P @ matrix.T + R
+    K = P @ matrix.T @ np.linalg.inv(S)
+    likelihood = multivariate_normal.logpdf(z, matrix @ x, S)
+    return x + K @ (z - matrix @ x), P - K @ S @ K.T, likelihood
+
+
+def padded(x, P, variance):
+    """With a turn rate of mean zero, independent of the rest."""
+    P5 = np.zeros((5, 5))
+    P5[:4, :4], P5[4, 4] = P, variance
+    return np.append(x, 0.0), P5
+
+
+def naive_imm_turn(accelerations, start_rate, change, stay):
+    """Equations of the IMM paper, mixed in five states."""
+    variance = math.radians(start_rate) ** 2
+    Q5 = np.zeros((5, 5))
+    Q5[:4, :4] = accelerations[2] ** 2 * UNIT_Q
+    Q5[4, 4] = math.radians(change) ** 2
+    transition = [[stay[i] if i == j else (1 - stay[i]) / 2 for j in range(3)] for i in range(3)]
+
+    def track(x, P):
+        bank = [padded(x, P, variance)] * 3
+        mu = np.array([1 / (1 - s) for s in stay])
+        mu = mu / mu.sum()
+        z, R = yield
+        while True:
+            predicted = mu @ transition
+            updated, log_weights = [], []
+            for j in range(3):
+                w = [transition[i][j] * mu[i] / predicted[j] for i in range(3)]
+                x = sum(w[i] * bank[i][0] for i in range(3))
+                P = sum(w[i] * (bank[i][1] + np.outer(bank[i][0] - x, bank[i][0] - x)) for i in range(3))
+                if j < 2:
+                    x, P = F @ x[:4], F @ P[:4, :4] @ F.T + accelerations[j] ** 2 * UNIT_Q
+                    x, P, likelihood = kalman_update(x, P, z, R)
+                    x, P = padded(x, P, variance)
+                else:
+                    A = coordinated_turn.jacobian(x, T)
+                    x, P = coordinated_turn.turned(x, T), A @ P @ A.T + Q5
+                    x, P, likelihood = kalman_update(x, P, z, R, H5)
+                updated.append((x, P))
+                log_weights.append(math.log(predicted[j]) + likelihood)
+            bank = updated
+            mu = np.exp(np.array(log_weights) - max(log_weights))
+            mu = mu / mu.sum()
+            x = sum(mu[j] * bank[j][0] for j in range(3))
+            P = sum(mu[j] * (bank[j][1] + np.outer(bank[j][0] - x, bank[j][0] - x)) for j in range(3))
+            z, R = yield x[:4], P[:4, :4]
+
+    return track
+
+
+def test_imm_with_a_turn_equals_naive_loops(task):
+    values = ((0.1, 4.0, 0.5), 1.5, 0.4, (0.97, 0.8, 0.9))
+    compare(task, KalmanTurnInteractingMultipleModel(task, *values), naive_imm_turn(*values), rtol=1e-8)
+
+
+@pytest.mark.parametrize("stay", [(0.9, 0.9), (0.98, 0.6, 0.8)])
+def test_modes_start_as_the_chain_leaves_them(task, stay):
+    accelerations = (0.1,) * len(stay)
+    estimator = KalmanInteractingMultipleModel(task, accelerations, stay)
+    np.testing.assert_allclose(estimator.transition.sum(axis=1), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(estimator.probabilities.sum(), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(
+        estimator.probabilities @ estimator.transition, estimator.probabilities, rtol=1e-14
+    )
+
+
+def test_imm_equals_filterpys(task):
+    filterpy = pytest.importorskip("filterpy.kalman")
+    sigmas, stay = (0.2, 4.0), (0.98, 0.9)
+
+    def track(x, P):
+        filters = []
+        for sigma in sigmas:
+            one = filterpy.KalmanFilter(dim_x=4, dim_z=2)
+            one.x, one.P, one.F, one.H, one.Q = x.copy(), P.copy(), F, H, sigma**2 * UNIT_Q
+            filters.append(one)
+        mu = [1 / (1 - s) for s in stay]
+        transition = np.array([[stay[0], 1 - stay[0]], [1 - stay[1], stay[1]]])
+        peer = filterpy.IMMEstimator(filters, np.array(mu) / sum(mu), transition)
+        z, R = yield
+        while True:
+            for one in filters:
+                one.R = R
+            peer.predict()
+            peer.update(z)
+            z, R = yield peer.x, peer.P
+
+    compare(task, KalmanInteractingMultipleModel(task, sigmas, stay), track, rtol=1e-8)
+
+
+def test_unscented_filter_equals_filterpys(task):
+    filterpy = pytest.importorskip("filterpy.kalman")
+    acceleration, change, start_rate = 0.5, 0.4, 1.5
+    Q = np.array(coordinated_turn.process_noise(T, acceleration, math.radians(change) / T))
+
+    def track(x, P):
+        points = filterpy.MerweScaledSigmaPoints(5, alpha=1.0, beta=2.0, kappa=0.0)
+        peer = filterpy.UnscentedKalmanFilter(
+            5, 2, T, hx=lambda s: s[:2], fx=coordinated_turn.turned, points=points
+        )
+        peer.x, peer.P = padded(x, P, math.radians(start_rate) ** 2)
+        peer.Q = Q
+        z, R = yield
+        while True:
+            peer.predict()
+            # Drawn anew, so that they hold the process noise: then its update is Kalman's.
+            peer.sigmas_f = points.sigma_points(peer.x, peer.P)
+            peer.update(z, R=R)
+            z, R = yield peer.x[:4], peer.P[:4, :4]
+
+    compare(task, UnscentedTurn(task, acceleration, change, start_rate), track)
+
+
+def test_sage_husa_equals_the_papers_recursion(task):
+    acceleration, forgetting, least = 0.8, 0.9, 0.2
+
+    def track(x, P):
+        level, k = acceleration**2, 0
+        z, R = yield
+        while True:
+            k += 1
+            d = (1 - forgetting) / (1 - forgetting ** (k + 1))
+            carried = F @ P @ F.T
+            before = F @ x
+            x, P, _ = kalman_update(before, carried + level * UNIT_Q, z, R)
+            sample = np.diag(np.outer(x - before, x - before) + P - carried) / np.diag(UNIT_Q)
+            level = max((1 - d) * level + d * sample.mean(), least**2)
+            z, R = yield x, P
+
+    compare(task, SageHusa(task, acceleration, forgetting, least), track)
+
+
+def test_variational_bayes_equals_the_papers_recursion(task):
+    acceleration, rho, shape = 2.0, 0.9, 4.0
+
+    def track(x, P):
+        alpha, beta = np.full(2, shape), np.full(2, shape)
+        z, R = yield
+        while True:
+            before, P = F @ x, F @ P @ F.T + acceleration**2 * UNIT_Q
+            alpha = rho * alpha + 0.5
+            faded = beta = rho * beta
+            for _ in range(VariationalBayes.iterations):
+                x, after, _ = kalman_update(before, P, z, np.diag(beta / alpha) @ R)
+                beta = faded + 0.5 * ((z - x[:2]) ** 2 + np.diag(after)[:2]) / np.diag(R)
+            P = after
+            z, R = yield x, P
+
+    compare(task, VariationalBayes(task, acceleration, rho, shape), track)
+
+
+def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(task):
+    acceleration, tau = 0.6, 2.0
+
+    def track(x, P):
+        z, R = yield
+        while True:
+            before, nominal = F @ x, F @ P @ F.T + acceleration**2 * UNIT_Q
+            estimated = nominal
+            for _ in range(VariationalBayesPrediction.iterations):
+                x, P, _ = kalman_update(before, estimated, z, R)
+                estimated = (tau * nominal + P + np.outer(x - before, x - before)) / (tau + 1)
+            z, R = yield x, P
+
+    compare(task, VariationalBayesPrediction(task, acceleration, tau), track)
+
+
+def test_untuned_values_are_those_in_force():
+    known = baselines_of(ID)
+    seeds = episode_seeds("train", 0, 8)
+    for name, maker in known.estimators.items():
+        tunable = known.tunable[name]
+        untuned = tunable.apply(tunable.start)[1]
+        same = type("Untuned", (), {"control": None, "apply": lambda values, maker=maker: ({}, maker)})
+        # Logarithms of the values, there and back; an IMM amplifies that.
+        expected = mean_cost(ID, "random", same, {}, seeds)
+        assert mean_cost(ID, "random", tunable, tunable.start, seeds) == pytest.approx(expected, rel=1e-9), (
+            name
+        )
+        assert isinstance(untuned(make_task(ID, None, "random")), maker)
+
+
+def test_tuned_imm_with_a_turn_beats_the_others_on_fresh_flights():
+    others = [name for name in tuned_names(ID) if name != "kalman-imm-turn-tuned"]
+    cost = evaluate(ID, ["kalman-imm-turn-tuned", *others], "random", episodes=300, seed=1).cost
+    costs = cost.mean(("episode", "time")).values
+    assert costs[0] < 0.95 * costs[1:].min()
