@@ -316,10 +316,10 @@ class NoiseBank(HypothesisBank):
         return self._weighed(state, probabilities, exponent)
 
     def covariance(self, state: Filters) -> Array:
-        """Of the combination, when it is steered times the short average of the NIS per reading where that is above one.
+        """Of the combination, when it is steered times the short average of the NIS per reading if that is above one.
 
-        Whether the action is right about the sensors, only the innovations tell. Left alone, it is the paper's bank with
-        the paper's covariance.
+        Whether the action is right about the sensors, only the innovations tell. Left alone, it is the paper's bank
+        with the paper's covariance.
         """
         groups = int(state.average_nis.shape[0])
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups

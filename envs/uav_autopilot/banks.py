@@ -294,8 +294,8 @@ class GainBank(_AutopilotFilter):
     def covariance(self, state: Filter) -> Array:
         """Covariance of the filter, when it is steered times the short average of the NIS where that is above one.
 
-        Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter with
-        the paper's covariance.
+        Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
+        with the paper's covariance.
         """
         told = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
         return super().covariance(state) * told
