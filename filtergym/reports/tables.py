@@ -43,7 +43,7 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
     median, wins = (
         found.get((*scenario, name, metric, "", "all")) for metric in ("median_cost_ratio", "win_rate")
     )
-    if median is None or median.value is None:
+    if median is None or wins is None or median.value is None:
         return ["-", "-"]
     return [f"{100.0 * (median.value - 1.0):+.1f}", f"{100.0 * wins.value:.0f}"]
 
