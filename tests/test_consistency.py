@@ -1,0 +1,140 @@
+"""Whether covariances are believed: NEES and NIS, medians and wins, and what is said of who is best."""
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.evaluation.bootstrap import Bootstrap, Estimate
+from filtergym.evaluation.metrics import chi_square_band, score
+from filtergym.filters import alpha_beta
+from scipy.stats import chi2
+
+from filtergym import evaluate, tidy_records
+from filtergym.reports.ranking import ranking, ranking_sentence
+
+ID = "filtergym/ManeuveringTarget-v0"
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    names = ["imm", "adaptive-rearm-tuned", "bptt", "ppo", "kalman-imm", "known-turn", "known-input-bound"]
+    return evaluate(ID, names, episodes=200, tracks=True)
+
+
+@pytest.fixture(scope="module")
+def found(dataset):
+    return {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
+
+
+def test_quantiles_are_those_of_the_chi_square_distribution():
+    degrees, runs = np.array([[1.0, 4.0], [0.0, 17.0]]), 50
+    low, high = chi_square_band(degrees, runs)
+    there = degrees > 0.0
+    for quantile, p in ((low, 0.025), (high, 0.975)):
+        expected = chi2.ppf(p, runs * degrees[there]) / runs
+        np.testing.assert_allclose(quantile[there], expected, rtol=1e-10)  # an iteration in both
+
+
+def test_consistency_is_what_it_says(dataset, found):
+    for name in ("imm", "kalman-imm"):
+        run = dataset.sel(policy=name)
+        error, P = run["error"].values, run["covariance"].values
+        nees = np.einsum("mti,mti->mt", error, np.linalg.solve(P, error[..., None])[..., 0])
+        assert found[name, "anees"].value == pytest.approx(nees.mean() / 4, rel=1e-9)
+        low, high = chi2.ppf([0.025, 0.975], 4)
+        inside = ((nees >= low) & (nees <= high)).mean()
+        assert found[name, "nees_inside"].value == pytest.approx(inside, abs=1e-4)
+    nis = dataset["nis"].sel(policy="imm").values
+    assert found["imm", "anis"].value == pytest.approx(nis.mean() / 2, rel=1e-9)
+    assert ("kalman-imm", "anis") not in found
+    assert ("known-input-bound", "anees") not in found
+
+
+def test_a_gain_reports_a_covariance_that_one_can_gate_with(found):
+    """Without what an acceleration leaves it would be too small by factors of tens to hundreds."""
+    for name in ("adaptive-rearm-tuned", "bptt", "ppo"):
+        assert 0.5 < found[name, "anees"].value < 2.0
+
+
+def test_what_an_acceleration_leaves():
+    T, alpha, a = 4.0, np.array([0.2, 0.9]), 3.0
+    beta, zero = alpha_beta.benedict_bordner_beta(alpha), np.zeros(2)
+    d = 0.5 * a * T**2
+    # A filter at rest at the origin, without noise, whose target has accelerated in this interval.
+    position, velocity = alpha_beta.update(zero, zero, np.full(2, d), alpha, beta, T)
+    error = np.array([d - position, a * T - velocity])
+    P = alpha_beta.left_by_acceleration(
+        alpha_beta.Covariance(zero, zero, zero), np.full(2, d**2), alpha, beta, T
+    )
+    np.testing.assert_allclose(P.position, error[0] ** 2, rtol=1e-14)
+    np.testing.assert_allclose(P.cross, error[0] * error[1], rtol=1e-14)
+    np.testing.assert_allclose(P.velocity, error[1] ** 2, rtol=1e-14)
+
+
+def test_medians_are_those_of_the_resamples():
+    values = np.random.default_rng(0).normal(size=31)
+    bootstrap = Bootstrap(31, resamples=50)
+    counts = np.rint(bootstrap.weights * 31).astype(int)
+    expected = [np.median(np.repeat(values, count)) for count in counts]  # 31 is odd: a value of the sample
+    np.testing.assert_array_equal(bootstrap.medians(values), expected)
+
+
+def test_typical_episodes(dataset, found):
+    cost = dataset["cost"].mean("time")
+    ratio = (cost.sel(policy="bptt") / cost.sel(policy="imm")).values
+    assert found["bptt", "win_rate"].value == pytest.approx((ratio < 1.0).mean())
+    # Of an even number the lower of the two in the middle.
+    assert found["bptt", "median_cost_ratio"].value == np.sort(ratio)[99]
+    assert found["imm", "win_rate"].value == pytest.approx(0.5, rel=1e-12)
+    assert found["imm", "median_cost_ratio"].value == 1.0
+
+
+def test_no_room_unless_the_reference_is_better():
+    rng, bootstrap = np.random.default_rng(0), Bootstrap(200)
+    paper = rng.gamma(2.0, 1.0, 200)
+    for shift, room in ((-0.5, True), (0.5, False), (0.0, False)):
+        noise = rng.normal(size=200)
+        reference = paper + shift + 0.1 * (noise - noise.mean())
+        means = [bootstrap.means(values) for values in (0.9 * paper, paper, reference)]
+        found = score(*means, bootstrap)
+        assert isinstance(found, Estimate)
+        assert np.isfinite(found.value) == room
+
+
+def test_who_is_best(dataset, found):
+    records = tidy_records(dataset)
+    places = ranking(records)
+    assert [p.name for p in places] == ["bptt", "ppo", "adaptive-rearm-tuned", "kalman-imm", "imm"]
+    assert {p.role for p in places if p.name in ("bptt", "ppo")} == {"learned"}
+    behind = found["ppo", "behind_best"]
+    assert behind.component == "bptt"
+    cost = dataset["cost"].mean(["episode", "time"])
+    expected = float(cost.sel(policy="ppo") / cost.sel(policy="bptt")) - 1.0
+    assert behind.value == pytest.approx(expected, rel=1e-12)
+    sentence = ranking_sentence(records)
+    assert sentence.startswith("On `random` `bptt` (learned) costs least: -")
+    assert "The strongest classical competitor, `adaptive-rearm-tuned` (policy), costs " in sentence
+    assert ("known-turn", "behind_best") not in found
+
+
+def test_tracks_hold_what_a_track_is_drawn_from(dataset):
+    run = dataset.sel(policy=["imm", "kalman-imm", "known-turn"])
+    assert run["covariance"].dims == ("policy", "episode", "time", "component", "other_component")
+    np.testing.assert_allclose(
+        (run["estimate"] - run["truth"]).values, run["error"].values, rtol=0, atol=1e-9
+    )
+    for name in ("measurement_position", "measurement_variance"):
+        values = run[name].values  # the same for everybody: nobody steers the radar
+        assert values.shape == (3, 200, 100, 2)
+        np.testing.assert_array_equal(values[1:], values[:1].repeat(2, axis=0))
+    assert "estimate" not in evaluate(ID, ["imm"], episodes=2)
+
+
+def test_info_holds_the_same(dataset):
+    env = gymnasium.make(ID, control="weights", detailed_info=True)
+    env.reset(seed=int(dataset["episode_seed"].values[3]))
+    info = env.step(np.array([0.5, 0.5], dtype=np.float32))[-1]
+    first = dataset.sel(policy="imm").isel(episode=3, time=0)
+    for name in ("truth", "measurement_position", "measurement_variance"):
+        np.testing.assert_allclose(info[name], first[name].values, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(info["estimate"] - info["truth"], info["error"], rtol=0, atol=1e-9)
+    assert info["covariance"].shape == (4, 4)
