@@ -4,7 +4,17 @@ import inspect
 
 import numpy as np
 import pytest
-from filtergym.filters import alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices
+from filtergym.filters import (
+    alpha_beta,
+    bounds,
+    gaussian,
+    imm,
+    kalman,
+    noise_adaptation,
+    ordered_sums,
+    polar,
+    small_matrices,
+)
 
 torch = pytest.importorskip("torch")
 
@@ -31,6 +41,9 @@ S2, X4, P4, Z2 = (
 )
 F4, Q4, H24, R2 = rng.normal(size=(4, 4)), positive_definite(4), rng.normal(size=(2, 4)), positive_definite(2)
 ALPHA, BETA = rng.uniform(0.1, 0.9, N), rng.uniform(0.1, 0.9, N)
+LEVEL = noise_adaptation.Level(np.abs(Z2) + 0.5, np.abs(Z2) + 1.0)
+WINDOW = rng.normal(size=(3, 2, N))
+THERE = np.array([1.0, 0.0, 1.0, 1.0, 0.0])
 
 CALLS = [
     (alpha_beta.benedict_bordner_beta, (ALPHA,)),
@@ -57,6 +70,18 @@ CALLS = [
     (imm.mode_posterior, (np.log(MU), -1e5 + MEANS[0])),
     (kalman.predict, (X4, P4, F4, Q4, X4)),
     (kalman.update, (X4, P4, Z2, H24, R2)),
+    (noise_adaptation.faded, (LEVEL, Z2, 0.9, THERE)),
+    (noise_adaptation.sage_husa, (LEVEL, Z2, LEVEL.value, 0.9, 0.1, THERE)),
+    (noise_adaptation.sage_husa_positive, (LEVEL, Z2, LEVEL.value, 0.9, THERE)),
+    (noise_adaptation.process_noise_factor, (Z2, LEVEL.value, LEVEL.weight, LEVEL.value)),
+    (noise_adaptation.start_window, (Z2, 3)),
+    (noise_adaptation.mehra, (WINDOW, Z2, LEVEL.value, 0.1, THERE)),
+    (noise_adaptation.mehra, (WINDOW, Z2, LEVEL.value, 0.1)),
+    (noise_adaptation.forget, (noise_adaptation.InverseGamma(*LEVEL), 0.9, THERE)),
+    (
+        noise_adaptation.variational_bayes,
+        (noise_adaptation.InverseGamma(*LEVEL), lambda R: (R, R, R), 2, THERE),
+    ),
     (ordered_sums.ordered_sum, (MU,)),
     (ordered_sums.weighted_sum, (MU, COVARIANCES)),
     (polar.cartesian_variances, (1e4 * Z2, 100.0, 0.004)),
@@ -114,7 +139,8 @@ def test_gradients_pass_through_every_function():
 
 
 @pytest.mark.parametrize(
-    "module", [alpha_beta, bounds, gaussian, imm, kalman, ordered_sums, polar, small_matrices]
+    "module",
+    [alpha_beta, bounds, gaussian, imm, kalman, noise_adaptation, ordered_sums, polar, small_matrices],
 )
 def test_no_function_is_forgotten(module):
     public = {

@@ -1,0 +1,205 @@
+r"""Noise levels estimated by a filter from what its own measurements say.
+
+Sage and Husa, "Adaptive filtering with unknown prior statistics", Joint Automatic Control Conference (1969):
+
+    R_k = (1 - d_k) R_k-1 + d_k (nu^2 - H P' H^T)               unbiased, but it can become negative       (1)
+    R_k = (1 - d_k) R_k-1 + d_k (epsilon^2 + H P H^T)           positive whatever the data                 (2)
+    Q_k = (1 - d_k) Q_k-1 + d_k (K nu nu^T K^T + P - F P_k-1 F^T)                                          (3)
+    d_k = (1 - b) / (1 - b^(k+1))                                                                          (4)
+
+with the innovation ``nu = z - H x'``, the residual ``epsilon = z - H x``, P' and P the covariances before and
+after the update, b the forgetting factor. (2) is what the paper's estimate becomes when the filtered state
+stands in for the smoothed one; its samples have the mean R only where the filter already believes R, so it comes
+nearer by a fraction of the error, where (1) has no bias.
+
+Mehra, "Approaches to adaptive filtering", IEEE Transactions on Automatic Control 17(5), 1972, covariance
+matching over the last W measurements (after "On the identification of variances and adaptive Kalman filtering",
+15(2), 1970):
+
+    R_k = 1/W sum of (nu^2 - H P' H^T)                                                                     (5)
+
+Särkkä and Nummenmaa, "Recursive noise adaptive Kalman filtering by variational Bayesian approximations", IEEE
+Transactions on Automatic Control 54(3), 2009: every variance has an inverse-gamma distribution with shape alpha and
+scale beta,
+
+    alpha' = rho alpha,  beta' = rho beta                                                                  (6)
+    alpha = alpha' + 1/2,  beta = beta' + epsilon^2 / 2 + H P H^T / 2,  R = beta / alpha                     (7)
+
+where epsilon and P come from the Kalman update with that R, so (7) is iterated from ``beta = beta'`` on.
+
+Measurements are independent of each other: R is diagonal and everything is elementwise, ``(m, N)`` or ``(N,)``.
+``available`` is 1 where there is a measurement and 0 where there is none; there nothing is learned or forgotten,
+and all other arguments may be any finite number. In units of what a sensor reports (innovations over the
+reported deviation) the same functions estimate the factor by which the report is wrong.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
+
+State = TypeVar("State")
+
+
+class Level(NamedTuple):
+    """A variance or a factor on a covariance, and how many samples it stands for."""
+
+    value: Array
+    """In the unit of the samples squared."""
+    weight: Array
+    """Samples that have not been forgotten, more than zero; one at the start gives equation (4)."""
+
+
+def faded(level: Level, sample: Array, forgetting: float, available: Array | float = 1.0) -> Level:
+    """Mean of all samples with those of k measurements ago weighing ``forgetting^k``: equation (4).
+
+    Args:
+        level: before.
+        sample: of the same unit and shape.
+        forgetting: b, above 0 and at most 1.
+        available: whether there is a sample.
+    """
+    weight = level.weight + available * (1.0 - (1.0 - forgetting) * level.weight)
+    return Level(level.value + (available / weight) * (sample - level.value), weight)
+
+
+def sage_husa(
+    level: Level,
+    innovation: Array,
+    predicted: Array,
+    forgetting: float,
+    least: Array | float,
+    available: Array | float = 1.0,
+) -> Level:
+    """Variance of a measurement's noise by equation (1), held above a least one.
+
+    Args:
+        level: before.
+        innovation: nu.
+        predicted: variance of the predicted measurement, ``H P' H^T``.
+        forgetting: b.
+        least: smallest variance.
+        available: whether there is a measurement.
+    """
+    after = faded(level, innovation**2 - predicted, forgetting, available)
+    return after._replace(value=namespace(after.value).clip(after.value, least, None))
+
+
+def sage_husa_positive(
+    level: Level, residual: Array, updated: Array, forgetting: float, available: Array | float = 1.0
+) -> Level:
+    """Variance of a measurement's noise by equation (2), positive by itself.
+
+    Args:
+        level: before.
+        residual: epsilon.
+        updated: variance of the measured quantity after the update, ``H P H^T``.
+        forgetting: b.
+        available: whether there is a measurement.
+    """
+    return faded(level, residual**2 + updated, forgetting, available)
+
+
+def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:
+    """Sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
+
+    Its mean is the true factor where the filter believes the right one. Without a measurement it is the factor
+    that the filter believes. Single samples are often negative: average them with :func:`faded`, hold the average
+    above a least one.
+
+    Args:
+        correction: ``K nu`` of the coordinates that count, ``(c, N)``.
+        updated: their variances after the update, ``(c, N)``.
+        carried: their variances predicted without process noise, the diagonal of ``F P F^T``, ``(c, N)``.
+        unit: their variances by the process noise of factor one, ``(c,)`` lists or ``(c, N)``, above zero.
+
+    Returns:
+        Mean over the coordinates, ``(N,)``.
+    """
+    c = len(unit)
+    return ordered_sum((correction[i] ** 2 + updated[i] - carried[i]) / unit[i] for i in range(c)) / c
+
+
+def start_window(variance: Array, size: int) -> Array:
+    """Window of equation (5) filled with the variance that is believed at the start, ``(size, ...)``."""
+    return namespace(variance).stack([variance] * size, axis=0)
+
+
+def mehra(
+    window: Array,
+    innovation: Array,
+    predicted: Array,
+    least: Array | float,
+    available: Array | float = 1.0,
+) -> tuple[Array, Array]:
+    """Variance of a measurement's noise by equation (5), held above a least one.
+
+    Args:
+        window: the last samples, the oldest first, ``(W, ...)``.
+        innovation: nu.
+        predicted: variance of the predicted measurement, ``H P' H^T``.
+        least: smallest variance.
+        available: whether there is a measurement.
+
+    Returns:
+        The variance, and the window with the new sample in place of the oldest.
+    """
+    xp = namespace(window)
+    sample = innovation**2 - predicted
+    there = available + 0.0 * sample > 0.0
+    window = xp.where(there, xp.concat([window[1:], sample[None]], axis=0), window)
+    return xp.clip(ordered_sum(window) / window.shape[0], least, None), window
+
+
+class InverseGamma(NamedTuple):
+    """Distribution of a variance."""
+
+    shape: Array
+    """alpha: half the number of measurements that it stands for."""
+    scale: Array
+    """beta, in the unit of the variance."""
+
+    @property
+    def variance(self) -> Array:
+        """R of equation (7): the inverse of the mean of 1 / R."""
+        return self.scale / self.shape
+
+
+def forget(noise: InverseGamma, forgetting: float, available: Array | float = 1.0) -> InverseGamma:
+    """Equation (6): the same variance from fewer measurements.
+
+    Args:
+        noise: after the measurement before.
+        forgetting: rho, above 0 and at most 1.
+        available: whether there is a measurement now; the paper forgets by the clock, so that after a gap a single
+            measurement would decide.
+    """
+    kept = 1.0 - (1.0 - forgetting) * available
+    return InverseGamma(kept * noise.shape, kept * noise.scale)
+
+
+def variational_bayes(
+    noise: InverseGamma,
+    update: Callable[[Array], tuple[Array, Array, State]],
+    iterations: int,
+    available: Array | float = 1.0,
+) -> tuple[InverseGamma, State]:
+    """State and noise from one measurement by the fixed point of equation (7).
+
+    Args:
+        noise: after :func:`forget`.
+        update: Kalman's update with the variances R: returns the residual epsilon and the variance of the measured
+            quantity after it, ``H P H^T``, each like R, and the state.
+        iterations: how often, at least 1; the paper finds two enough.
+        available: whether there is a measurement.
+
+    Returns:
+        The distribution, and the state of the last update.
+    """
+    shape = noise.shape + 0.5 * available
+    scale = noise.scale
+    for _ in range(iterations):
+        residual, updated, state = update(scale / shape)
+        scale = noise.scale + 0.5 * available * (residual**2 + updated)
+    return InverseGamma(shape, scale), state
