@@ -8,8 +8,10 @@ import numpy
 import pytest
 import xarray
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot import reproduction as paper
+from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
 from filtergym.baselines.uav_autopilot.metrics import metrics
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.reproduction import experiment
@@ -424,3 +426,43 @@ def test_theory_spectra_integrate_to_the_variances(plant: str) -> None:
     assert sums["observation"] == pytest.approx(theory.output_variance + d.R[shown, shown], rel=1e-9)
     # The error of an optimal estimate is orthogonal to it.
     assert sums["estimate"] == pytest.approx(theory.output_variance - d.steady.posterior[i, i], rel=1e-9)
+
+
+# ---------------------------------------------------------------- noise estimated in the loop
+
+
+@BOTH
+def test_with_noise_as_stated_an_adaptive_filter_is_the_papers(plant):
+    makers: dict[str, Any] = {
+        "kalman": "kalman",
+        "own": lambda task: AdaptiveKalman(task, MeasurementNoise()),
+    }
+    makers["own"].kind = "estimator"
+    error = evaluate(ID, makers, "random", 8, plant=plant)["error"]
+    # One sensor after the other, as in the bank; the loop carries rounding on, and is stable.
+    numpy.testing.assert_allclose(error.sel(policy="own"), error.sel(policy="kalman"), rtol=0, atol=1e-10)
+
+
+@BOTH
+def test_an_imm_over_equal_gusts_is_one_filter(plant):
+    def equal(task: Any) -> GustInteractingMultipleModel:
+        return GustInteractingMultipleModel(task, memory=50.0, low=1.0, high=1.0)
+
+    def one(task: Any) -> AdaptiveKalman:
+        return AdaptiveKalman(task, VariationalBayes(50.0, 50.0))
+
+    equal.kind = one.kind = "estimator"  # type: ignore[attr-defined]
+    error = evaluate(ID, {"imm": equal, "one": one}, "random", 8, plant=plant)["error"]
+    numpy.testing.assert_allclose(error.sel(policy="imm"), error.sel(policy="one"), rtol=0, atol=1e-10)
+
+
+def test_who_learns_the_noise_flies_better_where_it_changes():
+    """Each where its kind of change is meant; intervals of paired differences, 40 episodes."""
+    for scenario, names in (
+        ("sensor-degradation", ("mehra", "sage-husa", "variational-bayes", "gust-imm")),
+        ("gust-front", ("gust-imm",)),
+    ):
+        cost = evaluate(ID, ["kalman", *names], scenario, 40)["cost"].mean("time")
+        for name in names:
+            difference = (cost.sel(policy=name) - cost.sel(policy="kalman")).values
+            assert difference.mean() < -4.0 * difference.std() / math.sqrt(40), (scenario, name)

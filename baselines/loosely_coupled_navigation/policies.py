@@ -18,7 +18,10 @@ from ...evaluation.bootstrap import Bootstrap
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...evaluation.metrics import Measure, mean_of_present
 from ...filters import loosely_coupled as ins_gnss
+from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
 from ..table import Baselines, Tunable
+from .augmented import WINDOW, AugmentedFilter, AugmentedMemory
+from .estimators import AugmentedMehra, AugmentedSageHusa, AugmentedVariationalBayes
 from .references import Matched, MatchedCovariance
 
 
@@ -189,12 +192,7 @@ class _Offset(NamedTuple):
 
     offset: numpy.ndarray
     """Estimate of the augmented filter less the steered one, ``(axes, N)``, m."""
-    drift: numpy.ndarray
-    """Estimate of beta, ``(axes, N)``, m/s."""
-    coloured: numpy.ndarray
-    """Estimate of eta, ``(axes, N)``, m/s."""
-    covariance: ins_gnss.AugmentedCovariance
-    """``(N,)`` each."""
+    rates: AugmentedMemory
 
 
 class AugmentedGain(TimeVarying):
@@ -206,40 +204,52 @@ class AugmentedGain(TimeVarying):
     So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
     """
 
+    def __init__(self, task: LooselyCoupledNavigation, noise: MeasurementNoise | None = None) -> None:
+        super().__init__(task)
+        self.filter = AugmentedFilter(task.parameters, MeasurementNoise() if noise is None else noise)
+
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
         p = self.loose.parameters
-        s = p.sampling
         none = numpy.zeros((p.axes, len(observation)))
-        zero = none[0]
-        first = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
-        memory = _Offset(none, none, none, first)
+        memory = _Offset(none, self.filter.start(none))
         if state is not None:
-            covariance = ins_gnss.AugmentedCovariance(
-                *(numpy.where(start, a, b) for a, b in zip(first, state.covariance, strict=True))
-            )
-            offset, drift, coloured = (numpy.where(start, 0.0, row) for row in state[:3])
-            memory = _Offset(offset, drift, coloured, covariance)
-        R = self.reported_variance(observation)[:, 0]
+            memory = chosen(start, memory, state)
+        reported = self.reported_variance(observation)[:, 0]
         available = numpy.where(self.available(observation)[:, 0] > 0.5, 1.0, 0.0)
         innovation = self.innovation(observation).T
 
-        offset = memory.offset - (s.step * memory.drift + s.drive * memory.coloured)
-        P = ins_gnss.predict_augmented(memory.covariance, s, *p.modelled_growth)
-        K, P = ins_gnss.update_augmented(P, R, available)
+        displacement, rates = self.filter.predict(memory.rates)
+        offset = memory.offset - displacement
         own = available * (innovation - offset)
-        wanted = offset + K.position * own
+        correction, rates = self.filter.update(rates, own, reported, available)
+        wanted = offset + correction
         usable = (available > 0.0) & (innovation != 0.0)
         gain = numpy.where(usable, wanted / numpy.where(usable, innovation, 1.0), 0.0)
         gain = numpy.clip(gain, 0.0, 1.0)
         gain = numpy.where(gain <= p.smallest_gain, 0.0, gain)
-        after = _Offset(
-            wanted - gain * innovation,
-            memory.drift - K.drift * own,
-            s.decay * memory.coloured - K.coloured * own,
-            P,
-        )
-        return gain_bank(self.task).action_for_gain(gain.T), after
+        return gain_bank(self.task).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
+
+
+class AugmentedGainMehra(AugmentedGain):
+    """`augmented-gain` with the receiver's noise by the mean square of the last innovations (Mehra 1972)."""
+
+    def __init__(self, task: LooselyCoupledNavigation, window: float = WINDOW) -> None:
+        super().__init__(task, Mehra(window))
+
+
+class AugmentedGainSageHusa(AugmentedGain):
+    """`augmented-gain` with the receiver's noise by their fading mean square (Sage and Husa 1969)."""
+
+    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
+        super().__init__(task, SageHusa(memory, trust))
+
+
+class AugmentedGainVariationalBayes(AugmentedGain):
+    """`augmented-gain` with the receiver's noise by variational Bayes (Särkkä and Nummenmaa 2009)."""
+
+    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
+        super().__init__(task, VariationalBayes(memory, trust))
 
 
 # --- the bank
@@ -335,6 +345,19 @@ def _intensity_tuned(
 
 _INTENSITY_LIMITS = (-2.0, 1.0)
 _INTENSITY_START = math.log10(0.36)
+_WINDOW = {"window": (5.0, 150.0)}
+_FADING = {"memory": (5.0, 200.0), "trust": (1.0, 200.0)}
+
+
+def _noise_tuned(control: str | None, make: Callable[..., Any], limits: Mapping[str, Any]) -> Tunable:
+    """Make a rule for the receiver's noise tunable, of a policy or an estimator."""
+    return Tunable(
+        control,
+        limits,
+        dict.fromkeys(limits, WINDOW),
+        lambda values: ({}, lambda task: make(task, **values)),
+    )
+
 
 TUNABLE = {
     "best-constant": Tunable(
@@ -355,6 +378,12 @@ TUNABLE = {
         {"log10_intensity": _INTENSITY_START, "window": 0.25},
         _intensity_tuned(lambda task, intensity, v: InnovationAdaptive(task, intensity, v["window"])),
     ),
+    "augmented-gain-mehra": _noise_tuned("gain", AugmentedGainMehra, _WINDOW),
+    "augmented-gain-sage-husa": _noise_tuned("gain", AugmentedGainSageHusa, _FADING),
+    "augmented-gain-variational-bayes": _noise_tuned("gain", AugmentedGainVariationalBayes, _FADING),
+    "augmented-mehra": _noise_tuned(None, AugmentedMehra, _WINDOW),
+    "augmented-sage-husa": _noise_tuned(None, AugmentedSageHusa, _FADING),
+    "augmented-variational-bayes": _noise_tuned(None, AugmentedVariationalBayes, _FADING),
 }
 
 BASELINES = Baselines(
@@ -367,10 +396,18 @@ BASELINES = Baselines(
         "time-varying-white": TimeVaryingWhite,
         "innovation-adaptive": InnovationAdaptive,
         "augmented-gain": AugmentedGain,
+        "augmented-gain-mehra": AugmentedGainMehra,
+        "augmented-gain-sage-husa": AugmentedGainSageHusa,
+        "augmented-gain-variational-bayes": AugmentedGainVariationalBayes,
         "augmented": Augmented,
         "ins-only": InsOnly,
         "gnss-only": GnssOnly,
         "random": RandomPolicy,
+    },
+    estimators={
+        "augmented-mehra": AugmentedMehra,
+        "augmented-sage-husa": AugmentedSageHusa,
+        "augmented-variational-bayes": AugmentedVariationalBayes,
     },
     references={"matched": Matched},
     bounds={"matched-covariance": MatchedCovariance},
@@ -387,6 +424,7 @@ BASELINES = Baselines(
         "innovation-adaptive",
         "augmented-gain",
         "augmented",
+        "augmented-sage-husa",
         "ins-only",
         "gnss-only",
         "random",

@@ -13,6 +13,7 @@ from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, Tunable
+from .estimators import GustInteractingMultipleModel, MehraKalman, SageHusaKalman, VariationalBayesKalman
 from .metrics import metrics
 from .references import KnownNoiseBound, Matched, SteadyKalman, TrueState
 from .theory import OVER_SMOOTHED, WIDE_BAND
@@ -118,6 +119,16 @@ def _tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callab
     return {}, make
 
 
+def _tuned_estimator(
+    make: Callable[..., Any], limits: Mapping[str, tuple[float, float]], start: Mapping[str, float]
+) -> Tunable:
+    return Tunable(None, limits, start, lambda values: ({}, lambda task: make(task, **values)))
+
+
+_MEMORY = (20.0, 400.0)
+_MEMORIES = {"memory": _MEMORY, "gust_memory": _MEMORY}
+_MEMORIES_START = {"memory": 100.0, "gust_memory": 100.0}
+
 TUNABLE = {
     "fixed-best": Tunable(
         "gain",
@@ -145,6 +156,14 @@ TUNABLE = {
         },
         _tuned_adaptive,
     ),
+    "mehra": _tuned_estimator(MehraKalman, {"window": _MEMORY}, {"window": 100.0}),
+    "sage-husa": _tuned_estimator(SageHusaKalman, _MEMORIES, _MEMORIES_START),
+    "variational-bayes": _tuned_estimator(VariationalBayesKalman, _MEMORIES, _MEMORIES_START),
+    "gust-imm": _tuned_estimator(
+        GustInteractingMultipleModel,
+        {"memory": (10.0, 150.0), "stay": (0.95, 0.9995), "low": (0.1, 0.9), "high": (1.2, 4.0)},
+        {"memory": 50.0, "stay": 0.99, "low": 0.5, "high": 2.0},
+    ),
 }
 
 BASELINES = Baselines(
@@ -157,6 +176,12 @@ BASELINES = Baselines(
         "innovation-adaptive": InnovationAdaptive,
         "fixed-best": FixedScale,
         "random": RandomPolicy,
+    },
+    estimators={
+        "mehra": MehraKalman,
+        "sage-husa": SageHusaKalman,
+        "variational-bayes": VariationalBayesKalman,
+        "gust-imm": GustInteractingMultipleModel,
     },
     references={"true-state": TrueState, "matched": Matched, "steady-kalman": SteadyKalman},
     bounds={"known-noise-bound": KnownNoiseBound},
@@ -171,6 +196,7 @@ BASELINES = Baselines(
         "wide-band",
         "raw-sensors",
         "innovation-adaptive",
+        "gust-imm",
         "random",
         "true-state",
         "matched",

@@ -1,0 +1,84 @@
+"""The augmented filter of LooselyCoupledNavigation with receiver noise as reported, or estimated.
+
+A policy under ``gain`` runs it beside the plain scheme, an estimator reports it.
+
+The receiver may say nothing of a change. So the noise is estimated from the innovations, beginning with what is
+reported; when the report changes it begins anew. One receiver measures all axes: an innovation is the root of their
+mean square.
+"""
+
+from typing import Any, NamedTuple
+
+from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
+from ...filters import loosely_coupled as ins_gnss
+from ...filters.array_namespace import Array, namespace
+from ...filters.ordered_sums import ordered_sum
+from ..measurement_noise import MeasurementNoise, chosen
+
+WINDOW = 25.0
+"""Measurements of a window without tuning: 0.25 s, the time constant of the averages that are shown."""
+
+
+class AugmentedMemory(NamedTuple):
+    """What the augmented filter knows beside the position."""
+
+    drift: Array
+    """Estimate of beta, ``(A, N)``, m/s."""
+    coloured: Array
+    """Estimate of eta, ``(A, N)``, m/s."""
+    covariance: ins_gnss.AugmentedCovariance
+    """``(N,)`` each."""
+    reported: Array
+    """Variance last reported, ``(N,)``, m^2."""
+    noise: Any
+    """Memory of the receiver's noise."""
+
+
+class AugmentedFilter:
+    """The augmented filter without its position, which whoever runs it keeps.
+
+    Args:
+        parameters: of the task.
+        noise: the receiver's.
+    """
+
+    def __init__(self, parameters: LooselyCoupledNavigationParameters, noise: MeasurementNoise) -> None:
+        self.parameters, self.noise = parameters, noise
+
+    def start(self, none: Array) -> AugmentedMemory:
+        """Memory at the start of the track.
+
+        Args:
+            none: zeros, ``(A, N)``.
+        """
+        p, zero = self.parameters, none[0]
+        P = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
+        return AugmentedMemory(none, none, P, zero, self.noise.start(zero))
+
+    def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
+        """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
+        p, s = self.parameters, self.parameters.sampling
+        P = ins_gnss.predict_augmented(memory.covariance, s, *p.modelled_growth)
+        displacement = s.step * memory.drift + s.drive * memory.coloured
+        return displacement, memory._replace(coloured=s.decay * memory.coloured, covariance=P)
+
+    def update(
+        self, memory: AugmentedMemory, innovation: Array, reported: Array, available: Array
+    ) -> tuple[Array, AugmentedMemory]:
+        """Correction of the position, m, ``(A, N)``, and memory.
+
+        Args:
+            memory: after :meth:`predict`.
+            innovation: measurement less predicted position, zero where there is none, m, ``(A, N)``.
+            reported: variance as the receiver reports it, m^2, ``(N,)``.
+            available: one where there is a measurement, ``(N,)``.
+        """
+        xp = namespace(innovation)
+        noise = chosen(reported != memory.reported, self.noise.start(reported), memory.noise)
+        size = xp.sqrt(ordered_sum(innovation * innovation) / innovation.shape[0])
+        R, noise = self.noise.update(noise, size, memory.covariance.position, reported, available)
+        K, P = ins_gnss.update_augmented(memory.covariance, R, available)
+        # The innovation of the position is minus that of the INS error.
+        return K.position * innovation, AugmentedMemory(
+            memory.drift - K.drift * innovation, memory.coloured - K.coloured * innovation, P, reported, noise
+        )

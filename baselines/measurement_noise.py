@@ -1,0 +1,111 @@
+"""How an estimator comes to know the noise of a sensor: as stated, or from the innovations.
+
+What several environments' competitors share; equation numbers are those of ``filters/noise_adaptation.py``.
+"""
+
+from typing import Any
+
+from ..filters import noise_adaptation as adaptation
+from ..filters.array_namespace import Array, namespace
+
+LEAST = 0.1
+"""Smallest estimate over the stated variance; ours: a third of the stated deviation, below which nothing is gained."""
+
+
+class MeasurementNoise:
+    """Noise as stated, by the sensor or its data sheet; subclasses estimate it."""
+
+    def start(self, stated: Array) -> Any:
+        """Memory where nothing but the stated variance is known, ``(N,)``."""
+        return ()
+
+    def update(
+        self, memory: Any, innovation: Array, P: Array, stated: Array, available: Array
+    ) -> tuple[Array, Any]:
+        """Variance of a measurement and memory, in the sensor's unit.
+
+        Args:
+            memory: after the measurement before.
+            innovation: measurement less prediction, ``(N,)``; of several channels with the same noise the root of their
+                mean square.
+            P: variance of the predicted measurement without its noise, ``(N,)``.
+            stated: stated variance, ``(N,)``.
+            available: one where there is a measurement, ``(N,)``.
+        """
+        return stated, memory
+
+
+class Mehra(MeasurementNoise):
+    """By the mean square of the last innovations.
+
+    Args:
+        window: measurements in it.
+    """
+
+    def __init__(self, window: float) -> None:
+        self.window = max(round(window), 1)
+
+    def start(self, stated: Array) -> Array:
+        """Window full of the stated variance."""
+        return adaptation.start_window(stated, self.window)
+
+    def update(
+        self, memory: Array, innovation: Array, P: Array, stated: Array, available: Array
+    ) -> tuple[Array, Array]:
+        """Equation (5) of ``filters/noise_adaptation.py``."""
+        return adaptation.mehra(memory, innovation, P, LEAST * stated, available)
+
+
+class SageHusa(MeasurementNoise):
+    """By the fading mean square of the innovations.
+
+    Args:
+        memory: measurements that count, ``1 / (1 - b)``.
+        trust: measurements that the statement counts for.
+    """
+
+    def __init__(self, memory: float, trust: float) -> None:
+        self.forgetting, self.trust = 1.0 - 1.0 / memory, trust
+
+    def start(self, stated: Array) -> adaptation.Level:
+        """Level at the stated variance."""
+        return adaptation.Level(stated, self.trust + 0.0 * stated)
+
+    def update(
+        self, memory: adaptation.Level, innovation: Array, P: Array, stated: Array, available: Array
+    ) -> tuple[Array, adaptation.Level]:
+        """Equation (1) of ``filters/noise_adaptation.py``."""
+        level = adaptation.sage_husa(memory, innovation, P, self.forgetting, LEAST * stated, available)
+        return level.value, level
+
+
+class VariationalBayes(SageHusa):
+    """By an inverse-gamma distribution; arguments as of :class:`SageHusa`, with ``rho`` for ``b``."""
+
+    iterations = 2
+
+    def start(self, stated: Array) -> adaptation.InverseGamma:  # type: ignore[override]
+        """Distribution about the stated variance."""
+        shape = 0.5 * self.trust + 0.0 * stated
+        return adaptation.InverseGamma(shape, shape * stated)
+
+    def update(  # type: ignore[override]
+        self, memory: adaptation.InverseGamma, innovation: Array, P: Array, stated: Array, available: Array
+    ) -> tuple[Array, adaptation.InverseGamma]:
+        """Equations (6) and (7) of ``filters/noise_adaptation.py``."""
+
+        def update(R: Array) -> tuple[Array, Array, Array]:
+            rest = R / (P + R)
+            return rest * innovation, rest * P, R
+
+        noise = adaptation.forget(memory, self.forgetting, available)
+        noise, R = adaptation.variational_bayes(noise, update, self.iterations, available)
+        return R, noise
+
+
+def chosen(which: Array, one: Any, other: Any) -> Any:
+    """Entries of one memory where ``which``, ``(N,)``, is true, and of another elsewhere."""
+    if isinstance(one, tuple):
+        parts = [chosen(which, a, b) for a, b in zip(one, other, strict=True)]
+        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
+    return namespace(which).where(which, one, other)

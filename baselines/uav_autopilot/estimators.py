@@ -1,0 +1,203 @@
+"""Estimators of UavAutopilot that learn the noise in flight: of each sensor, and of the gusts.
+
+Each closes the loop and flies its own truth. No action can do what they do: it scales the whole process noise, and
+a noisier sensor asks for another change of the filter than stronger gusts do. Equation numbers are those of
+``filters/noise_adaptation.py``.
+"""
+
+from typing import Any, ClassVar, NamedTuple
+
+from ...envs.observation import Array
+from ...envs.task import Initial
+from ...envs.uav_autopilot.task import UavAutopilot
+from ...envs.uav_autopilot.world import Measurement
+from ...filters import imm, packed_covariance
+from ...filters import noise_adaptation as adaptation
+from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
+
+
+class Filter(NamedTuple):
+    """One filter and what it thinks of the sensors."""
+
+    mean: Array
+    """``(n, N)``."""
+    covariance: Array
+    """Packed."""
+    noise: tuple[Any, ...]
+    """Memory of each sensor's noise."""
+
+
+class Step(NamedTuple):
+    """One measurement taken in."""
+
+    filter: Filter
+    log_likelihood: Array
+    """Of the readings, ``(N,)``."""
+    correction: Array
+    """Of the mean, ``(n, N)``."""
+    carried: Array
+    """Packed covariance predicted without the disturbance."""
+
+
+class AdaptiveKalman:
+    """Kalman filter (10)-(12) of the paper with the noise of each sensor estimated."""
+
+    kind = "estimator"
+
+    def __init__(self, task: UavAutopilot, sensor_noise: MeasurementNoise) -> None:
+        self.task, self.xp, self.sensor_noise = task, task.xp, sensor_noise
+        model, pack = task.design.model, packed_covariance.pack
+        self.F, self.B = task.constant(model.F), task.constant(model.B)
+        self.propagator = task.constant(packed_covariance.propagator(model.F))
+        self.scaled, self.other = (
+            task.constant(pack(Q)[:, None]) for Q in (model.scaled_noise, model.other_noise)
+        )
+        self.n = len(model.F)
+
+    def started(self, initial: Initial) -> Filter:
+        """Filter where everyone starts, with sensors as stated."""
+        zero = 0.0 * initial.mean[0]
+        noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
+        return Filter(initial.mean, packed_covariance.pack(initial.covariance), noise)
+
+    def filtered(self, before: Filter, measurement: Measurement, factor: Array | float) -> Step:
+        """Predict with a factor on the disturbance's covariance, and take in one sensor after the other."""
+        predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
+        carried = self.xp.matmul(self.propagator, before.covariance) + self.other
+        mean, covariance = predicted, carried + factor * self.scaled
+        noise, log_likelihood = [], 0.0 * measurement.number
+        for k, i in enumerate(self.task.measured):
+            available = measurement.available[k]
+            R, memory = self.sensor_noise.update(
+                before.noise[k],
+                measurement.reading[k] - mean[i],
+                covariance[packed_covariance.position(self.n, i, i)],
+                self.task.sensor_variances[k] + 0.0 * available,
+                available,
+            )
+            mean, covariance, likelihood, _ = packed_covariance.update_coordinates(
+                mean, covariance, measurement.reading[k][None], (i,), R[None], available[None]
+            )
+            noise.append(memory)
+            log_likelihood = log_likelihood + likelihood
+        return Step(Filter(mean, covariance, tuple(noise)), log_likelihood, mean - predicted, carried)
+
+    def start(self, initial: Initial, N: int) -> Any:
+        """Start where everyone starts."""
+        return self.started(initial)
+
+    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any]:
+        """One measurement, gusts as designed."""
+        after = self.filtered(memory, measurement, 1.0).filter
+        return after.mean, packed_covariance.unpack(after.covariance, self.n), after
+
+
+class MehraKalman(AdaptiveKalman):
+    """The paper's filter, each sensor's noise by the mean square of its last innovations (Mehra 1972)."""
+
+    def __init__(self, task: UavAutopilot, window: float = 100.0) -> None:
+        super().__init__(task, Mehra(window))
+
+
+class AdaptiveGusts(AdaptiveKalman):
+    """Sensor noise estimated, and the disturbance by equation (3) from the corrections of the last coordinate.
+
+    It is the gust, or the rate of plant P: the only one that the disturbance drives directly.
+    """
+
+    limits: ClassVar[tuple[float, float]] = (1.0 / 16.0, 16.0)
+    """Of the factor on the disturbance's covariance: the range of ``random``."""
+
+    def __init__(self, task: UavAutopilot, sensor_noise: MeasurementNoise, memory: float) -> None:
+        super().__init__(task, sensor_noise)
+        self.memory, self.forgetting = memory, 1.0 - 1.0 / memory
+        self.last = packed_covariance.position(self.n, self.n - 1, self.n - 1)
+
+    def start(self, initial: Initial, N: int) -> tuple[Filter, adaptation.Level]:
+        """Start with gusts as designed."""
+        one = 0.0 * initial.mean[0] + 1.0
+        return self.started(initial), adaptation.Level(one, self.memory * one)
+
+    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any]:
+        """One measurement, and the factor for the next."""
+        before, level = memory
+        after, _, correction, carried = self.filtered(before, measurement, level.value)
+        last = slice(self.last, self.last + 1)
+        sample = adaptation.process_noise_factor(
+            correction[-1:], after.covariance[last], carried[last], self.scaled[last]
+        )
+        level = adaptation.faded(level, sample, self.forgetting)
+        level = level._replace(value=self.xp.clip(level.value, *self.limits))
+        return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level)
+
+
+class SageHusaKalman(AdaptiveGusts):
+    """The paper's filter, noise of sensors and gusts by fading means of the innovations (Sage and Husa 1969)."""
+
+    def __init__(self, task: UavAutopilot, memory: float = 100.0, gust_memory: float = 100.0) -> None:
+        super().__init__(task, SageHusa(memory, memory), gust_memory)
+
+
+class VariationalBayesKalman(AdaptiveGusts):
+    """The paper's filter, gusts by Sage and Husa, sensors by variational Bayes (Särkkä and Nummenmaa 2009)."""
+
+    def __init__(self, task: UavAutopilot, memory: float = 100.0, gust_memory: float = 100.0) -> None:
+        super().__init__(task, VariationalBayes(memory, memory), gust_memory)
+
+
+class GustModels(NamedTuple):
+    """Filters for several levels of the gusts."""
+
+    filters: tuple[Filter, ...]
+    probabilities: Array
+    """``(M, N)``."""
+
+
+class GustInteractingMultipleModel(AdaptiveKalman):
+    """IMM over three levels of the gusts, in each the sensors' noise by variational Bayes.
+
+    One filter that estimates both takes the one noise for the other: a large innovation fits either. The models
+    differ in how their innovations hang together over time, which their likelihoods tell.
+    """
+
+    def __init__(
+        self,
+        task: UavAutopilot,
+        memory: float = 50.0,
+        stay: float = 0.99,
+        low: float = 0.5,
+        high: float = 2.0,
+    ) -> None:
+        super().__init__(task, VariationalBayes(memory, memory))
+        self.levels = low, 1.0, high
+        change = (1.0 - stay) / 2.0
+        self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
+
+    def start(self, initial: Initial, N: int) -> GustModels:
+        """Start all where everyone starts, as likely."""
+        third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
+        return GustModels((self.started(initial),) * 3, third)
+
+    def update(self, measurement: Measurement, memory: GustModels) -> tuple[Array, Array, GustModels]:
+        """One IMM cycle; each model keeps its own opinion of the sensors."""
+        xp = self.xp
+        prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
+        mean, covariance = imm.mix(*self.stacked(memory.filters), prediction.mixing)
+        steps = [
+            self.filtered(
+                Filter(mean[:, j], packed_covariance.pack(covariance[:, :, j]), memory.filters[j].noise),
+                measurement,
+                level**2,
+            )
+            for j, level in enumerate(self.levels)
+        ]
+        likelihoods = xp.stack([step.log_likelihood for step in steps])
+        probabilities = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), likelihoods)
+        after = GustModels(tuple(step.filter for step in steps), probabilities)
+        return *imm.combine(*self.stacked(after.filters), probabilities), after
+
+    def stacked(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
+        """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
+        xp = self.xp
+        covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
+        return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)
