@@ -28,12 +28,12 @@ class Baselines:
     environment: str
     """Gymnasium id."""
     policies: Mapping[str, Callable[[Any], Policy]]
-    estimators: Mapping[str, Any] = field(default_factory=dict)
-    """Classes that keep the protocol :class:`.Estimator`."""
     references: Mapping[str, Any] = field(default_factory=dict)
     """Classes that keep the protocol :class:`.Reference`."""
     bounds: Mapping[str, Any] = field(default_factory=dict)
     """Classes that keep the protocol :class:`.Bound`."""
+    estimators: Mapping[str, Any] = field(default_factory=dict)
+    """Classes that keep the protocol :class:`.Estimator`."""
     score_paper: str = ""
     """The policy whose score is 0."""
     score_bound: str = ""

@@ -240,6 +240,8 @@ class Bank(ABC, Generic[TaskT, Measurement, State]):
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
         ``mode_probability``.
+
+        Consistency is measured by ``nis``, the normalised innovation squared, and ``nis_degrees``, its dimension.
         """
         return {}
 

@@ -9,7 +9,13 @@ import xarray
 
 from .bootstrap import Bootstrap
 from .files import whole_file
-from .metrics import chi_square_band, consistency_degrees, reported_components, squared_errors
+from .metrics import (
+    chi_square_band,
+    consistency_degrees,
+    consistency_metrics,
+    reported_components,
+    squared_errors,
+)
 
 LINES = ("-", "--", "-.", ":")
 # Okabe and Ito's palette: distinguishable for colour-blind readers.
@@ -106,7 +112,7 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
 
 def draw_consistency(dataset: xarray.Dataset) -> Any:
     """Mean NEES and NIS over their dimensions at every measurement, with the 95 % chi-square band of that mean."""
-    shown = [metric for metric in ("nees", "nis") if metric in dataset]
+    shown = consistency_metrics(dataset)
     figure, axes = _axes(len(shown))
     names = dataset["policy"].values.tolist()
     for axis, metric in zip(axes, shown, strict=True):
@@ -315,7 +321,7 @@ def evaluation_figures(dataset: xarray.Dataset) -> Iterator[tuple[str, Any]]:
     """Every figure of an evaluation with the name of its file."""
     yield "rmse_over_time", draw_error_over_time(dataset)
     yield "error_distribution", draw_error_distribution(dataset)
-    if "nees" in dataset:
+    if consistency_metrics(dataset):
         yield "consistency", draw_consistency(dataset)
     if "true_class_probability" in dataset:
         # Where the truth differs from episode to episode, a mean over episodes of each mode says nothing.

@@ -103,7 +103,7 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
                     "mean_error", component, window, bootstrap.estimate(signed[:, times].mean(axis=1)), unit
                 )
     for metric in ("nees", "nis"):
-        if metric in run and not numpy.isnan(run[metric].values).all():
+        if metric in consistency_metrics(run):
             for window, times in slices.items():
                 yield from _consistency(run.isel(time=times), metric, window, bootstrap)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
@@ -134,6 +134,12 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Boots
     low, high = chi_square_band(degrees)
     inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
     yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
+
+
+def consistency_metrics(run: xarray.Dataset) -> list[str]:
+    """Which of ``nees`` and ``nis`` there are; the latter needs its dimension beside it, ``nis_degrees``."""
+    present = ["nees"] * ("nees" in run) + ["nis"] * ("nis" in run and "nis_degrees" in run)
+    return [metric for metric in present if not numpy.isnan(run[metric].values).all()]
 
 
 def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:

@@ -88,7 +88,7 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path):
     assert {r["seed"] for r in records} == {1}
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {
-        "records.json", "rmse_over_time.png", "error_distribution.png", "mode_probabilities.png",
+        "records.json", "rmse_over_time.png", "error_distribution.png", "consistency.png", "mode_probabilities.png",
     }  # fmt: skip
 
 
@@ -197,6 +197,10 @@ def test_full_benchmark_compares_everything():
     assert [cell.scenario for cell in benchmark.cells(True, [ENV], "validation")] == ["random"]
 
 
+def mean_cost(records, name):
+    return next(r.value for r in records if (r.policy, r.metric, r.window) == (name, "cost", "all"))
+
+
 def test_comparison_shows_what_the_records_say(tmp_path):
     from filtergym import evaluate, tidy_records
     from filtergym.reports import comparison
@@ -207,14 +211,21 @@ def test_comparison_shows_what_the_records_say(tmp_path):
     write_records(tmp_path / "benchmark.json", records)
     found = comparison.read_benchmark(tmp_path / "benchmark.json")
     assert found == {ENV: records}
-    cost, error = comparison.compare_environment(records).grids
-    assert cost.header == ["scenario", "`imm-tuned`", "`ppo` (learned)", "`known-turn` (reference)"]
+    cost, error, typical, consistent = comparison.compare_environment(records).grids
+    classical = sorted(["imm-tuned", "adaptive-rearm"], key=lambda name: mean_cost(records, name))
+    assert cost.header == [
+        "scenario", *(f"`{name}`" for name in classical), "`ppo` (learned)", "`known-turn` (reference)",
+    ]  # fmt: skip
+    assert typical.header == consistent.header == ["scenario", "`imm` (paper)", *cost.header[1:]]
+    assert typical.rows[0][1] == "+0.0<br>50"
+    [anees] = [r.value for r in records if (r.policy, r.metric, r.window) == ("ppo", "anees", "all")]
+    assert consistent.rows[0][4].startswith(f"{anees:.3g}")
     assert error.header[1] == "`imm` (paper)"
     assert error.header[-1] == "`known-input-bound` (bound)"
     [difference] = [
         100.0 * r.value for r in records if (r.policy, r.metric) == ("ppo", "relative_cost_difference")
     ]
-    assert float(cost.rows[0][2].partition("<br>")[0]) == pytest.approx(difference, rel=5e-3)
+    assert float(cost.rows[0][3].partition("<br>")[0]) == pytest.approx(difference, rel=5e-3)
     page = tmp_path / "page.md"
     page.write_text(
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"

@@ -293,23 +293,39 @@ def test_averages_are_those_of_the_definition():
 # --- Scenarios ---------------------------------------------------------------------------------------------
 
 
-def test_disturbances_stand_in_their_windows():
-    lanes = 3
-    for name in ("outage", "jamming", "spoof-ramp"):
+def test_disturbances_stand_where_they_are_drawn():
+    lanes = 400
+    limits = {
+        "outage": ("outage_start", "outage_duration"),
+        "jamming": ("jamming_start", "jamming_duration"),
+        "spoof-ramp": ("spoofing_start", "spoofing_duration"),
+    }
+    for name, (start, duration) in limits.items():
         task = make(name)
-        first, last = TASK.scenarios[name].windows["during"]
         uniforms, normals, rows = numbers(task, lanes, 500, 6)
         rows = [0.0 * row for row in rows]
+        drawn = {"outage": "outage", "jamming": "jamming", "spoof-ramp": "spoofing"}[name]
         for k, (seen, _) in enumerate(states(task, (uniforms, normals, rows), constant(task, 0.0, lanes)), 1):
-            inside = first <= k <= last
+            first, end = getattr(seen.truth, drawn)
+            inside = (k >= first) & (k < end)
             said = seen.measurement
-            assert (said.available == (0.0 if name == "outage" and inside else 1.0)).all()
-            jammed = 10.0 if name == "jamming" and inside else 1.0
+            np.testing.assert_array_equal(said.available, np.where(inside & (name == "outage"), 0.0, 1.0))
+            jammed = np.where(inside & (name == "jamming"), 10.0, 1.0)
             np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
             np.testing.assert_allclose(said.reported_deviation, math.sqrt(2), rtol=1e-14)
-            pull = 0.02 * (k - first + 1) if name == "spoof-ramp" and inside else 0.0
-            truth = 2 * math.sin(0.008 * k) + pull
-            np.testing.assert_allclose(said.fix, 0.0 if inside and name == "outage" else truth, atol=1e-12)
+            pull = np.where(inside & (name == "spoof-ramp"), 0.02 * (k - first + 1), 0.0)
+            fix = np.where(inside & (name == "outage"), 0.0, 2 * math.sin(0.008 * k) + pull)
+            np.testing.assert_allclose(said.fix[0], fix, atol=1e-12)
+        # One row of a hundredth of a second is the rounding of start and end.
+        p, windows = task.parameters, TASK.scenarios[name].windows
+        for seconds, (low, high) in ((first, getattr(p, start)), (end - first, getattr(p, duration))):
+            assert low - 0.011 <= 0.01 * seconds.min()
+            assert 0.01 * seconds.max() <= high + 0.011
+            assert 0.01 * np.ptp(seconds) > 0.9 * (high - low)
+        if "during" in windows:
+            assert (first <= windows["during"][0]).all()
+            assert (end > windows["during"][1]).all()
+            assert (end <= windows["after"][0]).all()
 
 
 def test_random_draws_a_decade_and_reports_half_of_the_changes():

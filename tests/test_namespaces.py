@@ -60,6 +60,7 @@ CALLS = [
         alpha_beta.propagate_error,
         (alpha_beta.ErrorMoments(Z2, Z2, P2), Z2, Z2, np.abs(Z2), ALPHA, BETA, 6.0),
     ),
+    (alpha_beta.left_by_acceleration, (P2, np.abs(Z2), ALPHA, BETA, 6.0)),
     (alpha_beta.predict_joint_covariance, (COVARIANCES, 6.0)),
     (alpha_beta.update_joint_covariance, (COVARIANCES, np.abs(Z2)[:, None], GAIN, GAIN, 6.0)),
     (bounds.predicted_bound, (P4, F4[..., None], Q4[..., None])),

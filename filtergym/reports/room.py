@@ -26,6 +26,7 @@ MARKER = "room table"
 
 def room_policies(id: str) -> list[str]:
     """Names in the room table: everything that has a name, but random actions."""
+    paper_of(id)  # there is no room without it
     known = baselines_of(id)
     names = [*known.names, *tuned_names(id), *shipped_agents(id)]
     return [name for name in names if name != "random"]

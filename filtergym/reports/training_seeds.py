@@ -13,6 +13,7 @@ from scipy.special import stdtrit
 
 from ..agents.training_run import TrainingRun, best_agent, load_run
 from ..baselines.catalogue import baselines_of, paper_of
+from ..baselines.names import evaluate
 from ..baselines.reproduction import Grid, markdown_table
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import task_class
@@ -20,7 +21,7 @@ from ..evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from ..evaluation.competitors import kind_of
 from ..evaluation.figures import draw_learning_curves
 from ..evaluation.metrics import reported_components, score, squared_errors
-from ..names import competitor, evaluate
+from ..names import competitor
 from .tables import shown_components, with_interval
 
 
