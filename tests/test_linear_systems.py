@@ -187,3 +187,7 @@ def test_gust_filter_has_the_stated_variance() -> None:
     assert gust.intensity / (2.0 * gust.rate) == pytest.approx(gust.sigma**2, rel=1e-13)
     with pytest.raises(ValueError, match="positive airspeed"):
         gusts.vertical_gust(0.0, 50.0, 0.7)
+
+
+def test_modes_are_listed_as_one_writes_them():
+    assert linear_systems._list([0.5 + 0.0j, 0.25 - 2.0j]) == "0.5, 0.25-2j"
