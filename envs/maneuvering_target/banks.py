@@ -23,6 +23,10 @@ SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
 
 
+LARGEST_SHARE = 1e8
+"""Of what an acceleration leaves over the covariance that the gains give."""
+
+
 class AlphaBeta(NamedTuple):
     """One alpha-beta filter with the covariance that belongs to the gains it used."""
 
@@ -243,6 +247,10 @@ class GainBank(_RadarBank):
         usual = (0.5 * T**2 * self.parameters.unmodelled_acceleration) ** 2
         beta = alpha_beta.benedict_bordner_beta(f.alpha)
         told = usual + xp.clip(f.average_excess, 0.0, None)
+        # Of one direction; beyond this the sum would be singular to rounding.
+        told = xp.minimum(
+            told, LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
+        )
         P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))

@@ -37,7 +37,7 @@ class ManeuveringTargetParameters(TaskParameters):
     """Nats that an evidence of one adds to a mode's log-posterior (ours)."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
-    unmodelled_acceleration: float = parameter(0.87, at_least=0.0)
+    unmodelled_acceleration: float = parameter(0.87, at_least=0.0, at_most=100.0)
     """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
     the covariance that control ``gain`` reports (ours)."""
     flight: str = parameter("random", choices=("maneuver", "random", "legs", "track"))
