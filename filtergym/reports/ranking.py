@@ -43,7 +43,7 @@ def ranking_sentence(records: Sequence[Record]) -> str:
     sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) costs least"
     if best.name != paper and difference is not None and difference.value is not None:
         median, wins = found[best.name, "median_cost_ratio"].value, found[best.name, "win_rate"].value
-        sentence += f": {with_interval(difference, 100.0)} % of the cost against `{paper}`"
+        sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
         if median is not None and wins is not None:
             sentence += (
                 f", {100.0 * (median - 1.0):+.1f} % in the median, lower in {100.0 * wins:.0f} % of episodes"
