@@ -262,6 +262,7 @@ def draw_differences(
     differences: Mapping[str, Mapping[str, Sequence[float]]],
     names: Sequence[str],
     learned: Sequence[str],
+    unranked: Sequence[str],
     title: str,
     paper: str,
 ) -> Any:
@@ -271,6 +272,7 @@ def draw_differences(
         differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
         names: policies in the order of the legend.
         learned: those that are drawn as diamonds.
+        unranked: references, which are drawn as grey squares.
         title: of the figure.
         paper: name of the paper's algorithm, whose line is at zero.
     """
@@ -278,7 +280,10 @@ def draw_differences(
     figure, axes = _axes(height=height)
     axis = axes[0]
     gap = 0.8 / len(names)
-    for i, (name, style) in enumerate(styles(list(names)).items()):
+    ranked = styles([name for name in names if name not in unranked])
+    for i, name in enumerate(names):
+        colour = ranked[name]["color"] if name in ranked else "0.45"
+        marker = "s" if name not in ranked else "D" if name in learned else "o"
         for row, found in enumerate(differences.values()):
             if name not in found:
                 continue
@@ -287,10 +292,10 @@ def draw_differences(
                 value,
                 row + gap * (i - 0.5 * (len(names) - 1)),
                 xerr=[[max(value - low, 0.0)], [max(high - value, 0.0)]],
-                fmt="D" if name in learned else "o",
+                fmt=marker,
                 ms=4.5 if name in learned else 3.5,
-                color=style["color"],
-                markerfacecolor=style["color"] if name in learned else "white",
+                color=colour,
+                markerfacecolor="white" if marker == "o" else colour,
                 elinewidth=1.2,
                 label=name if row == 0 else None,
             )

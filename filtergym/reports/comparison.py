@@ -8,6 +8,7 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import Grid, markdown_table
 from ..envs.catalogue import task_class
+from ..evaluation.competitors import RANKED
 from ..evaluation.figures import draw_differences
 from ..evaluation.metrics import Record
 from .ranking import ranking, ranking_sentence
@@ -147,7 +148,8 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             percent = tuple(100.0 * x for x in interval if x is not None)
             if len(percent) == 3:
                 row[name] = percent
-    figure = draw_differences(differences, columns, learned, cls.id, paper)
+    unranked = [name for name in columns if kinds[name] not in RANKED]
+    figure = draw_differences(differences, columns, learned, unranked, cls.id, paper)
     return Comparison(cls.id, grids, figure)
 
 
