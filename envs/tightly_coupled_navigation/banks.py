@@ -72,6 +72,8 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     task: "TightlyCoupledNavigation"
     parameters: TightlyCoupledNavigationParameters
+    thresholds: Sequence[float] | None = None
+    """Of every reading in the robust update; None: the paper's update."""
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -232,7 +234,13 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         )
         residual = measurement.readings[:, None] - expected
         return extended_kalman.update_one_by_one(
-            predicted.mean, predicted.covariance, residual, rows, variance, measurement.available
+            predicted.mean,
+            predicted.covariance,
+            residual,
+            rows,
+            variance,
+            measurement.available,
+            self.thresholds,
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -252,6 +260,11 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         else:
             last = xp.astype(xp.clip(action, 0.0 if control == "weights" else -1.0, 1.0), dtype)
         return self._weighed(state, probabilities, last)
+
+    def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
+        """Weigh the hypotheses by Bayes' rule (step 7), as the paper does."""
+        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
+        return self._weighed(state, probabilities, last_action)
 
     def _weighed(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
         """Combine (step 8), and predict to the next measurement."""
@@ -312,5 +325,4 @@ class NoiseBank(HypothesisBank):
         state = state._replace(
             means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
         )
-        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
-        return self._weighed(state, probabilities, exponent)
+        return self.weigh_by_bayes(state, exponent)
