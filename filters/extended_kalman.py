@@ -67,7 +67,7 @@ def update_one_by_one(
     rows: Sequence[JacobianRow],
     variance: Array,
     available: Array,
-    thresholds: Sequence[float] | None = None,
+    thresholds: Sequence[Array | float] | None = None,
 ) -> Correction:
     """Mean, covariance and likelihood after m independent scalar observations.
 
@@ -78,7 +78,7 @@ def update_one_by_one(
         rows: the Jacobian at the predicted mean.
         variance: of the noise, m values that broadcast against ``(...)``.
         available: one where an observation is there, zero where it is not; m values, likewise.
-        thresholds: k of each observation in the robust update, infinity for none; None: the plain update.
+        thresholds: k of each observation in the robust update, likewise; infinity for none. None: the plain update.
 
     Returns:
         The update; an observation that is not available changes nothing and has no likelihood.

@@ -12,7 +12,9 @@ from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
 from filtergym.baselines.tightly_coupled_navigation.reproduction import claims, experiment
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
+from filtergym.envs.task import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import run_bound, run_estimator, run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds
@@ -211,22 +213,32 @@ def test_fallback_says_nothing_of_other_sensors():
 # --- estimators
 
 
-def test_huber_without_outliers_is_the_paper():
+def test_huber_without_thresholds_is_the_paper():
     class Plain(estimators.Huber):
         def __init__(self, task):
-            super().__init__(task)
-            self.bank.thresholds = [math.inf] * len(self.bank.thresholds)
+            super().__init__(task, {})
 
     dataset = evaluate(ID, {"paper": "multi-hypothesis", "plain": Plain}, episodes=8, horizon=100)
     for name in ("error", "nees"):
         assert (dataset[name][0] == dataset[name][1]).all()
 
 
-def test_thresholds_are_those_of_the_sensors():
+def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
     task = make_task(ID)
-    thresholds = estimators.Huber(task, rates=2.0, accelerometers=3.0).bank.thresholds
+    available = numpy.ones((14, 4))
+    available[8:11, 1] = 0.0
+    available[9, 2:] = 0.0
+    measurement = Measurement(*[None] * 2, available, *[None] * 4)
+    check = estimators.HuberStuckCheck(task, rates=2.0, manoeuvre=3.0).huber.bank
+    average = numpy.full((4, 3, 4), 9.0)
+    average[1, 2, 3] = 2.9
+    state = check.start(Initial(numpy.ones((17, 4)), numpy.ones((17, 17, 4))))._replace(average_nis=average)
     usual = estimators.EFFICIENT
-    assert thresholds == [usual] * 4 + [2.0] * 4 + [3.0] * 3 + [usual] * 3
+    thresholds = numpy.stack(check.thresholds(state, measurement))
+    for lane, plain in enumerate([False, True, True, False]):
+        expected = [math.inf] * 14 if plain else [usual] * 4 + [2.0] * 4 + [math.inf] * 6
+        assert thresholds[:, lane].tolist() == expected
+    assert (numpy.stack(estimators.Huber(task).bank.thresholds(state, measurement)) == usual).all()
 
 
 def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():

@@ -221,8 +221,8 @@ TUNABLE = {
     ),
     "huber-stuck-check": Tunable(
         None,
-        {"rates": (0.5, 6.0), "accelerometers": (0.5, 6.0)},
-        {"rates": EFFICIENT, "accelerometers": EFFICIENT},
+        {"rates": (0.5, 6.0), "manoeuvre": (1.0, 20.0)},
+        {"rates": EFFICIENT, "manoeuvre": 4.0},
         lambda values: ({}, lambda task: HuberStuckCheck(task, **values)),
     ),
     "sticky": Tunable("evidence", {"log10_leave": (-6.0, -0.5)}, {"log10_leave": -4.0}, _sticky),

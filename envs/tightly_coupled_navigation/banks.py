@@ -72,8 +72,6 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     task: "TightlyCoupledNavigation"
     parameters: TightlyCoupledNavigationParameters
-    thresholds: Sequence[float] | None = None
-    """Of every reading in the robust update; None: the paper's update."""
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -209,7 +207,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, task, combined = self.xp, self.task, state.predicted.combined
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
-        update = self._updated(state.predicted, measurement, task.sensor_variance)
+        update = self._updated(state, measurement, task.sensor_variance)
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
         return state._replace(
@@ -222,9 +220,10 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         )
 
     def _updated(
-        self, predicted: Prediction, measurement: Measurement, variance: Sequence[Any]
+        self, state: Filters, measurement: Measurement, variance: Sequence[Any]
     ) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
+        predicted = state.predicted
         expected, rows = gnss_ins.observe(
             predicted.mean,
             measurement.satellite_position[:, :, None],
@@ -240,8 +239,12 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             rows,
             variance,
             measurement.available,
-            self.thresholds,
+            self.thresholds(state, measurement),
         )
+
+    def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
+        """Thresholds of the robust update for each reading; None: the paper's update."""
+        return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Weigh the hypotheses by the action (step 7)."""
@@ -321,7 +324,7 @@ class NoiseBank(HypothesisBank):
             for i, sensor in enumerate(task.sensors)
             for nominal in task.sensor_variance[sensor.readings]
         ]
-        update = self._updated(state.predicted, measurement, variance)
+        update = self._updated(state, measurement, variance)
         state = state._replace(
             means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
         )
