@@ -294,6 +294,26 @@ def fixed_type_log_likelihood(counts: Array, log_confusion: Array, log_compositi
     return largest + xp.log(ordered_sum(terms[:, j] for j in range(terms.shape[1])))
 
 
+def change_class_and_type(log_joint: Array, log_composition: Array, change: float) -> Array:
+    """Log-probabilities of class and type after the class may have changed and brought its own type, ``(M, J, N)``.
+
+    ``P(s, j) <- (1 - c) P(s, j) + c P(type j | s) sum_{s' != s} P(s') / (M - 1)``: the transition q of (8), for a type
+    that changes only together with the class. It is the prediction of Bayes' rule for a hidden Markov chain, and a
+    forgetting of the joint posterior: what speaks for another class counts for less the longer ago it was heard.
+
+    Args:
+        log_joint: log P(s, j), up to a constant, ``(M, J, N)``.
+        log_composition: log P(type j | s), ``(M, J)``; finite.
+        change: c, the probability that the class changes; all others are equally probable then.
+    """
+    xp, classes = namespace(log_joint), log_joint.shape[0]
+    joint = xp.exp(log_joint - xp.max(log_joint, axis=(0, 1)))
+    of_class = [ordered_sum(joint[s]) for s in range(classes)]
+    others = xp.stack([ordered_sum(of_class[r] for r in range(classes) if r != s) for s in range(classes)])
+    entered = xp.exp(log_composition)[..., None] * (change / (classes - 1) * others)[:, None]
+    return imm.log_probabilities((1.0 - change) * joint + entered)
+
+
 def bearing_gate(radar_sigma: float, esm_sigma: float, error_probability: float) -> float:
     """Largest difference of two bearings that are taken for one target, equation (7), in the sigmas' unit.
 

@@ -15,6 +15,18 @@ takes as long as one stacked product of 31 x 31 matrices.
 Reading: steps 5 and 6 of the paper write the Jacobian once through the picked parameters v = c x and once
 directly; one Jacobian with respect to the state is used.
 
+Robust update. Where the noise is Gaussian but for outliers, Huber's M-estimate minimises, for each observation
+in its turn, ``(x - x')^T P^-1 (x - x') / 2 + rho(u)`` with the residual after the update ``u = (nu' - h (x - x')) /
+sqrt(r)``, ``rho(u) = u^2 / 2`` up to a threshold k and ``k |u| - k^2 / 2`` beyond it. Reweighting, ``r' = r |u| / k``
+beyond the threshold, is the usual way to it. With one scalar observation its fixed point is a closed form,
+
+    s' = h P h^T + r' = max(s, sqrt(r) |nu'| / k),
+
+and s' takes the place of s. The prediction is believed as before: an innovation that h P h^T explains is no
+outlier. Sources: P. J. Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35,
+1964; in the update of a Kalman filter, by reweighting: Z. M. Durovic and B. D. Kovacevic, Robust estimation with
+unknown noise statistics, IEEE Transactions on Automatic Control 44, 1999.
+
 Shapes: mean ``(n, ...)``, covariance ``(n, n, ...)``, residual ``(m, ...)``, batch last.
 """
 
@@ -55,6 +67,7 @@ def update_one_by_one(
     rows: Sequence[JacobianRow],
     variance: Array,
     available: Array,
+    thresholds: Sequence[Array | float] | None = None,
 ) -> Correction:
     """Mean, covariance and likelihood after m independent scalar observations.
 
@@ -65,6 +78,7 @@ def update_one_by_one(
         rows: the Jacobian at the predicted mean.
         variance: of the noise, m values that broadcast against ``(...)``.
         available: one where an observation is there, zero where it is not; m values, likewise.
+        thresholds: k of each observation in the robust update, likewise; infinity for none. None: the plain update.
 
     Returns:
         The update; an observation that is not available changes nothing and has no likelihood.
@@ -83,6 +97,8 @@ def update_one_by_one(
             s = s + cross[column] * value
             if j:
                 error = error - shift[column] * value  # type: ignore[index]
+        if thresholds is not None:
+            s = xp.maximum(s, xp.abs(error) * (variance[j] ** 0.5 / thresholds[j]))
         here = available[j]
         whitened = here * error / xp.sqrt(s)
         # The same factor on both sides keeps the covariance exactly symmetric.

@@ -221,6 +221,23 @@ def test_fixed_type_posterior_sums_over_the_types(seed):
         assert result[s, n] == pytest.approx(math.log(likelihood), rel=1e-12)
 
 
+@pytest.mark.parametrize("change", [0.0, 0.03, 1.0])
+def test_change_of_class_and_type_is_the_chain_written_out(change):
+    rng = numpy.random.default_rng(4)
+    joint = rng.dirichlet(numpy.ones(12), size=6).T.reshape(3, 4, 6)
+    composition = rng.dirichlet(numpy.ones(4), size=3)
+    shifted = numpy.log(joint) + 500.0  # known up to a constant
+    after = numpy.exp(class_fusion.change_class_and_type(shifted, numpy.log(composition), change))
+    for n in range(6):
+        expected = numpy.zeros((3, 4))
+        for s, j, r, i in numpy.ndindex(3, 4, 3, 4):
+            q = 1.0 - change if s == r else change / 2.0
+            type_kept = float(i == j) if s == r else composition[r, i]
+            expected[r, i] += joint[s, j, n] * q * type_kept
+        # Rounding of logarithms near 500.
+        assert after[..., n] / after[..., n].sum() == pytest.approx(expected, rel=1e-12, abs=1e-13)
+
+
 def test_gate_and_wrapped_bearings():
     assert class_fusion.bearing_gate(15.0, 3.0, 0.1) == pytest.approx(25.2, abs=0.05)
     assert class_fusion.bearing_gate(1.5, 3.0, 0.1) == pytest.approx(5.52, abs=0.005)

@@ -5,6 +5,7 @@ import math
 
 import numpy
 import pytest
+import scipy.optimize
 from filtergym.filters import extended_kalman, geodesy, gnss_ins, satellites, singer
 from naive import dense
 
@@ -278,6 +279,45 @@ def test_what_is_not_available_changes_nothing():
     assert (nothing.mean == state).all()
     assert (nothing.covariance == P).all()
     assert (nothing.log_likelihood == 0.0).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_robust_update_is_the_minimum_of_hubers_cost(seed):
+    """Each observation in its turn: where the derivative of prediction's and Huber's cost along P h is zero."""
+    state, P, residual, rows = random_update(seed)
+    P, residual = 0.01 * P, 5.0 * residual
+    H, r, k = dense(rows, state), SENSOR_SIGMA**2, numpy.linspace(0.5, 3.0, 14)
+    result = extended_kalman.update_one_by_one(state, P, residual, rows, r, numpy.ones(14), k)
+    beyond = 0
+    for lane in list(numpy.ndindex(state.shape[1:]))[:4]:
+        at = (..., *lane)
+        x, C, log_likelihood = numpy.zeros(17), P[at].copy(), 0.0
+        for j, h in enumerate(H[at]):
+            p, nu, root = h @ C @ h, residual[at][j] - h @ x, math.sqrt(r[j])
+
+            def slope(t, p=p, nu=nu, root=root, k=k[j]):
+                return t - max(-k, min(k, (nu - p * t) / root)) / root
+
+            t = scipy.optimize.brentq(slope, -k[j] / root - 1.0, k[j] / root + 1.0, xtol=1e-300, rtol=1e-14)
+            beyond += abs(nu - p * t) > k[j] * root * (1.0 + 1e-9)
+            s = nu / t
+            x, C = x + C @ h * t, C - numpy.outer(C @ h, C @ h) / s
+            log_likelihood -= 0.5 * (nu**2 / s + math.log(2.0 * math.pi * s))
+        sigma = numpy.sqrt(numpy.diag(C))
+        # The same rounding as between the forms of the plain update.
+        assert (abs(result.mean[at] - state[at] - x) / sigma).max() < 1e-8
+        assert abs((result.covariance[at] - C) / numpy.outer(sigma, sigma)).max() < 1e-8
+        assert result.log_likelihood[at] == pytest.approx(log_likelihood, rel=1e-8)
+    assert 5 < beyond < 50
+
+
+def test_robust_update_without_thresholds_is_the_plain_one():
+    state, P, residual, rows = random_update(0)
+    arguments = (state, P, residual, rows, SENSOR_SIGMA**2, numpy.ones(14))
+    plain = extended_kalman.update_one_by_one(*arguments)
+    robust = extended_kalman.update_one_by_one(*arguments, [math.inf] * 14)
+    for one, other in zip(plain[:3], robust[:3], strict=True):
+        assert (one == other).all()
 
 
 def test_fewer_than_four_satellites_still_correct_what_they_see():

@@ -282,6 +282,48 @@ def test_weights_against_bayes_written_out(cls, arguments):
         previous = after.bank.probabilities
 
 
+@pytest.mark.parametrize("arguments", [{}, {"change": 0.1, "refused": 0.7, "esm": 0.4}])
+def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
+    task = make_task(ID, "weights", "crowded")
+    p = task.parameters
+    recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
+    policy = baselines.ForgettingJointType(task, **arguments)
+    change, refused, esm = (
+        arguments.get(n, d) for n, d in (("change", 0.002), ("refused", 0.0), ("esm", 1.0))
+    )
+    joint = numpy.repeat((composition / 3.0)[:, :, None], 8, axis=2)
+    last, state = numpy.zeros((4, 8)), None
+    lanes = started_lanes(task, range(8))
+    for step in range(60):
+        bank = lanes.state.bank
+        action, state = policy.predict(lanes.observe(), state, numpy.full(8, step == 0))
+        counts = esm * (bank.used_counts + refused * bank.refused_counts)
+        for n in range(8):
+            likelihood = numpy.exp(bank.log_likelihood[:, n] - bank.log_likelihood[:, n].max())
+            P = joint[:, :, n] * likelihood[:, None]
+            moved = numpy.zeros((3, 4))
+            for s, r in numpy.ndindex(3, 3):
+                moved[r] += P[s] * (1.0 - change) if s == r else P[s].sum() * change / 2.0 * composition[r]
+            P = moved * numpy.prod(recognition ** (counts - last)[:, n], axis=1)
+            joint[:, :, n] = P / P.sum()
+            # The observation compresses the logarithms; the last digits are lost.
+            assert action[n] == pytest.approx(joint[:, :, n].sum(axis=1), rel=1e-8, abs=1e-12)
+        last = counts
+        lanes.step(lambda episode, a=action: task.act(episode, a.T))
+
+
+def test_forgetting_nothing_is_the_joint_posterior():
+    task = make_task(ID, "weights", "random")
+    joint, kept = baselines.JointType(task), baselines.ForgettingJointType(task, change=0.0)
+    state = None
+    lanes = started_lanes(task, range(8))
+    for step in range(60):
+        shown = lanes.observe()
+        action, state = kept.predict(shown, state, numpy.full(8, step == 0))
+        assert action == pytest.approx(joint.predict(shown)[0], rel=1e-8, abs=1e-12)
+        lanes.step(lambda episode, a=action: task.act(episode, a.T))
+
+
 def test_the_printed_rule_by_weights_is_zero_evidence():
     """Where nothing is refused, all decisions are those that (8) uses."""
     dataset = evaluate(ID, ["quasi-optimal", "ungated"], "paper", 200, **NEVER_REFUSED)

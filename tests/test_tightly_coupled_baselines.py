@@ -7,14 +7,16 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.reproduction import save_reproduction
 from filtergym.baselines.reproduction.measured import Measured
-from filtergym.baselines.tightly_coupled_navigation import metrics, policies, references
+from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
 from filtergym.baselines.tightly_coupled_navigation.reproduction import claims, experiment
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
+from filtergym.envs.task import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
+from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.rollout import run_bound, run_policy, run_reference
+from filtergym.evaluation.rollout import run_bound, run_estimator, run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
 from naive import dense
@@ -195,6 +197,70 @@ def test_stuck_check_switches_stuck_accelerometers_off():
     both = stuck[1:] & stuck[:-1]
     assert off[1:][both].all()
     assert not off[~stuck].any()
+
+
+def test_fallback_says_nothing_of_other_sensors():
+    task = make_task(ID, "gain")
+    check, fallback = policies.StuckCheck(task), policies.StuckCheckFallback(task)
+    bad = observed(task, average_nis=math.log1p(30.0))
+    assert (check.predict(bad)[0][0] > 0.0).tolist() == [True, False, True, True]
+    action, state = fallback.predict(bad)
+    assert action[0] == pytest.approx([0.0, 0.0, check.predict(bad)[0][0, 2], 0.0], abs=0.0)
+    assert (action[1] == 0.0).all()
+    assert fallback.predict(bad, state, numpy.zeros(2, bool))[0].tolist() == [[0.0, 0.0, 1.0, 0.0]] * 2
+
+
+# --- estimators
+
+
+def test_huber_without_thresholds_is_the_paper():
+    class Plain(estimators.Huber):
+        def __init__(self, task):
+            super().__init__(task, {})
+
+    dataset = evaluate(ID, {"paper": "multi-hypothesis", "plain": Plain}, episodes=8, horizon=100)
+    for name in ("error", "nees"):
+        assert (dataset[name][0] == dataset[name][1]).all()
+
+
+def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
+    task = make_task(ID)
+    available = numpy.ones((14, 4))
+    available[8:11, 1] = 0.0
+    available[9, 2:] = 0.0
+    measurement = Measurement(*[None] * 2, available, *[None] * 4)
+    check = estimators.HuberStuckCheck(task, rates=2.0, manoeuvre=3.0).huber.bank
+    average = numpy.full((4, 3, 4), 9.0)
+    average[1, 2, 3] = 2.9
+    state = check.start(Initial(numpy.ones((17, 4)), numpy.ones((17, 17, 4))))._replace(average_nis=average)
+    usual = estimators.EFFICIENT
+    thresholds = numpy.stack(check.thresholds(state, measurement))
+    for lane, plain in enumerate([False, True, True, False]):
+        expected = [math.inf] * 14 if plain else [usual] * 4 + [2.0] * 4 + [math.inf] * 6
+        assert thresholds[:, lane].tolist() == expected
+    assert (numpy.stack(estimators.Huber(task).bank.thresholds(state, measurement)) == usual).all()
+
+
+def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
+    task = make_task(
+        ID, rate_fault_probability=0.0, stick_probability=1.0, horizon=200, satellites_outage=0.5
+    )
+    estimator = estimators.HuberStuckCheck(task)
+    seen, told = [], []
+    predict = estimator.huber.bank.predict
+
+    def watched(state, measurement):
+        seen.append(measurement.available)
+        return predict(state, measurement)
+
+    estimator.huber.bank.predict = watched
+    run_estimator(task, estimator, episode_seeds("test", 5, 8), told.append, lambda _: None)
+    stuck = numpy.stack([episode.truth.stuck for episode in told])
+    there = numpy.stack([episode.measurement.available for episode in told])
+    assert (stuck.sum(axis=0) > 0).all()
+    assert (there == 0.0).any()
+    there[:, 8:11] *= 1.0 - stuck[:, None]
+    assert (numpy.stack(seen) == there).all()
 
 
 def test_tuning_counts_decisions():

@@ -3,6 +3,7 @@
 Equation numbers and readings are those of the task's paper (Ivanov, Seliverstov).
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,6 +14,7 @@ from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
+from ...filters.small_matrices import apply
 from ..table import Baselines, Tunable
 from .metrics import metrics
 from .references import Ideal, KnownClassBound
@@ -145,6 +147,39 @@ class JointType(_Posterior):
         return self.log_prior + self.radar(observation) + esm
 
 
+class ForgettingJointType(JointType):
+    """Posterior over type and class together where the class may change and bring its own type: old evidence fades.
+
+    Args:
+        task: the problem.
+        change: probability that the class changes from one decision to the next; by default once in 500 scans,
+            four times the length of an episode.
+        refused: as in :class:`JointType`.
+        esm: likewise.
+    """
+
+    def __init__(
+        self, task: RadarEsmTracking, change: float = 0.002, refused: float = 0.0, esm: float = 1.0
+    ) -> None:
+        super().__init__(task, refused, esm)
+        self.change = change
+        self.log_start = self.log_prior[:, None] + self.log_composition[..., None]
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Radar under the class before, change of class, decisions about the type now."""
+        radar, counts = self.radar(observation), self.esm * self.counts(observation, self.refused)
+        joint, last_radar, last_counts = (self.log_start, 0.0, 0.0) if state is None else state
+        joint = numpy.where(start, self.log_start, joint)
+        joint = joint + (radar - numpy.where(start, 0.0, last_radar))[:, None]
+        joint = class_fusion.change_class_and_type(joint, self.log_composition, self.change)
+        new_counts = counts - numpy.where(start, 0.0, last_counts)
+        joint = joint + apply(self.log_recognition[..., None], new_counts)
+        weights = (
+            imm.normalised_exponential(joint.reshape(-1, joint.shape[-1])).reshape(joint.shape).sum(axis=1)
+        )
+        return weights.T, (joint, radar, counts)
+
+
 class Leaky(_Posterior):
     """The paper's rule (8) with class transitions: it never becomes so sure that it cannot turn round.
 
@@ -179,6 +214,11 @@ def _fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callabl
     return {}, lambda task: FixedWeights(task, weights)
 
 
+def _forgetting(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+    change, refused, esm = 10.0 ** values["log10_change"], values["refused"], values["esm"]
+    return {}, lambda task: ForgettingJointType(task, change, refused, esm)
+
+
 TUNABLE = {
     "fixed-weights": Tunable(
         "weights",
@@ -198,6 +238,12 @@ TUNABLE = {
         {"refused": 0.0, "esm": 1.0},
         lambda values: ({}, lambda task: JointType(task, values["refused"], values["esm"])),
     ),
+    "forgetting-joint-type": Tunable(
+        "weights",
+        {"log10_change": (-6.0, -0.5), "refused": (0.0, 1.0), "esm": (0.0, 1.0)},
+        {"log10_change": math.log10(0.002), "refused": 0.0, "esm": 1.0},
+        _forgetting,
+    ),
 }
 
 BASELINES = Baselines(
@@ -205,6 +251,7 @@ BASELINES = Baselines(
     policies={
         "quasi-optimal": QuasiOptimal,
         "joint-type": JointType,
+        "forgetting-joint-type": ForgettingJointType,
         "leaky": Leaky,
         "ungated": Ungated,
         "most-probable": MostProbable,
@@ -224,6 +271,7 @@ BASELINES = Baselines(
     benchmark=(
         "quasi-optimal",
         "joint-type",
+        "forgetting-joint-type",
         "leaky",
         "ungated",
         "most-probable",

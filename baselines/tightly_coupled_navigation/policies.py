@@ -15,6 +15,7 @@ from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, Tunable
+from .estimators import EFFICIENT, Huber, HuberStuckCheck
 from .metrics import metrics
 from .references import KnownMode, KnownModeBound
 
@@ -161,6 +162,20 @@ class StuckCheck(NisAdaptive):
         return action, readings
 
 
+class StuckCheckFallback(StuckCheck):
+    """`stuck-check` that falls back to the paper's action wherever the accelerometers give no cause for another.
+
+    Under `stuck-check` an excess of the pseudoranges makes them noisier. Between houses it comes from errors that last,
+    which are then believed all the same, and the dynamics with them.
+    """
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Keep what is said of the accelerometers."""
+        action, readings = super().act(observation, state, start)
+        only = numpy.arange(action.shape[1]) == self.switch
+        return action * only, readings
+
+
 # --- what can be tuned
 
 
@@ -204,6 +219,12 @@ TUNABLE = {
         {"threshold": 3.0, "rates": 0.0},
         _adaptive(StuckCheck),
     ),
+    "huber-stuck-check": Tunable(
+        None,
+        {"rates": (0.5, 6.0), "manoeuvre": (1.0, 20.0)},
+        {"rates": EFFICIENT, "manoeuvre": 4.0},
+        lambda values: ({}, lambda task: HuberStuckCheck(task, **values)),
+    ),
     "sticky": Tunable("evidence", {"log10_leave": (-6.0, -0.5)}, {"log10_leave": -4.0}, _sticky),
 }
 
@@ -214,12 +235,14 @@ BASELINES = Baselines(
         "sticky": Sticky,
         "nis-adaptive": NisAdaptive,
         "stuck-check": StuckCheck,
+        "stuck-check-fallback": StuckCheckFallback,
         "fixed-gain": FixedGain,
         "singer": Singer,
         "constant-velocity": ConstantVelocity,
         "rest": Rest,
         "random": RandomPolicy,
     },
+    estimators={"huber": Huber, "huber-stuck-check": HuberStuckCheck},
     references={"known-mode": KnownMode},
     bounds={"known-mode-bound": KnownModeBound},
     score_paper="multi-hypothesis",

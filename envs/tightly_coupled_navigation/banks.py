@@ -207,7 +207,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, task, combined = self.xp, self.task, state.predicted.combined
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
-        update = self._updated(state.predicted, measurement, task.sensor_variance)
+        update = self._updated(state, measurement, task.sensor_variance)
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
         return state._replace(
@@ -220,9 +220,10 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         )
 
     def _updated(
-        self, predicted: Prediction, measurement: Measurement, variance: Sequence[Any]
+        self, state: Filters, measurement: Measurement, variance: Sequence[Any]
     ) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
+        predicted = state.predicted
         expected, rows = gnss_ins.observe(
             predicted.mean,
             measurement.satellite_position[:, :, None],
@@ -232,8 +233,18 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         )
         residual = measurement.readings[:, None] - expected
         return extended_kalman.update_one_by_one(
-            predicted.mean, predicted.covariance, residual, rows, variance, measurement.available
+            predicted.mean,
+            predicted.covariance,
+            residual,
+            rows,
+            variance,
+            measurement.available,
+            self.thresholds(state, measurement),
         )
+
+    def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
+        """Thresholds of the robust update for each reading; None: the paper's update."""
+        return None
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Weigh the hypotheses by the action (step 7)."""
@@ -252,6 +263,11 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         else:
             last = xp.astype(xp.clip(action, 0.0 if control == "weights" else -1.0, 1.0), dtype)
         return self._weighed(state, probabilities, last)
+
+    def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
+        """Weigh the hypotheses by Bayes' rule (step 7), as the paper does."""
+        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
+        return self._weighed(state, probabilities, last_action)
 
     def _weighed(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
         """Combine (step 8), and predict to the next measurement."""
@@ -308,12 +324,11 @@ class NoiseBank(HypothesisBank):
             for i, sensor in enumerate(task.sensors)
             for nominal in task.sensor_variance[sensor.readings]
         ]
-        update = self._updated(state.predicted, measurement, variance)
+        update = self._updated(state, measurement, variance)
         state = state._replace(
             means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
         )
-        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
-        return self._weighed(state, probabilities, exponent)
+        return self.weigh_by_bayes(state, exponent)
 
     def covariance(self, state: Filters) -> Array:
         """Of the combination, when it is steered times the short average of the NIS per reading if that is above one.

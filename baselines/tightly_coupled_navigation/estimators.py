@@ -1,0 +1,125 @@
+"""Estimators of TightlyCoupledNavigation: the paper's bank with updates that no action can ask for."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from ...envs.observation import Array
+from ...envs.task import Initial
+from ...envs.tightly_coupled_navigation.banks import Filters, HypothesisBank
+from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
+from ...envs.tightly_coupled_navigation.world import Measurement
+
+EFFICIENT = 1.345
+"""Threshold that keeps 95 % of the efficiency where the noise is Gaussian (Huber, Robust Statistics, 1981)."""
+
+
+class HuberBank(HypothesisBank):
+    """The paper's bank with thresholds of the robust update.
+
+    Without accelerometers there are as many rates as unknown velocities. One that disagrees may be noisy; where they
+    disagree on the average a manoeuvre has begun, and a robust update would never follow it.
+
+    Args:
+        task: the problem.
+        thresholds: of each group of sensors by its name; of others none.
+        manoeuvre: short average of the normalised innovation squared of a rate, under the hypothesis that has the
+            smallest one, from which on updates without accelerometers are plain.
+    """
+
+    def __init__(
+        self, task: TightlyCoupledNavigation, thresholds: Mapping[str, float], manoeuvre: float
+    ) -> None:
+        super().__init__(task)
+        self.manoeuvre = manoeuvre
+        self.of_reading = [
+            thresholds.get(sensor.name, math.inf)
+            for sensor in task.sensors
+            for _ in range(sensor.readings.start, sensor.readings.stop)
+        ]
+
+    def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array]:
+        """Those of every reading, ``(N,)`` each; infinity where updates are plain."""
+        xp, forces = self.xp, self.task.sensors[2].readings
+        there = xp.all(measurement.available[forces] > 0.0, axis=0)
+        robust = there | (xp.min(state.average_nis[1], axis=0) < self.manoeuvre)
+        return [xp.where(robust, threshold, math.inf) for threshold in self.of_reading]
+
+
+class Huber:
+    """The paper's bank with Huber's robust update of every sensor: outliers pull no further than a threshold.
+
+    See ``filters/extended_kalman.py``.
+
+    Args:
+        task: the problem.
+        thresholds: of each group of sensors by its name; default: the usual one for all.
+        manoeuvre: see :class:`HuberBank`; by default every update is robust.
+    """
+
+    kind = "estimator"
+
+    def __init__(
+        self,
+        task: TightlyCoupledNavigation,
+        thresholds: Mapping[str, float] | None = None,
+        manoeuvre: float = math.inf,
+    ) -> None:
+        everywhere = {sensor.name: EFFICIENT for sensor in task.sensors}
+        self.bank = HuberBank(task, everywhere if thresholds is None else thresholds, manoeuvre)
+
+    def start(self, initial: Initial, N: int) -> Filters:
+        """Start every filter where everyone starts."""
+        return self.bank.start(initial)
+
+    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters]:
+        """One cycle of the bank."""
+        filters = self.bank.predict(memory, measurement)
+        filters = self.bank.weigh_by_bayes(filters, memory.last_action)
+        return filters.mean, filters.covariance, filters
+
+
+class Checked(NamedTuple):
+    """Memory of the check."""
+
+    filters: Filters
+    accelerometers: Array
+    """Last readings, ``(3, N)``, m/s^2; NaN before the first."""
+
+
+class HuberStuckCheck:
+    """Huber's update of ranges and rates, and accelerometers that repeat their last reading are left out at once.
+
+    Noise never repeats itself, so the first repeated reading shows the stuck sensor for certain. Robustness alone
+    cannot: a stuck accelerometer agrees with the prediction that it has made, and the outliers are the rates that
+    contradict it.
+
+    Args:
+        task: the problem.
+        rates: threshold of the pseudorange rates; that of the pseudoranges is the usual one.
+        manoeuvre: see :class:`HuberBank`.
+    """
+
+    kind = "estimator"
+
+    def __init__(
+        self, task: TightlyCoupledNavigation, rates: float = EFFICIENT, manoeuvre: float = 4.0
+    ) -> None:
+        self.task = task
+        self.huber = Huber(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
+
+    def start(self, initial: Initial, N: int) -> Checked:
+        """Start every filter where everyone starts."""
+        return Checked(self.huber.start(initial, N), math.nan * initial.mean[:3])
+
+    def update(self, measurement: Measurement, memory: Checked) -> tuple[Array, Array, Checked]:
+        """One cycle of the bank without what repeats itself."""
+        xp, forces = self.task.xp, self.task.sensors[2].readings
+        available, readings = measurement.available, measurement.readings[forces]
+        fresh = xp.any(readings != memory.accelerometers, axis=0)
+        kept = available[forces] * xp.astype(fresh, available.dtype)
+        available = xp.concat([available[: forces.start], kept, available[forces.stop :]])
+        mean, covariance, filters = self.huber.update(
+            measurement._replace(available=available), memory.filters
+        )
+        return mean, covariance, Checked(filters, readings)
