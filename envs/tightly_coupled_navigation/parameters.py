@@ -68,9 +68,9 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """White frequency noise of the receiver clock, m^2/s. Ours."""
     frequency_walk_density: float = parameter(0.036, above=0.0)
     """Random-walk frequency noise of the clock, m^2/s^3. Ours."""
-    angle_walk: float = parameter(0.01, above=0.0)
+    angle_walk: float = parameter(0.01, above=0.0, at_most=10.0)
     """Random walk of each attitude error, degrees per root second. Ours."""
-    attitude_rate_sigma: float = parameter(0.02, above=0.0)
+    attitude_rate_sigma: float = parameter(0.02, above=0.0, at_most=100.0)
     """Stationary rate of each attitude error, degrees/s. Ours."""
     attitude_rate_time: float = parameter(100.0, above=0.0)
     """Correlation time of the attitude rates, s. Ours."""
@@ -128,7 +128,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Limits of the speed of a random course that does not start at rest, m/s. Ours."""
     rest_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
     """That a random course starts at rest. Ours."""
-    true_increment_sigma: float = parameter(0.02, at_least=0.0)
+    true_increment_sigma: float = parameter(0.02, at_least=0.0, at_most=100.0)
     """True random velocity increment on legs of constant velocity of the random course, m/s per step. Ours:
     that of hypothesis 2, so that the known mode is the optimum."""
 
