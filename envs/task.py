@@ -35,6 +35,7 @@ of its own, on the same noise.
 """
 
 import copy
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -353,6 +354,14 @@ class Task(ABC):
         self.fields = self._blocks.fields
         self.action_space = self.bank.action_space
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Task":
+        """Share the task: nothing in it changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Pickle what it is made of; a module, its array namespace, cannot be."""
+        return _made_again, (type(self), self.parameters, self.control, self.xp.__name__, self.device)
+
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""
 
@@ -468,6 +477,10 @@ class Task(ABC):
         """What else an evaluation keeps of each measurement."""
         own = self._estimating(episode).records(episode.bank, episode.measurement)
         return {**own, **self.world.records(episode.truth)}
+
+
+def _made_again(cls: type[Task], parameters: Any, control: str, namespace: str, device: Any) -> Task:
+    return cls(parameters, control, importlib.import_module(namespace), device)
 
 
 def _named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
