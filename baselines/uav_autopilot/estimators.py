@@ -1,8 +1,8 @@
-"""Estimators of UavAutopilot that learn the noise in flight: of each sensor, and of the gusts.
+"""Estimators of UavAutopilot: the settled filter, and some that learn the noise of sensors and gusts in flight.
 
-Each closes the loop and flies its own truth. No action can do what they do: it scales the whole process noise, and
-a noisier sensor asks for another change of the filter than stronger gusts do. Equation numbers are those of
-``filters/noise_adaptation.py``.
+Each closes the loop and flies its own truth. No action can do what the latter do: it scales the whole process noise,
+and a noisier sensor asks for another change of the filter than stronger gusts do. Equation numbers are those of
+``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
 """
 
 from typing import Any, ClassVar, NamedTuple
@@ -10,10 +10,33 @@ from typing import Any, ClassVar, NamedTuple
 from ...envs.observation import Array
 from ...envs.task import Initial
 from ...envs.uav_autopilot.task import UavAutopilot
-from ...envs.uav_autopilot.world import Measurement
+from ...envs.uav_autopilot.world import Measurement, Start
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
+
+
+class SteadyKalman:
+    """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
+
+    kind = "estimator"
+
+    def __init__(self, task: UavAutopilot) -> None:
+        self.task, self.xp = task, task.xp
+        model, steady = task.design.model, task.design.steady
+        self.F, self.B, self.gain = (task.constant(part) for part in (model.F, model.B, steady.gain))
+        self.covariance = task.constant(steady.posterior)[:, :, None]
+
+    def start(self, initial: Start, N: int) -> Array:
+        """Mean at the start."""
+        return initial.mean
+
+    def update(self, measurement: Measurement, memory: Array) -> tuple[Array, Array, Array]:
+        """Equations (10), (11) with the gain of the algebraic Riccati equation."""
+        predicted = self.xp.matmul(self.F, memory) + self.B * measurement.control
+        innovation = measurement.reading - self.task.readings_of(predicted)
+        mean = predicted + self.xp.matmul(self.gain, measurement.available * innovation)
+        return mean, self.covariance + 0.0 * measurement.number, mean
 
 
 class Filter(NamedTuple):

@@ -98,30 +98,6 @@ class Matched(_ToldTheNoise):
         return updated.mean, covariance, Initial(updated.mean, updated.covariance)
 
 
-class SteadyKalman:
-    """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
-
-    kind = "reference"
-    knows = "nothing hidden, but its gain is outside what the action can steer"
-
-    def __init__(self, task: UavAutopilot) -> None:
-        self.task, self.xp = task, task.xp
-        model, steady = task.design.model, task.design.steady
-        self.F, self.B, self.gain = (task.constant(part) for part in (model.F, model.B, steady.gain))
-        self.covariance = task.constant(steady.posterior)[:, :, None]
-
-    def start(self, initial: Start, truth: Truth) -> Array:
-        """Mean at the start."""
-        return initial.mean
-
-    def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array, Array]:
-        """Equations (10), (11) with the gain of the algebraic Riccati equation."""
-        predicted = self.xp.matmul(self.F, memory) + self.B * measurement.control
-        innovation = measurement.reading - self.task.readings_of(predicted)
-        mean = predicted + self.xp.matmul(self.gain, measurement.available * innovation)
-        return mean, self.covariance + 0.0 * measurement.number, mean
-
-
 class KnownNoiseBound(_ToldTheNoise):
     """Covariance of the best estimate for an estimator that is told plant and noise: the Riccati recursion.
 
