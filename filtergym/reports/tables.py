@@ -45,7 +45,9 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
     )
     if median is None or wins is None or median.value is None:
         return ["-", "-"]
-    return [f"{100.0 * (median.value - 1.0):+.1f}", f"{100.0 * wins.value:.0f}"]
+    percent = 100.0 * (median.value - 1.0)
+    digits = 1 if abs(percent) < 1000.0 else 0
+    return [f"{percent:+,.{digits}f}", f"{100.0 * wins.value:.0f}"]
 
 
 def consistency(record: Any) -> str:
