@@ -9,6 +9,9 @@ from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .tables import with_interval
 
+NEGLIGIBLE = 5e-5
+"""Relative difference of costs that is rounding, or as good as none."""
+
 
 class Place(NamedTuple):
     """A ranked competitor with what is said of it."""
@@ -41,7 +44,9 @@ def ranking_sentence(records: Sequence[Record]) -> str:
     best, *others = ranking(records)
     difference = found.get((best.name, "relative_cost_difference"))
     sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) costs least"
-    if best.name != paper and difference is not None and difference.value is not None:
+    if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
+        sentence += f", but not significantly less than `{paper}`"
+    elif best.name != paper and difference is not None and difference.value is not None:
         median, wins = found[best.name, "median_cost_ratio"].value, found[best.name, "win_rate"].value
         sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
         if median is not None and wins is not None:
