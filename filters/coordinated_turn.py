@@ -40,12 +40,12 @@ def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
     return xp.where(small, series, (cosine - ratio) / xp.where(small, 1.0, angle))
 
 
-def turned(state: Array, T: float) -> Array:
+def turned(state: Array, T: float | Array) -> Array:
     """State after an interval at constant turn rate.
 
     Args:
         state: position (m), velocity (m/s) and turn rate (rad/s), ``(5, ...)``.
-        T: interval, s.
+        T: interval, s; one for all, or ``(...)``.
     """
     xp = namespace(state)
     x, y, vx, vy, omega = (state[i] for i in range(5))

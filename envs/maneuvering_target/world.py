@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from ...filters import polar
+from ...filters import coordinated_turn, polar
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws
 from ..observation import Array
@@ -220,16 +220,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
 
     def _after(self, time: Array, turn: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
         """Position and velocity after a time on a circle, or a straight line, at constant speed."""
-        xp, angle = self.xp, turn * time
-        turning = xp.abs(turn) > 0.0
-        divisor = xp.where(turning, turn, 1.0)
-        along = xp.where(turning, xp.sin(angle) / divisor, time)
-        # 1 - cos, in a form that keeps its digits for small angles.
-        across = xp.where(turning, 2.0 * xp.sin(0.5 * angle) ** 2 / divisor, 0.0)
-        flown = xp.stack(
-            [along * velocity[0] - across * velocity[1], across * velocity[0] + along * velocity[1]]
-        )
-        return position + flown, self._rotated(velocity, angle)
+        state = coordinated_turn.turned(self.xp.concat([position, velocity, turn[None]]), time)
+        return state[:2], state[2:4]
 
     def on_legs(self, legs: Legs, scan: Array) -> tuple[Array, Array]:
         """Position and velocity at a scan."""
