@@ -33,6 +33,11 @@ BLOCK = 64
 """Rows of a block where an episode is longer than that: 64 rows keep 4096 lanes in cache-friendly memory."""
 
 
+def padded_width(count: int) -> int:
+    """Lanes that so many episodes take: the next multiple of ``LANE_MULTIPLE``."""
+    return -(-count // LANE_MULTIPLE) * LANE_MULTIPLE
+
+
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     """Return ``old`` with its last-axis entries ``lanes`` taken from ``new``, for nested tuples of arrays."""
     if old is None:
@@ -47,12 +52,12 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     return merged
 
 
-def _mapped(function: Callable[[Array], Array], part: Any) -> Any:
+def mapped(function: Callable[[Array], Array], part: Any) -> Any:
     """Return nested tuples of arrays with a function applied to every array."""
     if part is None:
         return None
     if isinstance(part, tuple):
-        parts = [_mapped(function, item) for item in part]
+        parts = [mapped(function, item) for item in part]
         return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
     return function(part)
 
@@ -87,7 +92,7 @@ class Lanes:
     ) -> None:
         self.task = task
         self.count = count
-        self.width = -(-count // LANE_MULTIPLE) * LANE_MULTIPLE
+        self.width = padded_width(count)
         self.paper = paper
         self._begun = begun
         self.paper_state: Any = None
@@ -165,7 +170,7 @@ class Lanes:
 
     def _padded(self, values: numpy.ndarray, fill: float) -> Array:
         """Widen ``(rows, lanes)`` to a multiple of eight lanes."""
-        width = -(-values.shape[1] // LANE_MULTIPLE) * LANE_MULTIPLE
+        width = padded_width(values.shape[1])
         padded = numpy.full((values.shape[0], width), fill)
         padded[:, : values.shape[1]] = values
         return self.task.xp.asarray(padded, device=self.task.device)
@@ -250,7 +255,7 @@ class Lanes:
     def detach(self) -> None:
         """Cut the gradient: what follows no longer remembers how it came about (torch only)."""
         self.state, self.paper_state, self._interval_mean = (
-            _mapped(lambda tensor: tensor.detach(), part)
+            mapped(lambda tensor: tensor.detach(), part)
             for part in (self.state, self.paper_state, self._interval_mean)
         )
 

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation: every policy, reference estimator and bound on identical noise.
+"""Monte Carlo evaluation: every policy, estimator, reference and bound on identical noise.
 
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
 """

@@ -9,7 +9,7 @@ from typing import Any
 import numpy
 
 from ..envs.environment import checked_action
-from ..envs.lanes import LANE_MULTIPLE, Lanes
+from ..envs.lanes import Lanes, mapped, padded_width
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
 from .competitors import Policy
@@ -144,7 +144,7 @@ def run_estimator(
     Raises:
         ValueError: if the estimator raises, or returns what is no mean and covariance.
     """
-    width = -(-len(seeds) // LANE_MULTIPLE) * LANE_MULTIPLE
+    width = padded_width(len(seeds))
     filled = numpy.minimum(numpy.arange(width), len(seeds) - 1)  # the last episode is repeated
     memory: Any = None
     step = 0
@@ -174,10 +174,7 @@ def chosen_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
     entry, without that axis.
     """
-    if isinstance(part, tuple):
-        parts = [chosen_lanes(item, lanes) for item in part]
-        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
-    return None if part is None else part[..., lanes]
+    return mapped(lambda values: values[..., lanes], part)
 
 
 @contextmanager
