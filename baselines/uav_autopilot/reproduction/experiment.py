@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy
 
 from ....envs.catalogue import make_task
-from ....envs.task import Episode, Outside
+from ....envs.task import Episode
 from ....envs.uav_autopilot.task import UavAutopilot
 from ....evaluation.seeds import episode_seeds
-from ....filters import linear_systems, packed_covariance
+from ....filters import linear_systems
 from ...reproduction import Progress
 from ...reproduction.measured import evaluated, mean, recorded
 from ..policies import Kalman, RawSensors
@@ -70,13 +70,6 @@ class Signals:
         return 10.0 * math.log10(self.variance("observation") / self.variance("estimate"))
 
 
-def _own_covariance(task: UavAutopilot, episode: Episode) -> numpy.ndarray:
-    """Covariance by the paper's equation (12); what the environment reports is widened by the innovations."""
-    if isinstance(episode.bank, Outside):
-        return task.covariance(episode)
-    return packed_covariance.unpack(episode.bank.estimate_covariance, len(task.components))
-
-
 def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) -> Signals:
     """Run one loop of ``LOOPS`` on test episodes."""
     control = "mode" if loop == "raw-sensors" else "gain"
@@ -85,7 +78,7 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
 
     def fields(episode: Episode) -> dict[str, numpy.ndarray]:
         error, said = task.error(episode), task.records(episode)
-        covariance = numpy.moveaxis(_own_covariance(task, episode), -1, 0)
+        covariance = numpy.moveaxis(task.covariance(episode), -1, 0)
         whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
         without_filter = numpy.full_like(said["output"], numpy.nan)
         innovation = said.get("innovation", without_filter)
