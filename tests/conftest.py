@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from filtergym.envs.catalogue import catalogue, make_task
 
+from filtergym.__main__ import main
+
 # The same examples in every run, and no stored ones: a run can be repeated anywhere.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("repeatable")
@@ -52,6 +54,19 @@ def _one(space, rng):
     if isinstance(space, gym.spaces.Discrete):
         return rng.integers(space.n)
     return rng.uniform(space.low, space.high).astype(space.dtype)
+
+
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """Run the command line; returns exit code, output and errors."""
+
+    def run(*words):
+        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code, *capsys.readouterr()
+
+    return run
 
 
 @pytest.fixture

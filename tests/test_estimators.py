@@ -53,18 +53,11 @@ class Raw(Recording):
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
+def command(command, monkeypatch, tmp_path):
     """Run the command line in a folder of one's own; returns exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if place not in ("", str(tmp_path))])
-
-    def run(*words):
-        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, *capsys.readouterr()
-
-    return run
+    return command
 
 
 def test_a_plain_estimator_works_everywhere(env_id, short):

@@ -29,19 +29,6 @@ class Trap:
 
 
 @pytest.fixture
-def command(monkeypatch, capsys):
-    """Run the command line; returns exit code, output and errors."""
-
-    def run(*words):
-        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
 def stranger(tmp_path, monkeypatch):
     """A run's folder from a stranger, below the working directory; the name of the file that his code writes."""
     monkeypatch.chdir(tmp_path)
