@@ -2,7 +2,7 @@
 
 from setuptools import find_packages, setup
 
-ROOMS = ("filters", "envs", "evaluation", "baselines", "agents")
+ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents")
 
 setup(
     packages=[

@@ -47,7 +47,7 @@ def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) ->
             "Stable-Baselines3 resets a finished environment in the same step: make the vector environment "
             f'with autoreset_mode="SameStep", got {vector_env.autoreset_mode.value!r}'
         )
-    if vector_env.backend != "numpy":
+    if vector_env.backend == "torch":
         raise ValueError(
             f"Stable-Baselines3 takes NumPy arrays: use backend='numpy', got {vector_env.backend!r}"
         )

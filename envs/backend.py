@@ -1,14 +1,58 @@
-"""Where the arrays of a vector environment live: NumPy, or torch on a device."""
+"""What computes the steps of a task: code compiled for the processor, NumPy, or torch on a device."""
 
 from types import ModuleType
 from typing import Any
 
 import numpy
 
-from .catalogue import nearest
+from ..compiler.namespace import NotTraceable
+from .catalogue import make_task, nearest
+from .compiled import AVAILABLE, compiled, warn_of
 from .observation import Array
+from .task import Task
 
-BACKENDS = ("numpy", "torch")
+BACKENDS = ("auto", "compiled", "numpy", "torch")
+
+
+def task_on(
+    backend: str,
+    id: str,
+    control: str | None = None,
+    scenario: Any = None,
+    *,
+    device: Any = None,
+    threads: int = 1,
+    **keywords: Any,
+) -> Task:
+    """Make a task that computes on a backend; ``task.backend`` says on which.
+
+    Args:
+        backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
+            traced, else NumPy.
+        id: environment id; what follows is that of :func:`~.catalogue.make_task`.
+        control: likewise.
+        scenario: likewise.
+        device: of torch, such as "cuda:1".
+        threads: how many share the lanes of the compiled backend.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for an unknown name or backend, a parameter out of its limits, a device that is not there, less
+            than one thread, or a task that cannot be compiled and was asked to be.
+        ImportError: if the backend needs a library that is not installed.
+    """
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
+    xp, device = array_backend(backend, device)
+    task = make_task(id, control, scenario, xp, device, **keywords)
+    if backend == "compiled" or (backend == "auto" and AVAILABLE):
+        try:
+            return compiled(task, threads)
+        except NotTraceable as error:
+            if backend == "compiled":
+                raise ValueError(f"{task.id} cannot be compiled: {error}") from error
+            warn_of(task.id, error)
+    return task
 
 
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
@@ -17,7 +61,7 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
     torch is imported here and only when asked for.
 
     Args:
-        backend: "numpy" or "torch".
+        backend: one of ``BACKENDS``; all but "torch" compute on NumPy arrays.
         device: None for the backend's default (the CPU), or what ``torch.device`` takes, such as "cuda:1".
 
     Returns:
@@ -29,10 +73,10 @@ def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:
     """
     if backend not in BACKENDS:
         raise nearest("backend", backend, BACKENDS)
-    if backend == "numpy":
+    if backend != "torch":
         if device not in (None, "cpu"):
             raise ValueError(
-                f"backend 'numpy' works on the CPU only, got device {device!r}; use backend='torch'"
+                f"backend {backend!r} works on the CPU only, got device {device!r}; use backend='torch'"
             )
         return numpy, None
     try:

@@ -9,9 +9,9 @@ import numpy
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from .backend import array_backend, host_array, is_tensor, tensor_on
-from .catalogue import find_scenario, make_task, nearest
-from .lanes import Lanes
+from .backend import host_array, is_tensor, task_on, tensor_on
+from .catalogue import find_scenario, nearest
+from .lanes import Lanes, mean_of
 from .observation import Array, Field
 from .reward import REWARDS, paper_task, reward
 from .task import Task
@@ -25,7 +25,13 @@ def _observation_space(task: Task) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (len(task.fields),), numpy.float64)
 
 
+FEW = 16
+"""Numbers that are looked at one by one sooner than by NumPy."""
+
+
 def _all_finite(values: Array) -> bool:
+    if isinstance(values, numpy.ndarray) and values.size <= FEW:
+        return all(map(math.isfinite, values.ravel().tolist()))
     # The sum is finite unless an entry is not, and costs a third of asking for every entry. It may overflow.
     with numpy.errstate(over="ignore", invalid="ignore"):
         return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
@@ -76,15 +82,23 @@ class _Face:
         self.detailed_info = detailed_info
         self.lanes = Lanes(task, count, paper_task(task) if reward_kind == "relative" else None)
 
+    @property
+    def backend(self) -> str:
+        """What computes the steps: "compiled", "numpy" or "torch"."""
+        return self.task.backend
+
     def _pay(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
-        """Step the lanes and return the mean reward over the measurements of this decision.
+        """Step the lanes and return the mean reward over the measurements of this decision, ``(count,)``.
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
+        if not self.detailed_info and watch is None:
+            return self.lanes.pay(action, self.reward_kind)
         task = self.task
         rewards: list[Array] = []
+        widened = self.lanes.widened(action)
 
         def record(state: Any, paper_state: Any) -> None:
             rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
@@ -97,15 +111,13 @@ class _Face:
                 }
                 # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 for name, values in batch_last.items():
-                    info[name] = task.xp.asarray(task.xp.moveaxis(values, -1, 0), copy=True)
+                    moved = task.xp.moveaxis(values[..., : self.lanes.count], -1, 0)
+                    info[name] = task.xp.asarray(moved, copy=True)
             if watch is not None:
                 watch(state)
 
-        self.lanes.step(lambda state: task.act(state, action), record)
-        total = rewards[0]
-        for one in rewards[1:]:
-            total = total + one
-        return total / len(rewards) if len(rewards) > 1 else total
+        self.lanes.step(lambda state: task.act(state, widened), record)
+        return mean_of(rewards)[: self.lanes.count]
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
@@ -124,10 +136,12 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
+        backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.task_on`.
         **keywords: parameters of the task.
 
     Raises:
         ValueError: for an unknown name or a value out of its limits.
+        ImportError: for the compiled backend without llvmlite.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gymnasium.Env)
@@ -140,11 +154,14 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         reward: str = "cost",
         render_mode: str | None = None,
         detailed_info: bool = False,
+        backend: str = "auto",
         **keywords: Any,
     ) -> None:
+        if backend == "torch":
+            raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        self._open(make_task(task, control, scenario, **keywords), reward, 1, detailed_info)
+        self._open(task_on(backend, task, control, scenario, **keywords), reward, 1, detailed_info)
         self.render_mode = render_mode
         self.picture: EpisodePicture | None = None
         """What keeps and draws the episode; None without a render mode."""
@@ -171,7 +188,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
-        if self.lanes.state is None:
+        if not self.lanes.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
@@ -182,9 +199,11 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             def watch(state: Any) -> None:
                 picture.keep(state, array, shown)
 
-        paid = self._pay(self.lanes.widened(array[None]), info, watch)
-        self._show()
-        info = {name: values[0] for name, values in info.items()}
+        paid = self._pay(array[None], info, watch)
+        if self.picture is not None:
+            self._show()
+        if info:
+            info = {name: values[0] for name, values in info.items()}
         return self.lanes.observe()[0], float(paid[0]), False, bool(self.lanes.finished[0]), info
 
     def _show(self) -> None:
@@ -207,7 +226,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
                 'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
             )
             return None
-        if self.lanes.state is None:
+        if not self.lanes.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first render")
         if self.render_mode == "human":
             self._show()
@@ -230,11 +249,12 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, or a trajectory.
         reward: "cost" (default), "log-likelihood" or "relative".
-        backend: "numpy", or "torch": observations, rewards, masks and ``info`` are tensors, actions may be.
-            Episodes are the same, drawn by the same NumPy generators; float64 results differ by rounding.
-            Gradients flow from rewards and observations back to actions that require them, over all steps
+        backend: "auto" (default) or "compiled", "numpy", see :func:`~.backend.task_on`; or "torch": observations,
+            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
+            same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and observations back to actions that require them, over all steps
             since the last reset; pass detached actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
+        threads: how many share the sub-environments, of the compiled backend; the numbers stay the same.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
         max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
@@ -243,7 +263,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     Raises:
         ValueError: for an unknown name, a value out of its limits, or a device that is not there.
-        ImportError: for the torch backend without torch.
+        ImportError: for a backend whose library is not installed.
     """
 
     def __init__(
@@ -253,8 +273,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: str | None = None,
         scenario: str | Trajectory | None = None,
         reward: str = "cost",
-        backend: str = "numpy",
+        backend: str = "auto",
         device: Any = None,
+        threads: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         detailed_info: bool = False,
@@ -262,11 +283,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        xp, self.device = array_backend(backend, device)
-        self.backend = backend
-        self._open(
-            make_task(task, control, scenario, xp, self.device, **keywords), reward, num_envs, detailed_info
-        )
+        made = task_on(backend, task, control, scenario, device=device, threads=threads, **keywords)
+        self.device = made.device
+        self._open(made, reward, num_envs, detailed_info)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
@@ -326,7 +345,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
                     f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
                     f"at least one True, got {mask!r}"
                 )
-            if self.lanes.state is None and not mask.all():
+            if not self.lanes.begun and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
             chosen = numpy.flatnonzero(mask).tolist()
         self._seed(seed, chosen)
@@ -338,7 +357,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Array, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         """Apply the actions to the measurements just shown, then show the next ones."""
-        if self.lanes.state is None:
+        if not self.lanes.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         waiting = self._finished
         if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
@@ -348,7 +367,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         array = self._actions(actions)
         info: dict[str, Any] = {}
-        paid = self._pay(self.lanes.widened(array), info)[: self.num_envs]
+        paid = self._pay(array, info)
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self.lanes.restart(numpy.flatnonzero(waiting).tolist())
@@ -375,12 +394,12 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             return {}
         masked = {}
         for name, values in info.items():
-            masked[name], masked[f"_{name}"] = values[: self.num_envs], self._mask(mask)
+            masked[name], masked[f"_{name}"] = values, self._mask(mask)
         return masked
 
     def _actions(self, actions: Any) -> Array:
         array = checked_action(self.single_action_space, actions, self.num_envs)
-        if self.backend == "numpy":
+        if self.backend != "torch":
             return host_array(array)
         tensor = tensor_on(array, self.device)
         # As in NumPy, where clipping whole numbers to limits that are floats gives floats.
@@ -389,7 +408,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
         """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
-        return lanes.copy() if self.backend == "numpy" else tensor_on(lanes, self.device)
+        return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
     def _final_observations(self, last: Array, done: numpy.ndarray) -> Array:
         """Gymnasium's form: an object for each finished sub-environment, None elsewhere.
@@ -397,7 +416,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
         transfer for each lane.
         """
-        if self.backend != "numpy":
+        if self.backend == "torch":
             return last
         final = numpy.full(self.num_envs, None, dtype=object)
         for lane in done:

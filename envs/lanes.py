@@ -15,15 +15,24 @@ environment with the same seed bit for bit.
 
 **The noise ring.** All lanes share one clock. A lane that restarts writes its rows into the ring from the
 current slot on, so that every step reads one contiguous slice, whatever the lanes' own times are.
+
+**Two ways to step.** :meth:`Lanes.step` shows every state on the way to whoever asks, in arrays that never change.
+:meth:`Lanes.pay` only wants rewards and observations; a compiled task then moves its episodes in memory of its own
+(:class:`~.compiled.Stepper`), and :attr:`Lanes.state` is a copy of it.
 """
 
 import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium
 import numpy
 
+from ..compiler.functions import mapped
+from ..filters.ordered_sums import ordered_sum
+from .compiled import MANY, Stepper
 from .observation import Array
+from .reward import reward
 from .task import Episode, Task
 
 LANE_MULTIPLE = 8
@@ -31,6 +40,8 @@ LONGEST_BLOCK = 256
 """Measurements of noise that an episode draws at once."""
 BLOCK = 64
 """Rows of a block where an episode is longer than that: 64 rows keep 4096 lanes in cache-friendly memory."""
+DRAWN = 64
+"""Lanes whose noise is drawn before it is put into the ring: it is still in the cache then."""
 
 
 def padded_width(count: int) -> int:
@@ -45,21 +56,15 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     if isinstance(old, tuple):
         parts = [_replace_lanes(a, b, lanes) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    # A copy, because states are never changed in place: someone may still hold the old one. In the type of
-    # the new one: float32 actions leave float32 in a state, and a fresh lane must not be rounded to it.
+    # A copy, because states are never changed in place: someone may still hold the old one.
     merged = old.astype(new.dtype) if isinstance(old, numpy.ndarray) else old.to(new.dtype, copy=True)
     merged[..., lanes] = new[..., : len(lanes)]
     return merged
 
 
-def mapped(function: Callable[[Array], Array], part: Any) -> Any:
-    """Return nested tuples of arrays with a function applied to every array."""
-    if part is None:
-        return None
-    if isinstance(part, tuple):
-        parts = [mapped(function, item) for item in part]
-        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
-    return function(part)
+def mean_of(rewards: Sequence[Array]) -> Array:
+    """Mean over the measurements of one decision."""
+    return ordered_sum(rewards) / len(rewards) if len(rewards) > 1 else rewards[0]
 
 
 _REPLACED = ("state", "paper_state", "_interval_mean", "_clock")
@@ -95,10 +100,17 @@ class Lanes:
         self.width = padded_width(count)
         self.paper = paper
         self._begun = begun
-        self.paper_state: Any = None
         if paper is not None:
             self._paper_action = self._constant_action(paper)
-        self.state: Any = None
+        self._episodes: list[Any] = [None, None]
+        """The task's episodes and the paper's; None where they are in a stepper's memory."""
+        self._steppers: dict[str, list[Stepper]] = {}
+        self._moving: list[Stepper] = []
+        """Those whose memory holds the episodes."""
+        self._shown: Any = None
+        """What they show, ``(width, fields)``."""
+        self._shown_to = False
+        """Whether somebody else has that array."""
         self.generators: list[numpy.random.Generator] = []
         self.decisions = numpy.zeros(count, dtype=numpy.int64)
         self.decisions_per_episode = task.horizon // task.decision_interval
@@ -119,54 +131,67 @@ class Lanes:
 
     # --- noise
 
-    def _rows(self, lanes: Sequence[int], generators: Sequence[Any]) -> numpy.ndarray:
-        """Draw ``_slots`` rows for each lane: ``(slots, row width, lanes)``."""
-        noise = self.task.noise
-        drawn = numpy.empty((len(lanes), self._slots, self._row_width))
-        if noise.row_uniforms == 0:
-            flat = drawn.reshape(len(lanes), -1)
-            for i, generator in enumerate(generators):
-                generator.standard_normal(out=flat[i])
-        else:
-            for i, generator in enumerate(generators):
-                drawn[i, :, : noise.normals] = generator.standard_normal((self._slots, noise.normals))
-                drawn[i, :, noise.normals :] = generator.random((self._slots, noise.row_uniforms))
-        return numpy.moveaxis(drawn, 0, -1)
+    def _draw_rows(self, lanes: Sequence[int], generators: Sequence[Any], before: numpy.ndarray) -> None:
+        """Draw ``_slots`` rows for each lane and write them into the ring from the current slot on.
 
-    def _draw_episode(self, lanes: Sequence[int]) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray]:
-        """Uniforms, initial normals and first rows of new episodes, lanes last."""
+        Args:
+            lanes: ascending.
+            generators: theirs.
+            before: filled with normal numbers that are drawn before the rows, ``(lanes, any number)``.
+        """
+        task, noise = self.task, self.task.noise
+        first = self._clock % self._slots
+        ahead = self._slots - first
+        on_host = task.xp is numpy
+        if self._ring is None:
+            shape = (self._slots, self._row_width)
+            self._ring = task.xp.zeros((*shape, self.width), dtype=task.xp.float64, device=task.device)
+        # In portions: what was drawn is turned into the ring while it is in the cache. A device gets all at once.
+        portion = DRAWN if on_host else len(lanes)
+        ahead_of_rows = before.shape[1]
+        drawn = numpy.empty((min(portion, len(lanes)), ahead_of_rows + self._slots * self._row_width))
+        rows = drawn[:, ahead_of_rows:].reshape(len(drawn), self._slots, self._row_width)
+        for start in range(0, len(lanes), portion):
+            chosen = lanes[start : start + portion]
+            for i, (generator, numbers) in enumerate(
+                zip(generators[start : start + portion], drawn, strict=False)
+            ):
+                if noise.row_uniforms == 0:
+                    generator.standard_normal(out=numbers)
+                else:
+                    generator.standard_normal(out=numbers[:ahead_of_rows])
+                    rows[i, :, : noise.normals] = generator.standard_normal((self._slots, noise.normals))
+                    rows[i, :, noise.normals :] = generator.random((self._slots, noise.row_uniforms))
+            before[start : start + portion] = drawn[: len(chosen), :ahead_of_rows]
+            turned: Any = numpy.moveaxis(rows[: len(chosen)], 0, -1)
+            side_by_side = range(chosen[0], chosen[0] + len(chosen))
+            where: Any = slice(side_by_side.start, side_by_side.stop)
+            if list(chosen) != list(side_by_side):
+                where = task.xp.asarray(chosen, device=task.device)
+            if not on_host:
+                turned = task.xp.asarray(numpy.ascontiguousarray(turned), device=task.device)
+            self._ring[first:, :, where] = turned[:ahead]
+            self._ring[:first, :, where] = turned[ahead:]
+
+    def _draw_episode(self, lanes: Sequence[int]) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Draw new episodes: return uniforms and initial normals, lanes last; the rows go into the ring."""
         noise = self.task.noise
         uniforms = numpy.empty((len(lanes), noise.uniforms))
         normals = numpy.empty((len(lanes), noise.initial_normals))
         generators = [self.generators[lane] for lane in lanes]
-        for i, generator in enumerate(generators):
-            if noise.uniforms:
-                generator.random(out=uniforms[i])
-            if noise.initial_normals:
-                generator.standard_normal(out=normals[i])
+        if noise.uniforms:
+            for generator, numbers in zip(generators, uniforms, strict=True):
+                generator.random(out=numbers)
+        before = normals
         if self._in_blocks:
+            for generator, numbers in zip(generators, normals, strict=True):
+                generator.standard_normal(out=numbers)
             generators = [numpy.random.default_rng(g.integers(0, 2**63, size=2)) for g in generators]
             for lane, child in zip(lanes, generators, strict=True):
                 self._children[lane] = child
-        return uniforms.T, normals.T, self._rows(lanes, generators)
-
-    def _store(self, rows: numpy.ndarray, lanes: Sequence[int]) -> None:
-        """Write rows into the ring from the current slot on."""
-        task = self.task
-        first = self._clock % self._slots
-        ahead = self._slots - first
-        rows = task.xp.asarray(numpy.ascontiguousarray(rows), device=task.device)
-        if self._ring is None:
-            self._ring = task.xp.zeros(
-                (self._slots, self._row_width, self.width), dtype=task.xp.float64, device=task.device
-            )
-        if len(lanes) == self.count:
-            self._ring[first:, :, : self.count] = rows[:ahead]
-            self._ring[:first, :, : self.count] = rows[ahead:]
-        else:
-            lanes = task.xp.asarray(lanes, device=task.device)
-            self._ring[first:, :, lanes] = rows[:ahead]
-            self._ring[:first, :, lanes] = rows[ahead:]
+            before = normals[:, :0]
+        self._draw_rows(lanes, generators, before)
+        return uniforms.T, normals.T
 
     def _padded(self, values: numpy.ndarray, fill: float) -> Array:
         """Widen ``(rows, lanes)`` to a multiple of eight lanes."""
@@ -185,30 +210,40 @@ class Lanes:
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
         """Start new episodes in some lanes (default: all) and let their first measurement arrive."""
+        task, xp = self.task, self.task.xp
         everyone = lanes is None or len(lanes) == self.count
-        chosen: Sequence[int] = range(self.count) if lanes is None or everyone else lanes
-        uniforms, normals, rows = self._draw_episode(chosen)
-        self._store(rows, chosen)
+        chosen: Sequence[int] = range(self.count) if lanes is None or everyone else list(lanes)
+        uniforms, normals = self._draw_episode(chosen)
+        index = numpy.asarray(chosen)
         # The padding lanes fly an average episode without noise.
         scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
-        first_row = self._padded(rows[0], 0.0)
-        episode = self.task.begin(scenario, start)
+        row = self._ring[self._clock % self._slots]
+        first_row = row[:, index if xp is numpy else xp.asarray(chosen, device=task.device)]
+        width = padded_width(len(chosen))
+        if width != len(chosen):
+            padding = xp.zeros((row.shape[0], width - len(chosen)), dtype=row.dtype, device=task.device)
+            first_row = xp.concat([first_row, padding], axis=1)
+        episode = task.begin(scenario, start)
         if self._begun is not None:
             self._begun(episode)
-        state = self.task.measure(episode, first_row)
-        paper_state = self.paper and self.paper.measure(self.paper.begin(scenario, start), first_row)
+        fresh = [task.measure(episode, first_row)]
+        if self.paper is not None:
+            fresh.append(self.paper.measure(self.paper.begin(scenario, start), first_row))
         if everyone:
-            self.state, self.paper_state = state, paper_state
-            self._interval_mean = None
+            self._episodes[: len(fresh)] = fresh
+            self._moving, self._interval_mean, self._shown = [], None, None
+        elif self._moving:
+            if self._shown_to:
+                self._show(self._shown.copy())
+            for stepper, new in zip(self._moving, fresh, strict=True):
+                stepper.replace(new, index)
+            self._shown[index] = task.observe(fresh[0])[:, : len(index)].T
         else:
-            lane_index = self.task.xp.asarray(list(chosen), device=self.task.device)
-            self.state = _replace_lanes(self.state, state, lane_index)
-            if self.paper is not None:
-                self.paper_state = _replace_lanes(self.paper_state, paper_state, lane_index)
+            lane_index = xp.asarray(chosen, device=task.device)
+            for i, new in enumerate(fresh):
+                self._episodes[i] = _replace_lanes(self._episodes[i], new, lane_index)
             if self._interval_mean is not None:
-                first_seen = self.task.observe(state)
-                self._interval_mean = _replace_lanes(self._interval_mean, first_seen, lane_index)
-        index = numpy.asarray(chosen)
+                self._interval_mean = _replace_lanes(self._interval_mean, task.observe(fresh[0]), lane_index)
         self._started[index] = self._clock
         self.decisions[index] = 0
 
@@ -222,13 +257,20 @@ class Lanes:
                 paper's state at that moment (None without ``paper``).
         """
         task = self.task
+        self._settle()
         shown = None
         for _ in range(task.decision_interval):
             posterior = update(self.state)
             paper_posterior = self.paper and self.paper.act(self.paper_state, self._paper_action)
             if record is not None:
                 record(posterior, paper_posterior)
-            self._advance(posterior, paper_posterior)
+            row = self._next_row()
+            if not isinstance(row, numpy.ndarray):
+                # Autograd may keep it until the backward pass, when the ring has long been written over.
+                row = row.clone()
+            self.state = task.measure(posterior, row)
+            if self.paper is not None:
+                self.paper_state = self.paper.measure(paper_posterior, row)
             if self._mean_fields and task.decision_interval > 1:
                 seen = task.observe(self.state)
                 shown = seen if shown is None else shown + seen
@@ -236,19 +278,118 @@ class Lanes:
             self._interval_mean = shown / task.decision_interval
         self.decisions += 1
 
-    def _advance(self, posterior: Any, paper_posterior: Any) -> None:
+    def _next_row(self) -> Array:
+        """Noise of the next measurement, ``(row width, width)``."""
         self._clock += 1
         if self._in_blocks:
             due = numpy.flatnonzero((self._clock - self._started) % self._slots == 0).tolist()
             if due:
-                self._store(self._rows(due, [self._children[lane] for lane in due]), due)
-        row = self._ring[self._clock % self._slots]
-        if not isinstance(row, numpy.ndarray):
-            # Autograd may keep it until the backward pass, when the ring has long been written over.
-            row = row.clone()
-        self.state = self.task.measure(posterior, row)
-        if self.paper is not None:
-            self.paper_state = self.paper.measure(paper_posterior, row)
+                self._draw_rows(due, [self._children[lane] for lane in due], numpy.empty((len(due), 0)))
+        return self._ring[self._clock % self._slots]
+
+    def pay(self, action: Array, kind: str) -> Array:
+        """Apply one decision and return what is paid for it, the mean over its measurements, ``(count,)``.
+
+        Args:
+            action: batch first, as the action space has it.
+            kind: one of :data:`~.reward.REWARDS`.
+        """
+        if self.task.backend != "compiled":
+            widened, rewards = self.widened(action), []
+
+            def record(state: Any, paper_state: Any) -> None:
+                rewards.append(reward(kind, self.task, state, self.paper, paper_state))
+
+            self.step(lambda state: self.task.act(state, widened), record)
+            return mean_of(rewards)[: self.count]
+        if self._moving is not self._steppers.get(kind):
+            self._move(kind)
+        steppers, interval = self._moving, self.task.decision_interval
+        steppers[0].action[..., : self.count] = action.T if action.ndim == 2 else action
+        if self._shown_to:
+            self._show(numpy.empty_like(self._shown))
+        mean = self._mean_fields if interval > 1 else []
+        rewards, total = [], 0.0
+        for _ in range(interval):
+            self._next_row()
+            row = self._ring_start + self._clock % self._slots * self._ring_stride
+            for stepper in steppers:
+                stepper.step(row)
+            paid = steppers[0].paid[: self.count].copy()
+            for paper in steppers[1:]:
+                paid -= paper.paid[: self.count]
+            rewards.append(paid)
+            if mean:
+                total = total + self._shown[:, mean]
+        if mean:
+            self._shown[:, mean] = total / interval
+        self.decisions += 1
+        return mean_of(rewards)
+
+    def _move(self, kind: str) -> None:
+        """Put the episodes into the memory of the steppers that pay so."""
+        if kind not in self._steppers:
+            tasks = [self.task] if self.paper is None else [self.task, self.paper]
+            # Both are paid their own cost; the difference is the relative reward.
+            own = "cost" if kind == "relative" else kind
+            self._steppers[kind] = [Stepper(task, own, self.width) for task in tasks]
+            for stepper in self._steppers[kind][1:]:
+                stepper.action[...] = self._paper_action
+        steppers, shown = self._steppers[kind], self._observed()
+        self._settle()
+        for stepper, episode in zip(steppers, self._episodes, strict=False):
+            stepper.load(episode)
+        self._moving, self._episodes = steppers, [None, None]
+        self._shown, self._shown_to = steppers[0].shown, False
+        self._shown[...] = shown.T
+        self._ring_start, self._ring_stride = self._ring.ctypes.data, self._ring.strides[0]
+
+    def _show(self, memory: numpy.ndarray) -> None:
+        """Let observations be written into other memory from now on."""
+        self._shown, self._shown_to = memory, False
+        self._moving[0].show_in(memory)
+
+    def _settle(self) -> None:
+        """Take the episodes out of a stepper's memory; what is shown is then observed from them."""
+        if self._moving:
+            shown = self._shown.T.copy()
+            self._episodes[: len(self._moving)] = [stepper.episode() for stepper in self._moving]
+            self._moving, self._shown = [], None
+            interval = self._mean_fields and self.task.decision_interval > 1
+            self._interval_mean = shown if interval else None
+
+    @property
+    def begun(self) -> bool:
+        """Whether there are episodes."""
+        return bool(self._moving) or self._episodes[0] is not None
+
+    def _state_of(self, which: int) -> Any:
+        return self._moving[which].episode() if which < len(self._moving) else self._episodes[which]
+
+    @property
+    def state(self) -> Any:
+        """The episodes after the last measurement, lanes padded to a multiple of eight."""
+        return self._state_of(0)
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        self._settle()
+        self._episodes[0] = state
+
+    @property
+    def paper_state(self) -> Any:
+        """The same of ``paper``."""
+        return self._state_of(1)
+
+    @paper_state.setter
+    def paper_state(self, state: Any) -> None:
+        self._settle()
+        self._episodes[1] = state
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what is bound to memory: a copy makes its own."""
+        self._settle()
+        return {**self.__dict__, "_steppers": {}}
 
     # --- for whoever steps them in an unusual way
 
@@ -261,6 +402,7 @@ class Lanes:
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
+        self._settle()
         kept = copy.deepcopy({name: getattr(self, name) for name in _REWRITTEN})
         return {"count": self.count, **kept, **{name: getattr(self, name) for name in _REPLACED}}
 
@@ -283,20 +425,33 @@ class Lanes:
         return self.decisions >= self.decisions_per_episode
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first: ``(count, len(task.fields))``."""
+        """Observation of every lane, batch first: ``(count, len(task.fields))``; the caller may keep it."""
+        if self._moving:
+            if self.count < MANY:
+                return self._shown[: self.count].copy()
+            self._shown_to = True
+            return self._shown[: self.count]
+        shown = self._observed()[:, : self.count].T
+        # Contiguous, and nobody else's memory.
+        return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
+
+    def _observed(self) -> Array:
+        """What is shown, ``(fields, width)``."""
+        if self._moving:
+            return self._shown.T
         task = self.task
         shown = task.observe(self.state)
         if self._interval_mean is not None:
             fresh = task.constant([[1.0 if i in self._mean_fields else 0.0] for i in range(len(task.fields))])
             shown = task.xp.where(fresh > 0.0, self._interval_mean, shown)
-        shown = shown[:, : self.count].T
-        # Contiguous, and nobody else's memory: the caller may keep it.
-        return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
+        return shown
 
     def widened(self, action: Array) -> Array:
         """Turn a batch-first action into the task's form: batch last, padded."""
         xp = self.task.xp
         turned = action.T if action.ndim == 2 else action
+        if not isinstance(self.task.action_space, gymnasium.spaces.Discrete):
+            turned = xp.astype(turned, xp.float64, copy=False)
         if self.width == self.count:
             return turned
         padding = xp.zeros(

@@ -40,4 +40,4 @@ def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: A
 
 def paper_task(task: Task) -> Task:
     """Return the same task under the control of the paper's algorithm."""
-    return type(task)(task.parameters, task.paper_policy.control, task.xp, task.device)
+    return task.under(task.paper_policy.control)

@@ -37,7 +37,7 @@ of its own, on the same noise.
 import copy
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
@@ -332,6 +332,8 @@ class Task(ABC):
     noise: NoiseLayout
     fields: tuple[Field, ...]
     action_space: gymnasium.Space
+    backend: str
+    """What computes its steps: "numpy", "torch", or "compiled"."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -345,6 +347,7 @@ class Task(ABC):
         self.decision_interval = parameters.decision_interval
         self.xp = xp
         self.device = device
+        self.backend = "torch" if "torch" in xp.__name__ else "numpy"
         self.set_up()
         self.world = self.World(self)
         self.bank = self.banks[control](self)
@@ -353,6 +356,12 @@ class Task(ABC):
         self._blocks = Blocks(self.bank.blocks, self.bank.quantities, xp)
         self.fields = self._blocks.fields
         self.action_space = self.bank.action_space
+
+    def __copy__(self) -> "Task":
+        """Another with the same attributes, to change one of them."""
+        other: Task = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Task":
         """Share the task: nothing in it changes."""
@@ -405,6 +414,22 @@ class Task(ABC):
             ValueError: for a name that is neither.
         """
         return self._blocks.reader(name)
+
+    def under(self, control: str) -> "Task":
+        """Return the same problem with another control."""
+        return type(self)(self.parameters, control, self.xp, self.device)
+
+    def run(self, function: Callable[..., Any], *parts: Any) -> Any:
+        """Call ``function(task, *parts)`` on this task's backend.
+
+        Args:
+            function: of this module or another, not made anew for each call: it may be compiled, once.
+            *parts: nested tuples of arrays ``(..., N)``.
+
+        Returns:
+            Nested tuples or dictionaries of arrays ``(..., N)``.
+        """
+        return function(self, *parts)
 
     def estimated_outside(self) -> "Task":
         """Return this task with an :class:`OutsideBank` in place of its bank, and nothing to observe."""

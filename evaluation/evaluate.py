@@ -10,9 +10,10 @@ from typing import Any
 import numpy
 import xarray
 
+from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, make_task, nearest, task_class
 from ..envs.reward import capped_cost
-from ..envs.task import Scenario, Task
+from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .competitors import Kind, check_competitor, kind_of, made
 from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference, told
@@ -47,6 +48,22 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
     return own
 
 
+def _measured(task: Task, episode: Episode) -> dict[str, Any]:
+    """What is kept of every measurement, arrays ``(..., N)``."""
+    error = task.error(episode)
+    return {
+        "error": error,
+        "cost": task.cost(episode),
+        "capped_cost": capped_cost(task, episode),
+        "nees": log_density(error, task.covariance(episode))[1],
+        **task.records(episode),
+    }
+
+
+def _measured_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
+    return {**_measured(task, episode), **task.track(episode)}
+
+
 def _run_chunk(
     task: Task,
     actor: Any,
@@ -64,12 +81,7 @@ def _run_chunk(
         series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
     def record(state: Any) -> None:
-        error, covariance = task.error(state), task.covariance(state)
-        keep("error", error)
-        keep("cost", task.cost(state))
-        keep("capped_cost", capped_cost(task, state))
-        keep("nees", log_density(error, covariance)[1])
-        for name, values in {**(task.track(state) if tracks else {}), **task.records(state)}.items():
+        for name, values in task.run(_measured_and_tracked if tracks else _measured, state).items():
             keep(name, values)
 
     if kind == "policy":
@@ -96,6 +108,8 @@ def evaluate(
     tracks: bool = False,
     paper: str = "",
     reference: str = "",
+    backend: str = "auto",
+    threads: int = 1,
     **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, estimators, references and bounds over the same episodes.
@@ -113,6 +127,8 @@ def evaluate(
         tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
         paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
         reference: name of the competitor whose score is 1; kept likewise.
+        backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
+        threads: how many share the episodes, of the compiled backend.
         **keywords: parameters of the task.
 
     Returns:
@@ -140,7 +156,9 @@ def evaluate(
     for name, maker in competitors.items():
         tuned_keywords = getattr(maker, "task_keywords", {})
         controls[name] = _control_of(maker, kinds[name], control, cls, name)
-        tasks[name] = make_task(cls.id, controls[name], scenario, **{**tuned_keywords, **keywords})
+        tasks[name] = task_on(
+            backend, cls.id, controls[name], scenario, threads=threads, **{**tuned_keywords, **keywords}
+        )
     for name, task in tasks.items():
         shown = getattr(getattr(competitors[name], "observation_space", None), "shape", None)
         if shown is not None and shown != (len(task.fields),):

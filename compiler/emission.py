@@ -1,0 +1,330 @@
+"""A program as text of LLVM: vector code for blocks of eight lanes.
+
+The entry ``@program(table, first, last)`` goes through the blocks between two lanes and calls for each one
+``@part0``, ``@part1``, ...: a long straight line is cut into parts, because the time that LLVM takes grows faster
+than the length of a function. What crosses a cut lies in a scratch array on the stack. ``table`` holds the address
+of the constants, then two integers for each argument, address and stride.
+"""
+
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+
+from .library import BINARY, Library
+from .program import FUNCTIONS, OPERATIONS, Program
+
+LANES = 8
+PART = 100
+"""Operations of a part."""
+VECTOR, TRUTH = f"<{LANES} x double>", f"<{LANES} x i1>"
+_INFIX = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
+_COMPARE = {"less": "olt", "less_equal": "ole", "greater": "ogt", "greater_equal": "oge"}
+_COMPARE |= {"equal": "oeq", "not_equal": "une"}
+_INTRINSIC = {name: name for name in ("sqrt", "floor", "ceil", "trunc", "rint", "maximum", "minimum")}
+_INTRINSIC["absolute"] = "fabs"
+FREE = ("input", "constant")
+"""Steps that every part makes again instead of fetching them from the scratch array."""
+
+
+def _splat(value: str, kind: str = "double") -> str:
+    return "<" + ", ".join([f"{kind} {value}"] * LANES) + ">"
+
+
+ONE, ZERO, MINUS_ONE = _splat("1.0"), _splat("0.0"), _splat("-1.0")
+
+
+class _Part:
+    """Text of one part; values are named by the steps that they come from."""
+
+    def __init__(self, program: Program, lane_first: Sequence[bool], slots: Mapping[int, int]) -> None:
+        self.program, self.lane_first, self.slots = program, lane_first, slots
+        self.lines: list[str] = []
+        self.known: set[int] = set()
+        self._arguments: dict[int, tuple[str, str]] = {}
+        self._names = 0
+        self.constants = self._entry("ptr", 0)
+
+    def new(self, expression: str, name: str | None = None) -> str:
+        """Name of a new value."""
+        if name is None:
+            self._names += 1
+            name = f"%t{self._names}"
+        self.lines.append(f"{name} = {expression}")
+        return name
+
+    def place(self, argument: int, row: int) -> str:
+        """Address of the block's eight numbers in a row of an argument."""
+        address, stride = self.argument(argument)
+        start = self.new(f"mul i64 {stride}, {row}")
+        start = self.new(f"add i64 {start}, %lane")
+        return self.new(f"getelementptr double, ptr {address}, i64 {start}")
+
+    def argument(self, argument: int) -> tuple[str, str]:
+        """Address and stride of an argument."""
+        if argument not in self._arguments:
+            self._arguments[argument] = (
+                self._entry("ptr", 1 + 2 * argument),
+                self._entry("i64", 2 + 2 * argument),
+            )
+        return self._arguments[argument]
+
+    def _entry(self, kind: str, place: int) -> str:
+        address = self.new(f"getelementptr i64, ptr %table, i64 {place}")
+        return self.new(f"load {kind}, ptr {address}, !invariant.load !0")
+
+    def constant(self, place: int, name: str | None = None) -> str:
+        """Constant, eight times."""
+        address = self.new(f"getelementptr double, ptr {self.constants}, i64 {place}")
+        value = self.new(f"load double, ptr {address}, !invariant.load !0")
+        one = self.new(f"insertelement {VECTOR} poison, double {value}, i32 0")
+        return self.new(
+            f"shufflevector {VECTOR} {one}, {VECTOR} poison, <{LANES} x i32> zeroinitializer", name
+        )
+
+    def choice(
+        self, condition: str, one: str, other: str, kind: str = VECTOR, name: str | None = None
+    ) -> str:
+        """One of two values in each lane."""
+        return self.new(f"select {TRUTH} {condition}, {kind} {one}, {kind} {other}", name)
+
+    def compare(self, how: str, one: str, other: str, name: str | None = None) -> str:
+        """Truth of a comparison in each lane."""
+        return self.new(f"fcmp {how} {VECTOR} {one}, {other}", name)
+
+    def value(self, step: int) -> str:
+        """Name of a step's value; what is free, or lies in the scratch array, is fetched where it is first needed."""
+        operation, arguments, logical = self.program.steps[step]
+        if step not in self.known:
+            self.known.add(step)
+            if operation == "input":
+                self.new(f"load {VECTOR}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
+            elif operation == "constant" and logical:
+                self.compare("une", self.constant(*arguments), ZERO, f"%v{step}")
+            elif operation == "constant":
+                self.constant(*arguments, name=f"%v{step}")
+            else:
+                kind = TRUTH if logical else VECTOR
+                self.new(f"load {kind}, ptr {self.scratch(step)}, align 64", f"%v{step}")
+        return f"%v{step}"
+
+    def step(self, index: int) -> None:
+        """Compute a step."""
+        operation, arguments, logical = self.program.steps[index]
+        if operation in FREE:
+            self.value(index)
+            return
+        name, kind = f"%v{index}", TRUTH if logical else VECTOR
+        self.known.add(index)
+        if operation == "take":
+            self._take(*arguments, name=name)
+            return
+        a, *rest = (self.value(argument) for argument in arguments)
+        if operation in _INFIX:
+            self.new(f"{_INFIX[operation]} {VECTOR} {a}, {rest[0]}", name)
+        elif operation in _COMPARE:
+            self.compare(_COMPARE[operation], a, rest[0], name)
+        elif operation in ("logical_and", "logical_or"):
+            self.new(f"{operation.removeprefix('logical_')} {TRUTH} {a}, {rest[0]}", name)
+        elif operation == "logical_not":
+            self.new(f"xor {TRUTH} {a}, {_splat('true', 'i1')}", name)
+        elif operation == "negative":
+            self.new(f"fneg {VECTOR} {a}", name)
+        elif operation == "where":
+            self.choice(a, rest[0], rest[1], kind, name)
+        elif operation == "number":
+            self.choice(a, ONE, ZERO, name=name)
+        elif operation == "sign":  # of zero and of what is no number: itself
+            low = self.choice(self.compare("olt", a, ZERO), MINUS_ONE, a)
+            self.choice(self.compare("ogt", a, ZERO), ONE, low, name=name)
+        elif operation == "remainder":  # with the sign of the divisor
+            quotient = self.new(f"fdiv {VECTOR} {a}, {rest[0]}")
+            whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
+            product = self.new(f"fmul {VECTOR} {rest[0]}, {whole}")
+            self.new(f"fsub {VECTOR} {a}, {product}", name)
+        elif operation in ("maximum", "minimum") and (limited := self._constant_first(arguments)):
+            # One instruction: where the comparison is false, also for what is no number, the second is taken.
+            how = "ogt" if operation == "maximum" else "olt"
+            self.choice(self.compare(how, *limited), *limited, name=name)
+        else:
+            callee = (
+                f"@llvm.{_INTRINSIC[operation]}.v8f64" if operation in _INTRINSIC else f"@all_{operation}"
+            )
+            listed = ", ".join(f"{VECTOR} {value}" for value in (a, *rest))
+            self.new(f"call {VECTOR} {callee}({listed})", name)
+
+    def _constant_first(self, arguments: tuple[int, ...]) -> tuple[str, str] | None:
+        for one, other in (arguments, arguments[::-1]):
+            if self.program.steps[one].operation == "constant":
+                return self.value(one), self.value(other)
+        return None
+
+    def _take(self, start: int, length: int, index: int, name: str) -> None:
+        place = self.value(index)
+        size, last = _splat(f"{length}.0"), _splat(f"{length - 1}.0")
+        from_end = self.new(f"fadd {VECTOR} {place}, {size}")
+        place = self.choice(self.compare("olt", place, ZERO), from_end, place)
+        # An index outside, or one that is no number, reads within the table all the same.
+        place = self.choice(self.compare("ogt", place, ZERO), place, ZERO)
+        place = self.choice(self.compare("olt", place, last), place, last)
+        whole = self.new(f"fptosi {VECTOR} {place} to <{LANES} x i64>")
+        table = self.new(f"getelementptr double, ptr {self.constants}, i64 {start}")
+        places = self.new(f"getelementptr double, ptr {table}, <{LANES} x i64> {whole}")
+        everywhere = f"{TRUTH} {_splat('true', 'i1')}"
+        self.new(
+            f"call {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr> {places}, i32 8, {everywhere}, "
+            f"{VECTOR} poison)",
+            name,
+        )
+
+    def store(self, argument: int, row: int, step: int) -> None:
+        """Write a result."""
+        value = self.value(step)
+        if self.program.steps[step].logical:
+            value = self.choice(value, ONE, ZERO)
+        if not self.lane_first[argument]:
+            self.lines.append(f"store {VECTOR} {value}, ptr {self.place(argument, row)}, align 8")
+            return
+        start, stride = self.argument(argument)
+        first = self.new(f"mul i64 %lane, {stride}")
+        first = self.new(f"add i64 {first}, {row}")
+        for lane in range(LANES):
+            offset = self.new(f"mul i64 {stride}, {lane}")
+            offset = self.new(f"add i64 {offset}, {first}")
+            number = self.new(f"extractelement {VECTOR} {value}, i32 {lane}")
+            address = self.new(f"getelementptr double, ptr {start}, i64 {offset}")
+            self.lines.append(f"store double {number}, ptr {address}, align 8")
+
+    def scratch(self, step: int) -> str:
+        """Address of a step's value in the scratch array."""
+        return self.new(f"getelementptr {VECTOR}, ptr %scratch, i64 {self.slots[step]}")
+
+    def hand_on(self, step: int) -> None:
+        """Put a value into the scratch array."""
+        kind = TRUTH if self.program.steps[step].logical else VECTOR
+        self.lines.append(f"store {kind} {self.value(step)}, ptr {self.scratch(step)}, align 64")
+
+
+def _parts(program: Program) -> list[list[int]]:
+    """Steps of each part; those that are free stand only where they are results themselves."""
+    results = {result.node for result in program.results}
+    listed = [i for i, step in enumerate(program.steps) if step.operation not in FREE or i in results]
+    return [listed[i : i + PART] for i in range(0, len(listed), PART)] or [[]]
+
+
+def _slots(program: Program, part_of: dict[int, int]) -> dict[int, int]:
+    """Place in the scratch array of every step that crosses a cut; places are used again."""
+    last_user: dict[int, int] = {}
+    for index, part in part_of.items():
+        operation, arguments, _ = program.steps[index]
+        if operation in FREE:
+            continue
+        for argument in arguments[2:] if operation == "take" else arguments:
+            if part_of.get(argument, part) < part and program.steps[argument].operation not in FREE:
+                last_user[argument] = part
+    free: list[int] = []
+    busy: list[tuple[int, int]] = []
+    found: dict[int, int] = {}
+    for step in sorted(last_user):
+        while busy and busy[0][0] < part_of[step]:
+            free.append(heapq.heappop(busy)[1])
+        found[step] = free.pop() if free else len(busy)
+        heapq.heappush(busy, (last_user[step], found[step]))
+    return found
+
+
+def emitted(program: Program, lane_first: Sequence[bool], library: Library) -> str:
+    """Text of a program.
+
+    Args:
+        program: to emit.
+        lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
+        library: where functions come from.
+
+    Raises:
+        KeyError: for a function that the library lacks.
+    """
+    parts = _parts(program)
+    slots = _slots(program, {step: i for i, part in enumerate(parts) for step in part})
+    results: dict[int, list[tuple[int, int]]] = {}
+    for argument, row, step in program.results:
+        results.setdefault(step, []).append((argument, row))
+    text = list(_declarations(program, library))
+    for number, steps in enumerate(parts):
+        part = _Part(program, lane_first, slots)
+        for step in steps:
+            part.step(step)
+            for place in results.get(step, ()):
+                part.store(*place, step)
+            if step in slots:
+                part.hand_on(step)
+        header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
+        text += [f"define internal void @part{number}({header}) {{", *part.lines, "ret void", "}"]
+    text += _entry(len(parts), max(slots.values(), default=0) + 1)
+    return "\n".join([*text, "!0 = !{}"])
+
+
+def _entry(parts: int, slots: int) -> Iterator[str]:
+    yield "define void @program(ptr %table, i64 %first, i64 %last) {"
+    yield "entry:"
+    yield f"%scratch = alloca {VECTOR}, i64 {slots}, align 64"
+    yield "br label %head"
+    yield "head:"
+    yield "%lane = phi i64 [%first, %entry], [%next, %body]"
+    yield "%more = icmp slt i64 %lane, %last"
+    yield "br i1 %more, label %body, label %exit"
+    yield "body:"
+    for number in range(parts):
+        yield f"call void @part{number}(ptr %table, ptr %scratch, i64 %lane)"
+    yield f"%next = add i64 %lane, {LANES}"
+    yield "br label %head"
+    yield "exit:"
+    yield "ret void"
+    yield "}"
+
+
+def _declarations(program: Program, library: Library) -> Iterator[str]:
+    """Intrinsics, and functions of eight lanes made of the library's."""
+    used = {step.operation for step in program.steps}
+    yield f"declare {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr>, i32, {TRUTH}, {VECTOR})"
+    for name in sorted(set(_INTRINSIC.values())):
+        operands = ", ".join([VECTOR] * (2 if name in ("maximum", "minimum") else 1))
+        yield f"declare {VECTOR} @llvm.{name}.v8f64({operands})"
+    for name in sorted(used & FUNCTIONS.keys() - OPERATIONS.keys()):
+        if name not in library.functions:
+            raise KeyError(f"{library.name} has no function {name}")
+        yield from _of_eight(name, *library.functions[name][:2])
+
+
+def _of_eight(name: str, symbol: str, lanes: int) -> Iterator[str]:
+    kind = "double" if lanes == 1 else f"<{lanes} x double>"
+    operands = ("%a", "%b") if name in BINARY else ("%a",)
+    yield f"declare {kind} @{symbol}({', '.join([kind] * len(operands))})"
+    header = ", ".join(f"{VECTOR} {operand}" for operand in operands)
+    yield f"define internal {VECTOR} @all_{name}({header}) {{"
+    if lanes == LANES:
+        yield f"%all = call {VECTOR} @{symbol}({header})"
+    whole = "poison"
+    for first in range(0, LANES, lanes) if lanes < LANES else ():
+        parts = [f"{operand}{first}" for operand in operands]
+        for operand, part in zip(operands, parts, strict=True):
+            if lanes == 1:
+                yield f"{part} = extractelement {VECTOR} {operand}, i32 {first}"
+            else:
+                chosen = ", ".join(f"i32 {first + i}" for i in range(lanes))
+                yield f"{part} = shufflevector {VECTOR} {operand}, {VECTOR} poison, <{lanes} x i32> <{chosen}>"
+        listed = ", ".join(f"{kind} {part}" for part in parts)
+        yield f"%result{first} = call {kind} @{symbol}({listed})"
+        target = "%all" if first + lanes == LANES else f"%whole{first}"
+        if lanes == 1:
+            yield f"{target} = insertelement {VECTOR} {whole}, double %result{first}, i32 {first}"
+        else:
+            spread = ", ".join(f"i32 {i}" if i < lanes else "i32 poison" for i in range(LANES))
+            yield f"%wide{first} = shufflevector {kind} %result{first}, {kind} poison, <{LANES} x i32> <{spread}>"
+            mixed = ", ".join(
+                f"i32 {LANES + i - first}" if first <= i < first + lanes else f"i32 {i}" for i in range(LANES)
+            )
+            yield (
+                f"{target} = shufflevector {VECTOR} {whole}, {VECTOR} %wide{first}, <{LANES} x i32> <{mixed}>"
+            )
+        whole = target
+    yield f"ret {VECTOR} %all"
+    yield "}"

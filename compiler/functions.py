@@ -1,0 +1,279 @@
+"""Functions of nested tuples of arrays, compiled for each structure of their arguments."""
+
+import functools
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy
+
+from . import namespace
+from .emission import LANES
+from .library import Library
+from .native import Native, native
+from .program import Graph, Program, Result, program
+
+
+DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
+FEWEST = 512
+"""Lanes that are worth a thread."""
+
+
+class Leaf(NamedTuple):
+    """Array in a structure."""
+
+    shape: tuple[int, ...]
+    """Without its last axis, the lanes."""
+    kind: str
+    """Its dtype's kind: ``f``, ``i`` or ``b``."""
+
+    @property
+    def rows(self) -> int:
+        """Numbers of one lane."""
+        return math.prod(self.shape)
+
+
+def leaves(part: Any) -> list[Any]:
+    """Arrays of nested tuples and dictionaries, in order; None holds none."""
+    if part is None:
+        return []
+    if isinstance(part, dict):
+        part = tuple(part.values())
+    if isinstance(part, tuple):
+        return [leaf for item in part for leaf in leaves(item)]
+    return [part]
+
+
+def mapped(function: Callable[[Any], Any], part: Any) -> Any:
+    """Nested tuples and dictionaries with a function applied to every array."""
+    if part is None:
+        return None
+    if isinstance(part, dict):
+        return {name: mapped(function, item) for name, item in part.items()}
+    if isinstance(part, tuple):
+        parts = [mapped(function, item) for item in part]
+        return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
+    return function(part)
+
+
+def _leaf(array: Any) -> Leaf:
+    kind = array.dtype.kind
+    return Leaf(array.shape[:-1], "i" if kind == "u" else kind)
+
+
+class Specialised:
+    """A function for arguments of one structure.
+
+    Args:
+        function: of nested tuples of arrays.
+        graph: where the constants that the function refers to were made.
+        parts: arguments, or others like them.
+        turned: write the last array of the answer lane by lane, ``(N, rows)``.
+        shared: of an output and the input that it repeats, both by number: whether nothing need be written.
+
+    Attributes:
+        inputs: arrays that it reads.
+        outputs: arrays of its answer.
+        same: for each output the input that stands for it, or None.
+        template: nested tuples of the answer, with the numbers of ``outputs`` in place of arrays.
+
+    Raises:
+        NotTraceable: if the function is no straight line of arithmetic.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        graph: Graph,
+        parts: Sequence[Any],
+        turned: bool = False,
+        shared: Callable[[int, int], bool] = lambda output, input: True,
+    ) -> None:
+        self.inputs = [_leaf(array) for part in parts for array in leaves(part)]
+        with namespace.tracing(graph):
+            places = iter(range(len(self.inputs)))
+            traced = [mapped(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
+            answer = function(*traced)
+            made = [namespace.asarray(array) for array in leaves(answer)]
+        count = iter(range(len(made)))
+        self.template = mapped(lambda _: next(count), answer)
+        self.outputs = [_leaf(array) for array in made]
+        given = {
+            (_leaf(array), array.nodes.tobytes()): i
+            for i, array in enumerate(array for part in traced for array in leaves(part))
+            if array.nodes.size
+        }
+        same = [given.get((_leaf(array), array.nodes.tobytes())) for array in made]
+        self.same = [i if i is not None and shared(output, i) else None for output, i in enumerate(same)]
+        wanted = [
+            Result(len(self.inputs) + place, row, node)
+            for place, array in enumerate(made)
+            if self.same[place] is None
+            for row, node in enumerate(array.nodes.ravel().tolist())
+        ]
+        self.program: Program = program(graph, wanted)
+        self.lane_first = [False] * (len(self.inputs) + len(self.outputs))
+        self.lane_first[-1] = turned
+        self.native: Native | None = None
+
+    def compile(self, library: Library | None = None) -> None:
+        """Translate the program, or find it in the cache."""
+        if self.native is None:
+            self.native = native(self.program, self.lane_first, library)
+
+    def bound(self, inputs: Sequence[numpy.ndarray], outputs: Sequence[numpy.ndarray]) -> "Call":
+        """Return what runs the function on arrays ``(rows, N)``, or ``(..., N)``, from now on always the same."""
+        self.compile()
+        assert self.native is not None
+        arrays = [*inputs, *outputs]
+        table = [self.program.constants.ctypes.data]
+        for array, lane_first in zip(arrays, self.lane_first, strict=True):
+            stride = array.strides[0 if lane_first else -2] // array.itemsize if array.ndim > 1 else 0
+            table += [array.ctypes.data, stride]
+        return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
+
+    def example(self) -> Any:
+        """Answer made of arrays that hold nothing in particular, for whoever traces what comes after."""
+        return mapped(
+            lambda place: numpy.zeros(
+                (*self.outputs[place].shape, LANES), dtype=DTYPES[self.outputs[place].kind]
+            ),
+            self.template,
+        )
+
+    def empty(self, width: int, place: int) -> numpy.ndarray:
+        """Memory for an output."""
+        shape = self.outputs[place].shape
+        if self.lane_first[len(self.inputs) + place]:
+            return numpy.empty((width, *shape))
+        return empty_lanes(shape, width)
+
+
+class Call:
+    """A function bound to its arrays.
+
+    Attributes:
+        arrays: inputs, then outputs.
+        table: addresses and strides; entry ``1 + 2 i`` is the address of array i.
+    """
+
+    def __init__(
+        self, native: Native, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
+    ) -> None:
+        self.native, self.table, self.arrays, self._constants = native, table, arrays, constants
+        self.address = table.ctypes.data
+
+    def replace(self, place: int, array: numpy.ndarray) -> None:
+        """Read or write another array of the same form from now on."""
+        self.arrays[place] = array
+        self.table[1 + 2 * place] = array.ctypes.data
+
+    def __call__(self, first: int, last: int) -> None:
+        """Run from one lane to another."""
+        self.native(self.address, first, last)
+
+
+def run_over(call: Callable[[int, int], None], width: int, threads: int) -> None:
+    """Run over all lanes, shared by some threads; the numbers do not depend on how many."""
+    threads = min(threads, width // FEWEST)
+    if threads <= 1:
+        call(0, width)
+        return
+    cuts = [width * i // threads // LANES * LANES for i in range(threads)] + [width]
+    list(_pool(threads, os.getpid()).map(call, cuts[:-1], cuts[1:]))
+
+
+@functools.cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """Threads of this process; a forked one has its own."""
+    return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
+
+
+def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
+    """Memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
+    # Rows a power of two apart would share the same few places of the cache.
+    stride = width + (LANES if width % 512 == 0 else 0)
+    memory = numpy.empty(math.prod(shape) * stride + LANES)
+    start = -memory.ctypes.data // memory.itemsize % LANES
+    return memory[start : start + math.prod(shape) * stride].reshape(*shape, stride)[..., :width]
+
+
+def _input(graph: Graph, argument: int, inputs: Sequence[Leaf]) -> Any:
+    leaf = inputs[argument]
+    nodes = numpy.array([graph.input(argument, row) for row in range(leaf.rows)], dtype=numpy.int64)
+    array = namespace.Traced(nodes.reshape(*leaf.shape, 1), namespace.float64)
+    if leaf.kind == "b":
+        return namespace.not_equal(array, 0.0)
+    return array if leaf.kind == "f" else namespace.Traced(array.nodes, namespace.int64)
+
+
+class Function:
+    """A function that is traced and compiled for every structure of arguments that it meets.
+
+    Args:
+        function: of nested tuples of arrays ``(..., N)``; it returns the same.
+        graph: where the constants that the function refers to were made.
+
+    Raises:
+        NotTraceable: when it is called, if it is no straight line of arithmetic.
+    """
+
+    def __init__(self, function: Callable[..., Any], graph: Graph) -> None:
+        self.function, self.graph = function, graph
+        self._specialised: dict[Any, Specialised] = {}
+
+    def specialised(self, *parts: Any) -> Specialised:
+        """Return the function for arguments of this structure."""
+        key = tuple(_structure(part) for part in parts)
+        if key not in self._specialised:
+            self._specialised[key] = Specialised(self.function, self.graph, parts)
+        return self._specialised[key]
+
+    def __call__(self, *parts: Any, threads: int = 1) -> Any:
+        """Run on arrays of one width; the answer is made of new arrays, or of the given ones where unchanged.
+
+        Args:
+            *parts: nested tuples of arrays ``(..., N)``.
+            threads: how many share the lanes.
+        """
+        given = [array for part in parts for array in leaves(part)]
+        special = self.specialised(*parts)
+        count = max(array.shape[-1] for array in given)
+        width = -(-count // LANES) * LANES
+        arrays = [_ready(array, width) for array in given]
+        outputs = [given[same] if same is not None else None for same in special.same]
+        memory = [
+            special.empty(width, i) if array is None else numpy.empty(0) for i, array in enumerate(outputs)
+        ]
+        run_over(special.bound(arrays, memory), width, threads)
+        for i, leaf in enumerate(special.outputs):
+            if outputs[i] is None:
+                cut = memory[i][..., :count]
+                outputs[i] = cut if leaf.kind == "f" else cut.astype(DTYPES[leaf.kind])
+        return mapped(lambda place: outputs[place], special.template)
+
+
+def _structure(part: Any) -> Any:
+    """What two arguments share that one program serves."""
+    if isinstance(part, tuple):
+        return type(part), *(_structure(item) for item in part)
+    if isinstance(part, dict):
+        return tuple((name, _structure(item)) for name, item in part.items())
+    return part if part is None else _leaf(part)
+
+
+def _ready(array: Any, width: int) -> numpy.ndarray:
+    """Array as the code reads it: float64, rows one after the other, a multiple of eight lanes."""
+    array = numpy.asarray(array, dtype=numpy.float64)
+    if array.shape[-1] != width:
+        padding = numpy.broadcast_to(array[..., -1:], (*array.shape[:-1], width - array.shape[-1]))
+        array = numpy.concatenate([array, padding], axis=-1)
+    rows = array.strides[-2] if array.ndim > 1 else 0
+    even = all(array.strides[i] == array.strides[i + 1] * array.shape[i + 1] for i in range(array.ndim - 2))
+    return (
+        array
+        if array.strides[-1] == array.itemsize and even and rows >= 0
+        else numpy.ascontiguousarray(array)
+    )

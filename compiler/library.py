@@ -1,0 +1,87 @@
+"""Which library computes exponentials and their like, eight lanes at a time or one by one.
+
+On Linux glibc brings vector functions, with errors up to four units in the last place; where they are missing, the
+scalar functions of the C library stand in, and every platform has those.
+"""
+
+import ctypes
+import functools
+import platform
+import sys
+from typing import NamedTuple
+
+from .program import FUNCTIONS
+
+BINARY = frozenset(("atan2", "pow", "hypot"))
+VARIANTS = {"avx512f": ("e", 8), "avx2": ("d", 4), "sse4.1": ("b", 2), "neon": ("n", 2)}
+"""Glibc's letter for the vectors of an instruction set, and how many numbers they hold."""
+ROUNDING = ("floor", "ceil", "trunc", "rint")
+"""What LLVM asks the C library for where the processor has no instruction."""
+
+
+class Function(NamedTuple):
+    """Function of a library."""
+
+    symbol: str
+    lanes: int
+    """Numbers that one call takes."""
+    address: int
+
+
+class Library(NamedTuple):
+    """Where functions come from."""
+
+    name: str
+    functions: dict[str, Function]
+    """By the names of :data:`~.program.FUNCTIONS`, and those of ``ROUNDING``."""
+
+
+def _address(library: ctypes.CDLL, symbol: str) -> int | None:
+    if not hasattr(library, symbol):
+        return None
+    return ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value
+
+
+def _opened(*names: str | None) -> ctypes.CDLL | None:
+    for name in names:
+        try:
+            return ctypes.CDLL(name)
+        except (OSError, TypeError):
+            continue
+    return None
+
+
+@functools.cache
+def portable() -> Library:
+    """Scalar functions of the C library."""
+    library = _opened("ucrtbase") if sys.platform == "win32" else _opened("libm.so.6", None)
+    functions = {}
+    for name in (*FUNCTIONS, *ROUNDING):
+        address = library and _address(library, name)
+        if address:
+            functions[name] = Function(name, 1, address)
+    return Library("C library", functions)
+
+
+@functools.cache
+def fastest(features: str) -> Library:
+    """Library for a processor.
+
+    Args:
+        features: as LLVM lists them, ``+avx2,-avx512f,...``.
+    """
+    there = features.split(",")
+    vectors = _opened("libmvec.so.1")
+    if platform.machine() == "aarch64":
+        there.append("+neon")
+    variant = next((VARIANTS[name] for name in VARIANTS if f"+{name}" in there), None)
+    if vectors is None or variant is None:
+        return portable()
+    letter, lanes = variant
+    functions = dict(portable().functions)
+    for name in FUNCTIONS:
+        symbol = f"_ZGV{letter}N{lanes}{'vv' if name in BINARY else 'v'}_{name}"
+        address = _address(vectors, symbol)
+        if address:
+            functions[name] = Function(symbol, lanes, address)
+    return Library(f"libmvec, {lanes} numbers a call", functions)

@@ -1,0 +1,370 @@
+"""Arrays of expressions, and the functions of the array API standard on them.
+
+A :class:`Traced` stands where a function expects an array: shapes, indices and broadcasting are those of NumPy, which
+moves the numbers of the expressions around, and arithmetic makes new expressions in the :class:`~.program.Graph` that
+:func:`tracing` has opened. Numbers are float64 in a program, also those whose ``dtype`` says that they are whole.
+"""
+
+import builtins
+import functools
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from types import ModuleType
+from typing import Any
+
+import numpy
+
+from .program import COMPARISONS, Graph
+
+float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
+bool = numpy.dtype("bool")  # noqa: A001  (the standard's name)
+pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
+_OPEN: ContextVar[Graph] = ContextVar("graph")
+
+
+class NotTraceable(TypeError):
+    """A function does what no straight line of arithmetic can do."""
+
+
+@contextmanager
+def tracing(graph: Graph) -> Iterator[Graph]:
+    """Let the arithmetic inside make expressions of a graph."""
+    token = _OPEN.set(graph)
+    try:
+        yield graph
+    finally:
+        _OPEN.reset(token)
+
+
+def _refused(self: Any, *_: Any) -> Any:
+    raise NotTraceable("a branch or a loop depends on the numbers of an array")
+
+
+class Traced:
+    """Array of expressions.
+
+    Attributes:
+        nodes: the expressions, as numbers in the open graph.
+        dtype: of what they stand for.
+    """
+
+    __slots__ = ("dtype", "nodes")
+    __array_ufunc__ = None  # NumPy leaves mixed arithmetic to the methods below
+    device = None
+    __bool__ = __float__ = __int__ = __index__ = __complex__ = _refused
+
+    def __init__(self, nodes: Any, dtype: Any) -> None:
+        self.nodes = numpy.asarray(nodes)
+        self.dtype = numpy.dtype(dtype)
+
+    def __array__(self, *_: Any, **__: Any) -> Any:
+        raise NotTraceable("an array is handed to a function of NumPy: call that of its namespace")
+
+    def __array_namespace__(self, api_version: str | None = None) -> ModuleType:
+        return importlib.import_module(__name__)
+
+    shape = property(lambda self: self.nodes.shape)
+    ndim = property(lambda self: self.nodes.ndim)
+    size = property(lambda self: self.nodes.size)
+    T = property(lambda self: Traced(self.nodes.T, self.dtype))
+    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __iter__(self) -> Iterator["Traced"]:
+        return (Traced(part, self.dtype) for part in self.nodes)
+
+    def __getitem__(self, key: Any) -> "Traced":
+        keys = key if isinstance(key, tuple) else (key,)
+        if not builtins.any(isinstance(k, Traced) for k in keys):
+            return Traced(self.nodes[key], self.dtype)
+        place = next(i for i, k in enumerate(keys) if isinstance(k, Traced))
+        others = tuple(slice(None) if i == place else k for i, k in enumerate(keys))
+        if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others):
+            raise NotTraceable("only one index of an array may depend on numbers, the others be slices")
+        dropped = builtins.sum(isinstance(k, int) for k in others[:place])
+        return take(Traced(self.nodes[others], self.dtype), keys[place], axis=place - dropped)
+
+    def __pow__(self, exponent: Any) -> "Traced":
+        return square(self) if isinstance(exponent, int | float) and exponent == 2 else pow(self, exponent)
+
+    def sum(self, axis: int | None = None) -> "Traced":
+        return sum(self, axis=axis)
+
+    def reshape(self, *shape: Any) -> "Traced":
+        return Traced(self.nodes.reshape(*shape), self.dtype)
+
+    def copy(self) -> "Traced":
+        return self
+
+
+def asarray(values: Any, dtype: Any = None, device: Any = None, copy: Any = None) -> Traced:
+    """Array of constants, or the traced array itself."""
+    if isinstance(values, Traced):
+        return values if dtype is None else astype(values, dtype)
+    if isinstance(values, list | tuple) and builtins.any(isinstance(value, Traced) for value in values):
+        return stack([asarray(value, dtype) for value in values])
+    array = numpy.asarray(values, dtype=dtype)
+    if array.dtype.kind not in "fiub":
+        raise NotTraceable(f"arrays of {array.dtype} cannot be traced")
+    constant = _OPEN.get().constant
+    nodes = [constant(value) for value in (array if array.dtype == bool else array.astype(float64)).ravel()]
+    return Traced(numpy.array(nodes, dtype=numpy.int64).reshape(array.shape), array.dtype)
+
+
+def _elementwise(name: str, arrays: Sequence[Traced], dtype: Any) -> Traced:
+    node = _OPEN.get().node
+    spread = (
+        numpy.broadcast_arrays(*(array.nodes for array in arrays)) if len(arrays) > 1 else [arrays[0].nodes]
+    )
+    columns = [part.ravel().tolist() for part in spread]
+    made = [node(name, *row) for row in zip(*columns, strict=True)]
+    return Traced(numpy.array(made, dtype=numpy.int64).reshape(spread[0].shape), dtype)
+
+
+def _numbers(array: Traced) -> Traced:
+    return _elementwise("number", [array], int64) if array.dtype == bool else array
+
+
+def _joined(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
+    """Arrays as traced ones of one kind, numbers or truth values, and their common type; Python's own have none."""
+    typed = [array.dtype for array in arrays if hasattr(array, "dtype")]
+    found = [asarray(array) for array in arrays]
+    weak = [float64 if isinstance(a, float) else int64 for a in arrays if isinstance(a, int | float)]
+    if builtins.all(array.dtype == bool for array in found):
+        return found, bool
+    kinds = [*typed, *(kind for kind in weak if kind == float64 or not typed)] or [float64]
+    return [_numbers(array) for array in found], numpy.result_type(*kinds)
+
+
+def _binary(name: str, result: Any = None) -> Callable[..., Any]:
+    def operation(one: Any, other: Any, /) -> Any:
+        if not isinstance(other, Traced | numpy.ndarray | numpy.generic | int | float | list):
+            return NotImplemented
+        arrays, dtype = _joined([one, other])
+        if dtype == bool:
+            arrays, dtype = [_numbers(array) for array in arrays], int64
+        return _elementwise(name, arrays, result or dtype)
+
+    return operation
+
+
+def _unary(name: str, result: Any = float64) -> Callable[[Any], Traced]:
+    def function(x: Any, /) -> Traced:
+        array = _numbers(asarray(x))
+        return _elementwise(name, [array], result or array.dtype)
+
+    return function
+
+
+def _logical(name: str) -> Callable[..., Any]:
+    def operation(*arrays: Any) -> Any:
+        traced = [asarray(array) for array in arrays]
+        if builtins.any(array.dtype != bool for array in traced):
+            raise NotTraceable("bitwise operations on whole numbers cannot be traced")
+        return _elementwise(name, traced, bool)
+
+    return operation
+
+
+def _floor_divide(one: Any, other: Any) -> Traced:
+    quotient = divide(one, other)
+    return Traced(floor(quotient).nodes, _joined([one, other])[1])
+
+
+add, subtract, multiply, remainder = (_binary(n) for n in ("add", "subtract", "multiply", "remainder"))
+divide, maximum, minimum = _binary("divide", float64), _binary("maximum"), _binary("minimum")
+less, less_equal, greater, greater_equal, equal, not_equal = (_binary(name, bool) for name in COMPARISONS)
+logical_and, logical_or, logical_not = (_logical(f"logical_{name}") for name in ("and", "or", "not"))
+floor_divide = _floor_divide
+negative, abs, sign = (_unary(name, result=None) for name in ("negative", "absolute", "sign"))  # noqa: A001
+floor, ceil, trunc, round = (_unary(n, result=None) for n in ("floor", "ceil", "trunc", "rint"))  # noqa: A001
+sqrt, exp, expm1, exp2, log, log1p, log2, log10, sin, cos, tan = (
+    _unary(n) for n in "sqrt exp expm1 exp2 log log1p log2 log10 sin cos tan".split()
+)
+asin, acos, atan, sinh, cosh, tanh, asinh, acosh, atanh = (
+    _unary(n) for n in "asin acos atan sinh cosh tanh asinh acosh atanh".split()
+)
+atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))  # noqa: A001
+
+
+def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda self, other: operation(other, self) if not isinstance(other, Traced) else NotImplemented
+
+
+_METHODS = {"add": add, "sub": subtract, "mul": multiply, "truediv": divide, "floordiv": floor_divide}
+_METHODS |= {"mod": remainder, "and": logical_and, "or": logical_or}
+for _name, _operation in _METHODS.items():
+    setattr(Traced, f"__{_name}__", _operation)
+    setattr(Traced, f"__r{_name}__", _reflected(_operation))
+for _name, _operation in zip(
+    ("lt", "le", "gt", "ge", "eq", "ne"),
+    (less, less_equal, greater, greater_equal, equal, not_equal),
+    strict=True,
+):
+    setattr(Traced, f"__{_name}__", _operation)
+Traced.__rpow__ = lambda self, base: pow(base, self)  # type: ignore[attr-defined]
+Traced.__neg__, Traced.__abs__, Traced.__invert__ = negative, abs, logical_not  # type: ignore[attr-defined]
+Traced.__hash__ = None  # type: ignore[assignment]
+
+
+def square(x: Any) -> Traced:
+    """Square."""
+    return multiply(x, x)
+
+
+def isnan(x: Any) -> Traced:
+    """Whether an entry is no number."""
+    return not_equal(x, x)
+
+
+def isfinite(x: Any) -> Traced:
+    """Whether an entry is finite."""
+    return less_equal(abs(x), float(numpy.finfo(float64).max))
+
+
+def where(condition: Any, one: Any, other: Any) -> Traced:
+    """Choose by a condition."""
+    arrays, dtype = _joined([one, other])
+    return _elementwise("where", [asarray(condition), *arrays], dtype)
+
+
+def clip(x: Any, min: Any = None, max: Any = None) -> Traced:  # noqa: A002
+    """Limit."""
+    if min is not None:
+        x = maximum(x, min)
+    return asarray(x) if max is None else minimum(x, max)
+
+
+def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
+    """Array of another type; from numbers to whole numbers the fraction is cut off."""
+    x, dtype = asarray(x), numpy.dtype(dtype)
+    if dtype == bool:
+        return x if x.dtype == bool else not_equal(x, 0.0)
+    if x.dtype == bool:
+        return Traced(_numbers(x).nodes, dtype)
+    if dtype.kind in "iu" and x.dtype.kind == "f":
+        return Traced(trunc(x).nodes, dtype)
+    return Traced(x.nodes, dtype)
+
+
+def _moved(move: Callable[..., Any]) -> Callable[..., Traced]:
+    """Function of one array that moves its entries, as NumPy's."""
+
+    @functools.wraps(move)
+    def function(x: Any, *arguments: Any, **keywords: Any) -> Traced:
+        x = asarray(x)
+        return Traced(move(x.nodes, *arguments, **keywords), x.dtype)
+
+    return function
+
+
+def _gathered(gather: Callable[..., Any]) -> Callable[..., Traced]:
+    """Function of several arrays that puts them together, as NumPy's."""
+
+    @functools.wraps(gather)
+    def function(arrays: Any, *, axis: int | None = 0) -> Traced:
+        found, dtype = _joined(list(arrays))
+        return Traced(gather([array.nodes for array in found], axis=axis), dtype)
+
+    return function
+
+
+reshape, moveaxis, permute_dims = _moved(numpy.reshape), _moved(numpy.moveaxis), _moved(numpy.permute_dims)
+broadcast_to, expand_dims, squeeze = (
+    _moved(numpy.broadcast_to),
+    _moved(numpy.expand_dims),
+    _moved(numpy.squeeze),
+)
+flip, roll, tile, repeat, tril, triu = (
+    _moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat, numpy.tril, numpy.triu)
+)
+concat, stack = _gathered(numpy.concat), _gathered(numpy.stack)
+
+
+def _made(make: Callable[..., Any]) -> Callable[..., Traced]:
+    """Function that makes an array of constants, as NumPy's."""
+
+    @functools.wraps(make)
+    def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
+        like = tuple(a.nodes if isinstance(a, Traced) else a for a in arguments)
+        first = arguments[0]
+        return asarray(make(*like, dtype=dtype or (first.dtype if isinstance(first, Traced) else None)))
+
+    return function
+
+
+zeros, ones, full, eye, arange = (
+    _made(m) for m in (numpy.zeros, numpy.ones, numpy.full, numpy.eye, numpy.arange)
+)
+zeros_like, ones_like, full_like = _made(numpy.zeros_like), _made(numpy.ones_like), _made(numpy.full_like)
+
+
+def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
+    """Entries by their place; places that depend on numbers choose from a table of constants, or one by one."""
+    x, indices = asarray(x), asarray(indices)
+    graph, rows = _OPEN.get(), numpy.moveaxis(x.nodes, axis, -1)
+    choices = rows.reshape(-1, rows.shape[-1])
+    taken = [
+        [_chosen(graph, row.tolist(), index) for index in indices.nodes.ravel().tolist()] for row in choices
+    ]
+    shaped = numpy.array(taken, dtype=numpy.int64).reshape(*rows.shape[:-1], *indices.shape)
+    for i in range(indices.ndim):
+        shaped = numpy.moveaxis(shaped, rows.ndim - 1 + i, axis % x.ndim + i)
+    return Traced(shaped, x.dtype)
+
+
+def _chosen(graph: Graph, row: list[int], index: int) -> int:
+    values = [graph.values[node] for node in row]
+    if graph.values[index] is not None:
+        return row[int(graph.values[index])]
+    if None not in values and not builtins.any(graph.logical[node] for node in row):
+        return graph.take(numpy.array(values, dtype=float), index)
+    chosen = row[0]
+    for place, node in enumerate(row[1:], 1):
+        here = graph.node("equal", index, graph.constant(float(place)))
+        chosen = graph.node("where", here, node, chosen)
+    return chosen
+
+
+def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
+    def function(x: Any, /, *, axis: int | tuple[int, ...] | None = None, keepdims: Any = False) -> Traced:
+        x = asarray(x)
+        axes = tuple(range(x.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
+        moved = numpy.moveaxis(x.nodes, axes, range(len(axes)))
+        parts = moved.reshape(-1, *moved.shape[len(axes) :])
+        reduced = functools.reduce(operation, (Traced(part, x.dtype) for part in parts))
+        return expand_dims(reduced, tuple(a % x.ndim for a in axes)) if keepdims else reduced
+
+    return function
+
+
+sum, prod, max, min = (_reduction(o) for o in (add, multiply, maximum, minimum))  # noqa: A001
+any, all = _reduction(logical_or), _reduction(logical_and)  # noqa: A001
+
+
+def sort(x: Any, /, *, axis: int = -1) -> Traced:
+    """Sort by comparing neighbours."""
+    rows = list(moveaxis(x, axis, 0))
+    for end in range(len(rows) - 1, 0, -1):
+        for i in range(end):
+            rows[i], rows[i + 1] = minimum(rows[i], rows[i + 1]), maximum(rows[i], rows[i + 1])
+    return moveaxis(stack(rows), 0, axis)
+
+
+def matmul(a: Any, b: Any, /) -> Traced:
+    """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out."""
+    a, b = asarray(a), asarray(b)
+    left, right = (a[None] if a.ndim == 1 else a), (b[:, None] if b.ndim == 1 else b)
+    product = functools.reduce(
+        add, (left[..., :, k, None] * right[..., k, None, :] for k in range(left.shape[-1]))
+    )
+    product = product[..., 0, :] if a.ndim == 1 else product
+    return product[..., 0] if b.ndim == 1 else product
+
+
+Traced.__matmul__ = matmul  # type: ignore[attr-defined]
+Traced.__rmatmul__ = lambda self, other: matmul(other, self)  # type: ignore[attr-defined]

@@ -1,0 +1,88 @@
+"""Programs as code of the processor at hand."""
+
+import ctypes
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from types import ModuleType
+from typing import Any
+
+import numpy
+
+from . import cache
+from .emission import emitted
+from .library import Library, fastest
+from .program import Program
+
+_LOCK = threading.Lock()
+_ENGINES: list[Any] = []
+"""What owns the code; it is never given back, as somebody may be about to call it."""
+
+
+@functools.cache
+def llvm() -> ModuleType:
+    """Return the binding of llvmlite, ready for this processor.
+
+    Raises:
+        ImportError: without llvmlite.
+    """
+    import llvmlite.binding as binding
+
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    return binding
+
+
+@functools.cache
+def processor() -> tuple[str, str]:
+    """Name and features of this processor, as LLVM calls them."""
+    return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
+
+
+def _target() -> Any:
+    name, features = processor()
+    return llvm().Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=1)
+
+
+Native = Callable[[int, int, int], None]
+"""Called with the address of the table of arguments, and with the lanes from where to where."""
+
+
+def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Native:
+    """Return code that runs a program.
+
+    Args:
+        program: what it computes.
+        lane_first: of every argument whether it is written as ``(N, rows)``.
+        library: where functions come from; default: the fastest for this processor.
+    """
+    binding, (name, features) = llvm(), processor()
+    library = library or fastest(features)
+    text = emitted(program, lane_first, library)
+    version = ".".join(map(str, binding.llvm_version_info))
+    with _LOCK:
+        return _loaded(text, cache.key(text, name, features, version), library)
+
+
+def _loaded(text: str, key: str, library: Library) -> Native:
+    if key in _LOADED:
+        return _LOADED[key]
+    binding = llvm()
+    for function in library.functions.values():
+        binding.add_symbol(function.symbol, function.address)
+    code = cache.kept(key)
+    if code is None:
+        module = binding.parse_assembly(text)
+        module.verify()
+        code = _target().emit_object(module)
+        cache.keep(key, code)
+    engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _target())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    _ENGINES.append(engine)
+    signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+    _LOADED[key] = signature(engine.get_function_address("program"))
+    return _LOADED[key]
+
+
+_LOADED: dict[str, Native] = {}

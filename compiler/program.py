@@ -1,0 +1,234 @@
+"""Expressions of one lane, each kept once, and the straight-line program that computes some of them.
+
+An expression is a number: its place in the :class:`Graph`. One that is made again is found again (common
+subexpressions), one of constants is computed at once, and what no result needs never enters a program.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy
+
+COMPARISONS = ("less", "less_equal", "greater", "greater_equal", "equal", "not_equal")
+LOGICAL = (*COMPARISONS, "logical_and", "logical_or", "logical_not")
+COMMUTATIVE = frozenset(("add", "multiply", "equal", "not_equal", "logical_and", "logical_or"))
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    **{
+        name: getattr(numpy, name) for name in (*LOGICAL, "add", "subtract", "multiply", "divide", "negative")
+    },
+    **{name: getattr(numpy, name) for name in ("remainder", "maximum", "minimum", "sign", "absolute")},
+    **{name: getattr(numpy, name) for name in ("floor", "ceil", "trunc", "rint", "sqrt")},
+    "where": lambda truth, one, other: one if truth else other,
+    "number": lambda truth: numpy.float64(truth),
+}
+"""What each operation means, in NumPy's words; ``number`` is 1 for true and 0 for false."""
+FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "exp": numpy.exp,
+    "expm1": numpy.expm1,
+    "exp2": numpy.exp2,
+    "log": numpy.log,
+    "log1p": numpy.log1p,
+    "log2": numpy.log2,
+    "log10": numpy.log10,
+    "sin": numpy.sin,
+    "cos": numpy.cos,
+    "tan": numpy.tan,
+    "asin": numpy.arcsin,
+    "acos": numpy.arccos,
+    "atan": numpy.arctan,
+    "sinh": numpy.sinh,
+    "cosh": numpy.cosh,
+    "tanh": numpy.tanh,
+    "asinh": numpy.arcsinh,
+    "acosh": numpy.arccosh,
+    "atanh": numpy.arctanh,
+    "atan2": numpy.arctan2,
+    "pow": numpy.power,
+    "hypot": numpy.hypot,
+}
+"""What a library computes, by the names of C's."""
+_COMPUTE = OPERATIONS | FUNCTIONS
+
+
+class Graph:
+    """Expressions of one lane.
+
+    ``input`` (argument, row) reads a number that the program is given; ``constant`` has a value; ``take`` (table,
+    index) reads a table of constants; everything else is an entry of ``OPERATIONS`` or ``FUNCTIONS``.
+
+    Attributes:
+        operations: name of every expression.
+        arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
+        values: value of a constant, None of what varies.
+        tables: what ``take`` reads, ``(length,)`` each.
+    """
+
+    def __init__(self) -> None:
+        self.operations: list[str] = []
+        self.arguments: list[tuple[int, ...]] = []
+        self.values: list[float | bool | None] = []
+        self.logical: list[bool] = []
+        self.tables: list[numpy.ndarray] = []
+        self._found: dict[Any, int] = {}
+
+    def _kept(self, key: Any, name: str, arguments: tuple[int, ...], value: Any, logical: bool) -> int:
+        found = self._found.get(key)
+        if found is None:
+            found = self._found[key] = len(self.operations)
+            self.operations.append(name)
+            self.arguments.append(arguments)
+            self.values.append(value)
+            self.logical.append(logical)
+        return found
+
+    def input(self, argument: int, row: int) -> int:
+        """Number in a row of an argument."""
+        return self._kept(("input", argument, row), "input", (argument, row), None, False)
+
+    def constant(self, value: Any) -> int:
+        """Number or truth value that is known."""
+        if isinstance(value, bool | numpy.bool_):
+            return self._kept(("constant", bool(value)), "constant", (), bool(value), True)
+        number = numpy.float64(value)
+        # By its bits: -0.0 is not 0.0, and NaN is itself.
+        return self._kept(("constant", number.tobytes()), "constant", (), float(number), False)
+
+    def take(self, table: numpy.ndarray, index: int) -> int:
+        """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
+        if self.values[index] is not None:
+            return self.constant(table[int(self.values[index])])
+        key = ("table", table.tobytes())
+        if key not in self._found:
+            self._found[key] = len(self.tables)
+            self.tables.append(table)
+        place = self._found[key]
+        return self._kept(("take", place, index), "take", (place, index), None, False)
+
+    def node(self, name: str, *arguments: int) -> int:
+        """Expression of others."""
+        values = [self.values[argument] for argument in arguments]
+        if None not in values:
+            with numpy.errstate(all="ignore"):
+                return self.constant(_COMPUTE[name](*values))
+        simpler = self._simpler(name, arguments, values)
+        if simpler is not None:
+            return simpler
+        if name in COMMUTATIVE and arguments[1] < arguments[0]:
+            arguments = (arguments[1], arguments[0])
+        logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
+        return self._kept((name, *arguments), name, arguments, None, logical)
+
+    def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
+        """The same with less work, for finite numbers."""
+        if name in ("logical_and", "logical_or"):
+            for known, other in ((0, 1), (1, 0)):
+                if values[known] is not None:
+                    # true and x = x, false or x = x; else the known one decides
+                    return arguments[other if values[known] == (name == "logical_and") else known]
+            return arguments[0] if arguments[0] == arguments[1] else None
+        if name == "where":
+            if values[0] is not None:
+                return arguments[1 if values[0] else 2]
+            return arguments[1] if arguments[1] == arguments[2] else None
+        if name == "negative":
+            inner = arguments[0]
+            return self.arguments[inner][0] if self.operations[inner] == "negative" else None
+        if name not in ("add", "subtract", "multiply", "divide"):
+            return None
+        (a, b), (x, y) = arguments, values
+        if name == "multiply":
+            if x == 0.0 or y == 0.0:
+                return self.constant(0.0)
+            if x == -1.0 or y == -1.0:
+                return self.node("negative", b if x == -1.0 else a)
+            return b if x == 1.0 else a if y == 1.0 else None
+        if name == "add":
+            return b if x == 0.0 else a if y == 0.0 else None
+        if name == "subtract":
+            if a == b:
+                return self.constant(0.0)
+            return a if y == 0.0 else self.node("negative", b) if x == 0.0 else None
+        if x == 0.0:
+            return self.constant(0.0)
+        return a if y == 1.0 else None
+
+    def live(self, wanted: Iterable[int]) -> list[int]:
+        """What the wanted expressions are made of, each after its own parts and as late as that allows: a sum of
+        products is finished before the next begins, and its terms need not be kept.
+        """
+        seen: set[int] = set()
+        order: list[int] = []
+        for root in wanted:
+            waiting = [(root, False)]
+            while waiting:
+                node, ready = waiting.pop()
+                if ready:
+                    order.append(node)
+                elif node not in seen:
+                    seen.add(node)
+                    waiting.append((node, True))
+                    waiting.extend((part, False) for part in reversed(self.parts(node)))
+        return order
+
+    def parts(self, node: int) -> tuple[int, ...]:
+        """Expressions that one is directly made of."""
+        name = self.operations[node]
+        return () if name == "input" else self.arguments[node][1 if name == "take" else 0 :]
+
+
+class Result(NamedTuple):
+    """Where a program writes an expression."""
+
+    argument: int
+    row: int
+    node: int
+
+
+class Step(NamedTuple):
+    """One operation of a program."""
+
+    operation: str
+    arguments: tuple[int, ...]
+    """Steps before it; of an ``input`` argument and row, of a ``constant`` its place in ``constants``, of a
+    ``take`` the place of its table and a step."""
+    logical: bool
+
+
+class Program(NamedTuple):
+    """Straight line that computes some expressions of a graph.
+
+    Constants are told apart from the steps, so that programs that differ only in numbers have the same code.
+    """
+
+    steps: list[Step]
+    constants: numpy.ndarray
+    """``(n,)``: scalars, then the tables one after the other."""
+    results: list[Result]
+    """``node`` is a step's place."""
+
+
+def program(graph: Graph, wanted: Sequence[Result]) -> Program:
+    """Program for some expressions of a graph."""
+    order = graph.live(result.node for result in wanted)
+    place = {node: i for i, node in enumerate(order)}
+    scalars = [node for node in order if graph.values[node] is not None]
+    scalar = {node: i for i, node in enumerate(scalars)}
+    tables = sorted({graph.arguments[node][0] for node in order if graph.operations[node] == "take"})
+    lengths = [len(graph.tables[table]) for table in tables]
+    starts = dict(zip(tables, numpy.cumsum([len(scalars), *lengths]).tolist(), strict=False))
+    sizes = dict(zip(tables, lengths, strict=True))
+    steps = []
+    for node in order:
+        name, arguments = graph.operations[node], graph.arguments[node]
+        if name == "constant":
+            arguments = (scalar[node],)
+        elif name == "take":
+            arguments = (starts[arguments[0]], sizes[arguments[0]], place[arguments[1]])
+        elif name != "input":
+            arguments = tuple(place[argument] for argument in arguments)
+        steps.append(Step(name, arguments, graph.logical[node]))
+    values: list[Any] = [graph.values[node] for node in scalars]
+    constants = numpy.concatenate(
+        [numpy.array(values, dtype=float), *(graph.tables[table] for table in tables)]
+    )
+    return Program(steps, constants, [Result(r.argument, r.row, place[r.node]) for r in wanted])
