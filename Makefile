@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := filtergym filters envs evaluation baselines agents tests benchmarks
+SOURCES := filtergym compiler filters envs evaluation baselines agents tests benchmarks
 
 # Numbers, and every library once: gymnasium, scipy, xarray, matplotlib, typer and rich, safetensors.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
@@ -79,12 +79,12 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast]"
 	touch $@
 
 $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[agents,dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,agents,dev]"
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made

@@ -167,6 +167,7 @@ def train_bptt(
         backend="torch",
         autoreset_mode="Disabled",
     )
+    run.backend = env.backend
     env.reset(seed=episode_seeds("train", run.seed, run.envs))
     policy = RecurrentPolicy(len(task.fields), space, values["hidden_size"])
     learning_rate = learning_rate_schedule(values["learning_rate"])

@@ -132,14 +132,16 @@ class _Trainer(BaseCallback):
 
 def training_environment(run: TrainingRun) -> TaskVecEnv:
     """Make the environments of a run, seeded by the training split."""
-    env = gymnasium.make_vec(
+    env: Any = gymnasium.make_vec(
         run.environment,
         num_envs=run.envs,
         autoreset_mode="SameStep",
         control=run.control,
         scenario=run.scenario,
+        backend=run.backend,
         **run.hyperparameters.get("env_kwargs", {}),
     )
+    run.backend = env.unwrapped.backend
     adapted = to_sb3(env)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
     return adapted

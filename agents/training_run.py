@@ -56,6 +56,8 @@ class TrainingRun:
     steps: int
     """Environment steps asked for."""
     hyperparameters: dict[str, Any]
+    backend: str = "auto"
+    """What computes the steps of the environments: as asked for, and once they are made what does."""
     command: str = ""
     steps_done: int = 0
     seconds: float = 0.0
@@ -85,6 +87,7 @@ def new_run(
     seed: int = 0,
     scenario: str | None = None,
     overrides: Mapping[str, Any] | None = None,
+    backend: str = "auto",
 ) -> TrainingRun:
     """Describe a run; what is not given comes from the algorithm's hyperparameters.
 
@@ -110,7 +113,15 @@ def new_run(
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
     return TrainingRun(
-        importable_name(cls), control or cls.controls[0], chosen.name, algorithm, seed, envs, steps, values
+        importable_name(cls),
+        control or cls.controls[0],
+        chosen.name,
+        algorithm,
+        seed,
+        envs,
+        steps,
+        values,
+        backend,
     )
 
 
@@ -237,6 +248,8 @@ def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
     if not (folder / "run.json").exists() or load_run(folder) != run:
         save_run(run, folder / "run.json")
     run.steps = asked.steps
+    if asked.backend != "auto":
+        run.backend = asked.backend
     return run
 
 
@@ -278,7 +291,12 @@ class Validation:
         """Mean cost over the episodes and over every resample of them."""
         run = self.run
         dataset = evaluate(
-            run.environment, {name: policy}, run.scenario, VALIDATION_EPISODES, split="validation"
+            run.environment,
+            {name: policy},
+            run.scenario,
+            VALIDATION_EPISODES,
+            split="validation",
+            backend="auto" if run.backend == "torch" else run.backend,
         )
         return self.bootstrap.means(dataset["cost"].sel(policy=name).values.mean(axis=1))
 

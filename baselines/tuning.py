@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, make_task, nearest, short_name, task_class
 from ..envs.task import Task
 from ..evaluation.competitors import Kind
@@ -46,11 +47,16 @@ class Tuned:
 
 
 def mean_cost(
-    id: str, scenario: Any, tunable: Tunable, values: Mapping[str, float], seeds: Sequence[int]
+    id: str,
+    scenario: Any,
+    tunable: Tunable,
+    values: Mapping[str, float],
+    seeds: Sequence[int],
+    backend: str = "auto",
 ) -> float:
     """Mean uncapped cost of a candidate over some episodes."""
     keywords, make = tunable.apply(values)
-    task = make_task(id, tunable.control, scenario, **keywords)
+    task = task_on(backend, id, tunable.control, scenario, **keywords)
     total = 0.0
 
     def record(state: Any) -> None:
@@ -71,6 +77,7 @@ def tune(
     seed: int = 0,
     episodes: int = 256,
     progress: Callable[[int], None] = lambda steps: None,
+    backend: str = "auto",
 ) -> Tuned:
     """Search a policy's values.
 
@@ -83,6 +90,7 @@ def tune(
         seed: of the training episodes and of the search.
         episodes: training episodes that every candidate meets.
         progress: told of environment steps done.
+        backend: what computes the steps, see :func:`~.envs.backend.task_on`.
 
     Raises:
         ValueError: for a held-out scenario, or a budget too small for one generation.
@@ -115,7 +123,7 @@ def tune(
         if spent >= evaluations:
             return math.inf
         values = dict(zip(names, map(float, vector), strict=True))
-        cost = mean_cost(cls.id, chosen.name, tunable, values, train)
+        cost = mean_cost(cls.id, chosen.name, tunable, values, train, backend)
         spent += 1
         progress(steps)
         best = min(best, (cost, values), key=lambda pair: pair[0])
@@ -137,8 +145,8 @@ def tune(
     )
     # A winner among many candidates on the training episodes is flattered by them: ask fresh episodes.
     fresh = episode_seeds("validation", seed, 4 * episodes)
-    untuned = mean_cost(cls.id, chosen.name, tunable, tunable.start, fresh)
-    cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh), best[1]
+    untuned = mean_cost(cls.id, chosen.name, tunable, tunable.start, fresh, backend)
+    cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh, backend), best[1]
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
     kept = {name: rounded(value) for name, value in values.items()}

@@ -15,7 +15,6 @@ from .library import Library
 from .native import Native, native
 from .program import Graph, Program, Result, program
 
-
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
 FEWEST = 512
 """Lanes that are worth a thread."""
@@ -128,11 +127,33 @@ class Specialised:
         self.compile()
         assert self.native is not None
         arrays = [*inputs, *outputs]
-        table = [self.program.constants.ctypes.data]
+        table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
-            stride = array.strides[0 if lane_first else -2] // array.itemsize if array.ndim > 1 else 0
-            table += [array.ctypes.data, stride]
+            table += [address_of(array), _stride(array, 0 if lane_first else -2)]
         return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
+
+    def called(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
+        """Run on inputs of some width; returns new outputs, None where an input stands for one."""
+        self.compile()
+        assert self.native is not None
+        table = [address_of(self.program.constants)]
+        for array in arrays:
+            table += [address_of(array), _stride(array, -2)]
+        rows = [leaf.rows if same is None else 0 for leaf, same in zip(self.outputs, self.same, strict=True)]
+        memory = empty_lanes((sum(rows),), width)
+        start, stride = address_of(memory), _stride(memory, 0)
+        outputs: list[numpy.ndarray | None] = []
+        first = 0
+        for leaf, same, count in zip(self.outputs, self.same, rows, strict=True):
+            table += [start + memory.itemsize * first * stride, stride]
+            part = memory[first : first + count]
+            outputs.append(part.reshape(*leaf.shape, width) if same is None else None)
+            first += count
+        call = Call(
+            self.native, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
+        )
+        run_over(call, width, threads)
+        return outputs
 
     def example(self) -> Any:
         """Answer made of arrays that hold nothing in particular, for whoever traces what comes after."""
@@ -142,13 +163,6 @@ class Specialised:
             ),
             self.template,
         )
-
-    def empty(self, width: int, place: int) -> numpy.ndarray:
-        """Memory for an output."""
-        shape = self.outputs[place].shape
-        if self.lane_first[len(self.inputs) + place]:
-            return numpy.empty((width, *shape))
-        return empty_lanes(shape, width)
 
 
 class Call:
@@ -163,12 +177,12 @@ class Call:
         self, native: Native, table: numpy.ndarray, arrays: list[numpy.ndarray], constants: numpy.ndarray
     ) -> None:
         self.native, self.table, self.arrays, self._constants = native, table, arrays, constants
-        self.address = table.ctypes.data
+        self.address = address_of(table)
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
         """Read or write another array of the same form from now on."""
         self.arrays[place] = array
-        self.table[1 + 2 * place] = array.ctypes.data
+        self.table[1 + 2 * place] = address_of(array)
 
     def __call__(self, first: int, last: int) -> None:
         """Run from one lane to another."""
@@ -196,7 +210,7 @@ def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
     # Rows a power of two apart would share the same few places of the cache.
     stride = width + (LANES if width % 512 == 0 else 0)
     memory = numpy.empty(math.prod(shape) * stride + LANES)
-    start = -memory.ctypes.data // memory.itemsize % LANES
+    start = -address_of(memory) // memory.itemsize % LANES
     return memory[start : start + math.prod(shape) * stride].reshape(*shape, stride)[..., :width]
 
 
@@ -242,17 +256,15 @@ class Function:
         special = self.specialised(*parts)
         count = max(array.shape[-1] for array in given)
         width = -(-count // LANES) * LANES
-        arrays = [_ready(array, width) for array in given]
-        outputs = [given[same] if same is not None else None for same in special.same]
-        memory = [
-            special.empty(width, i) if array is None else numpy.empty(0) for i, array in enumerate(outputs)
-        ]
-        run_over(special.bound(arrays, memory), width, threads)
-        for i, leaf in enumerate(special.outputs):
-            if outputs[i] is None:
-                cut = memory[i][..., :count]
-                outputs[i] = cut if leaf.kind == "f" else cut.astype(DTYPES[leaf.kind])
-        return mapped(lambda place: outputs[place], special.template)
+        outputs = special.called([_ready(array, width) for array in given], width, threads)
+        answer: list[Any] = []
+        for output, same, leaf in zip(outputs, special.same, special.outputs, strict=True):
+            if output is None or same is not None:
+                answer.append(given[same or 0])
+                continue
+            cut = output if width == count else output[..., :count]
+            answer.append(cut if leaf.kind == "f" else cut.astype(DTYPES[leaf.kind]))
+        return mapped(lambda place: answer[place], special.template)
 
 
 def _structure(part: Any) -> Any:
@@ -266,14 +278,23 @@ def _structure(part: Any) -> Any:
 
 def _ready(array: Any, width: int) -> numpy.ndarray:
     """Array as the code reads it: float64, rows one after the other, a multiple of eight lanes."""
-    array = numpy.asarray(array, dtype=numpy.float64)
+    if array.__class__ is not numpy.ndarray or array.dtype != numpy.float64:
+        array = numpy.asarray(array, dtype=numpy.float64)
     if array.shape[-1] != width:
         padding = numpy.broadcast_to(array[..., -1:], (*array.shape[:-1], width - array.shape[-1]))
         array = numpy.concatenate([array, padding], axis=-1)
-    rows = array.strides[-2] if array.ndim > 1 else 0
-    even = all(array.strides[i] == array.strides[i + 1] * array.shape[i + 1] for i in range(array.ndim - 2))
-    return (
-        array
-        if array.strides[-1] == array.itemsize and even and rows >= 0
-        else numpy.ascontiguousarray(array)
-    )
+    if array.flags.c_contiguous:
+        return array
+    strides, shape = array.strides, array.shape
+    even = all(strides[i] == strides[i + 1] * shape[i + 1] for i in range(array.ndim - 2))
+    return array if strides[-1] == array.itemsize and even else numpy.ascontiguousarray(array)
+
+
+def address_of(array: numpy.ndarray) -> int:
+    """Address of an array's first number."""
+    return array.__array_interface__["data"][0]
+
+
+def _stride(array: numpy.ndarray, axis: int) -> int:
+    """Numbers from one row to the next."""
+    return array.strides[axis] // array.itemsize if array.ndim > 1 else 0

@@ -19,12 +19,12 @@ import numpy
 from .program import COMPARISONS, Graph
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
-bool = numpy.dtype("bool")  # noqa: A001  (the standard's name)
+bool = numpy.dtype("bool")
 pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
-class NotTraceable(TypeError):
+class NotTraceable(TypeError):  # noqa: N818  (that is what a function is)
     """A function does what no straight line of arithmetic can do."""
 
 
@@ -69,7 +69,9 @@ class Traced:
     ndim = property(lambda self: self.nodes.ndim)
     size = property(lambda self: self.nodes.size)
     T = property(lambda self: Traced(self.nodes.T, self.dtype))
-    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))
+    mT = property(  # noqa: N815  (the standard's name)
+        lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype)
+    )
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -91,13 +93,34 @@ class Traced:
     def __pow__(self, exponent: Any) -> "Traced":
         return square(self) if isinstance(exponent, int | float) and exponent == 2 else pow(self, exponent)
 
+    def __rpow__(self, base: Any) -> "Traced":
+        return pow(base, self)
+
+    def __neg__(self) -> "Traced":
+        return negative(self)
+
+    def __abs__(self) -> "Traced":
+        return abs(self)
+
+    def __invert__(self) -> "Traced":
+        return logical_not(self)
+
+    def __matmul__(self, other: Any) -> "Traced":
+        return matmul(self, other)
+
+    def __rmatmul__(self, other: Any) -> "Traced":
+        return matmul(other, self)
+
     def sum(self, axis: int | None = None) -> "Traced":
+        """Sum over an axis."""
         return sum(self, axis=axis)
 
     def reshape(self, *shape: Any) -> "Traced":
+        """Same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
 
     def copy(self) -> "Traced":
+        """Nothing changes an array in place."""
         return self
 
 
@@ -180,15 +203,15 @@ divide, maximum, minimum = _binary("divide", float64), _binary("maximum"), _bina
 less, less_equal, greater, greater_equal, equal, not_equal = (_binary(name, bool) for name in COMPARISONS)
 logical_and, logical_or, logical_not = (_logical(f"logical_{name}") for name in ("and", "or", "not"))
 floor_divide = _floor_divide
-negative, abs, sign = (_unary(name, result=None) for name in ("negative", "absolute", "sign"))  # noqa: A001
-floor, ceil, trunc, round = (_unary(n, result=None) for n in ("floor", "ceil", "trunc", "rint"))  # noqa: A001
+negative, abs, sign = (_unary(name, result=None) for name in ("negative", "absolute", "sign"))
+floor, ceil, trunc, round = (_unary(n, result=None) for n in ("floor", "ceil", "trunc", "rint"))
 sqrt, exp, expm1, exp2, log, log1p, log2, log10, sin, cos, tan = (
-    _unary(n) for n in "sqrt exp expm1 exp2 log log1p log2 log10 sin cos tan".split()
+    _unary(n) for n in ["sqrt", "exp", "expm1", "exp2", "log", "log1p", "log2", "log10", "sin", "cos", "tan"]
 )
 asin, acos, atan, sinh, cosh, tanh, asinh, acosh, atanh = (
-    _unary(n) for n in "asin acos atan sinh cosh tanh asinh acosh atanh".split()
+    _unary(n) for n in ["asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"]
 )
-atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))  # noqa: A001
+atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))
 
 
 def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
@@ -206,8 +229,6 @@ for _name, _operation in zip(
     strict=True,
 ):
     setattr(Traced, f"__{_name}__", _operation)
-Traced.__rpow__ = lambda self, base: pow(base, self)  # type: ignore[attr-defined]
-Traced.__neg__, Traced.__abs__, Traced.__invert__ = negative, abs, logical_not  # type: ignore[attr-defined]
 Traced.__hash__ = None  # type: ignore[assignment]
 
 
@@ -232,7 +253,7 @@ def where(condition: Any, one: Any, other: Any) -> Traced:
     return _elementwise("where", [asarray(condition), *arrays], dtype)
 
 
-def clip(x: Any, min: Any = None, max: Any = None) -> Traced:  # noqa: A002
+def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
     """Limit."""
     if min is not None:
         x = maximum(x, min)
@@ -320,7 +341,7 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 def _chosen(graph: Graph, row: list[int], index: int) -> int:
     values = [graph.values[node] for node in row]
     if graph.values[index] is not None:
-        return row[int(graph.values[index])]
+        return row[int(graph.values[index] or 0.0)]
     if None not in values and not builtins.any(graph.logical[node] for node in row):
         return graph.take(numpy.array(values, dtype=float), index)
     chosen = row[0]
@@ -342,8 +363,8 @@ def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
     return function
 
 
-sum, prod, max, min = (_reduction(o) for o in (add, multiply, maximum, minimum))  # noqa: A001
-any, all = _reduction(logical_or), _reduction(logical_and)  # noqa: A001
+sum, prod, max, min = (_reduction(o) for o in (add, multiply, maximum, minimum))
+any, all = _reduction(logical_or), _reduction(logical_and)
 
 
 def sort(x: Any, /, *, axis: int = -1) -> Traced:
@@ -364,7 +385,3 @@ def matmul(a: Any, b: Any, /) -> Traced:
     )
     product = product[..., 0, :] if a.ndim == 1 else product
     return product[..., 0] if b.ndim == 1 else product
-
-
-Traced.__matmul__ = matmul  # type: ignore[attr-defined]
-Traced.__rmatmul__ = lambda self, other: matmul(other, self)  # type: ignore[attr-defined]

@@ -96,7 +96,7 @@ class Graph:
     def take(self, table: numpy.ndarray, index: int) -> int:
         """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
         if self.values[index] is not None:
-            return self.constant(table[int(self.values[index])])
+            return self.constant(table[int(self.values[index] or 0.0)])
         key = ("table", table.tobytes())
         if key not in self._found:
             self._found[key] = len(self.tables)

@@ -29,7 +29,7 @@ METHODS = ("begin", "measure", "act", "observe", "mean", "cost", "error", "covar
 """Of a task, those that are compiled."""
 TILE = 1024
 """Lanes that go through both halves of a step before the next: they stay in the second-level cache."""
-REMEMBERED = 64
+REMEMBERED = 8
 """Tasks whose programs a process keeps."""
 MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
@@ -169,13 +169,23 @@ def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
     return other
 
 
-@functools.lru_cache(REMEMBERED)
-def _programs(cls: type[Task], parameters: Any, control: str) -> Programs:
+def _traced(cls: type[Task], parameters: Any, control: str) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        programs = Programs(cls(parameters, control, namespace), graph)  # type: ignore[arg-type]
+        programs = Programs(cls(parameters, control, namespace), graph)
     programs.halves("cost")
     return programs
+
+
+_remembered = functools.lru_cache(REMEMBERED)(_traced)
+
+
+def _hashes(value: Any) -> bool:
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
 
 
 def compiled(task: Task, threads: int = 1) -> Task:
@@ -191,13 +201,10 @@ def compiled(task: Task, threads: int = 1) -> Task:
     """
     if not AVAILABLE:
         raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
+    # Parameters that hold arrays are traced each time.
+    trace = _remembered if _hashes(task.parameters) else _traced
     try:
-        hash(task.parameters)
-        make = _programs
-    except TypeError:
-        make = _programs.__wrapped__  # parameters that hold arrays are traced each time
-    try:
-        return _wrapped(task, make(type(task), task.parameters, task.control), threads)
+        return _wrapped(task, trace(type(task), task.parameters, task.control), threads)
     except NotTraceable:
         raise
     except Exception as error:  # a task may stumble over symbols in any way

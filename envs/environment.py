@@ -249,10 +249,11 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, or a trajectory.
         reward: "cost" (default), "log-likelihood" or "relative".
-        backend: "auto" (default) or "compiled", "numpy", see :func:`~.backend.task_on`; or "torch": observations,
+        backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
-            same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and observations back to actions that require them, over all steps
-            since the last reset; pass detached actions where none are wanted.
+            same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and
+            observations back to actions that require them, over all steps since the last reset; pass detached
+            actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         threads: how many share the sub-environments, of the compiled backend; the numbers stay the same.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.

@@ -28,7 +28,7 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..compiler.functions import mapped
+from ..compiler.functions import address_of, mapped
 from ..filters.ordered_sums import ordered_sum
 from .compiled import MANY, Stepper
 from .observation import Array
@@ -226,7 +226,7 @@ class Lanes:
         episode = task.begin(scenario, start)
         if self._begun is not None:
             self._begun(episode)
-        fresh = [task.measure(episode, first_row)]
+        fresh: list[Any] = [task.measure(episode, first_row)]
         if self.paper is not None:
             fresh.append(self.paper.measure(self.paper.begin(scenario, start), first_row))
         if everyone:
@@ -261,7 +261,7 @@ class Lanes:
         shown = None
         for _ in range(task.decision_interval):
             posterior = update(self.state)
-            paper_posterior = self.paper and self.paper.act(self.paper_state, self._paper_action)
+            paper_posterior: Any = self.paper and self.paper.act(self.paper_state, self._paper_action)
             if record is not None:
                 record(posterior, paper_posterior)
             row = self._next_row()
@@ -342,7 +342,7 @@ class Lanes:
         self._moving, self._episodes = steppers, [None, None]
         self._shown, self._shown_to = steppers[0].shown, False
         self._shown[...] = shown.T
-        self._ring_start, self._ring_stride = self._ring.ctypes.data, self._ring.strides[0]
+        self._ring_start, self._ring_stride = address_of(self._ring), self._ring.strides[0]
 
     def _show(self, memory: numpy.ndarray) -> None:
         """Let observations be written into other memory from now on."""

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy
 
-from ..envs.environment import checked_action
 from ..compiler.functions import mapped
+from ..envs.environment import checked_action
 from ..envs.lanes import Lanes, padded_width
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task

@@ -13,6 +13,7 @@ from rich.console import Console
 from . import __version__
 from .commands import improve, measure, report
 from .commands.terminal import close_output, open_output
+from .compiler.cache import SWITCH
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
@@ -43,8 +44,14 @@ def _general(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
     ] = False,
+    no_cache: Annotated[
+        bool,
+        typer.Option("--no-cache", help="Neither read nor keep compiled code in the user's cache folder."),
+    ] = False,
 ) -> None:
     """Gymnasium environments for adaptive-filter benchmarking. With --debug, an error shows its traceback."""
+    if no_cache:
+        os.environ[SWITCH] = "off"
 
 
 @functools.cache
@@ -82,7 +89,7 @@ def main() -> None:
         text, code = f"Error: {error}", 2
         if isinstance(error, MemoryError):
             text = f"Error: not enough memory, ask for less at once: {error}"
-        elif not isinstance(error, ValueError | OSError | gymnasium.error.Error):
+        elif not isinstance(error, ValueError | OSError | ImportError | gymnasium.error.Error):
             text, code = f"Error: unexpected {type(error).__name__}: {error}; {REPORT}", 1
         Console(stderr=True, highlight=False, emoji=False).print(
             text.replace("\n", " "), style="red", markup=False, soft_wrap=True

@@ -13,7 +13,7 @@ from filtergym.envs.catalogue import catalogue
 
 import filtergym
 
-ROOMS = ("filters", "envs", "evaluation", "baselines", "agents", "filtergym")
+ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents", "filtergym")
 
 
 def check_wheel(wheel: Path, source: Path) -> None:

@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
 
 
@@ -15,9 +16,11 @@ def continued(env, actions):
     return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
 
 
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
 @pytest.mark.parametrize("way", WAYS)
-def test_single_environments(env_id, short, way):
-    env = gymnasium.make(env_id, **short)
+def test_single_environments(env_id, short, way, backend):
+    pytest.importorskip(NEEDED[backend])
+    env = gymnasium.make(env_id, backend=backend, **short)
     env.reset(seed=3)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(8)]
@@ -30,11 +33,10 @@ def test_single_environments(env_id, short, way):
     np.testing.assert_array_equal(env.reset()[0], other.reset()[0])
 
 
-@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("backend", NEEDED)
 @pytest.mark.parametrize("way", WAYS)
 def test_vector_environments(env_id, short, way, backend):
-    if backend == "torch":
-        pytest.importorskip("torch")
+    pytest.importorskip(NEEDED[backend])
     env = gymnasium.make_vec(env_id, num_envs=3, backend=backend, **short)
     env.reset(seed=3)
     env.action_space.seed(0)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from filtergym.envs.catalogue import catalogue
 
 FOLDER = Path(__file__).parent / "golden"
@@ -26,9 +27,9 @@ def stored_file(env_id, control):
     return FOLDER / f"{env_id.split('/')[-1]}-{control}.json"
 
 
-def trajectory(env_id, control, actions):
+def trajectory(env_id, control, actions, backend="numpy"):
     """Observations and rewards that the actions lead to."""
-    env = gym.make(env_id, control=control, disable_env_checker=True)
+    env = gym.make(env_id, control=control, backend=backend, disable_env_checker=True)
     shown, paid = [env.reset(seed=SEED)[0].tolist()], []
     discrete = isinstance(env.action_space, gym.spaces.Discrete)
     for action in actions:
@@ -39,13 +40,16 @@ def trajectory(env_id, control, actions):
     return {"fields": fields, "observations": shown, "rewards": paid}
 
 
-def test_trajectory_is_the_stored_one(env_id, control):
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+def test_trajectory_is_the_stored_one(env_id, control, backend):
+    if backend == "compiled":
+        pytest.importorskip("llvmlite")
     path = stored_file(env_id, control)
     assert path.exists(), (
         f"{path.name} is missing: run `python tests/test_golden_trajectories.py` and look at what it wrote"
     )
     stored = json.loads(path.read_text())
-    now = trajectory(env_id, control, stored["actions"])
+    now = trajectory(env_id, control, stored["actions"], backend)
     assert now["fields"] == stored["fields"]
     # Processors differ below this.
     np.testing.assert_allclose(now["observations"], stored["observations"], rtol=1e-6, atol=1e-6)

@@ -12,7 +12,7 @@ from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation.files import writable_file
 from ..reports.tables import tuned_table
-from .terminal import Environment, TrainingScenario, Trust, console, progress_bar
+from .terminal import Backend, Environment, TrainingScenario, Trust, console, progress_bar
 
 
 def tune_policy(
@@ -22,6 +22,7 @@ def tune_policy(
     scenario: TrainingScenario = None,
     seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
+    backend: Backend = "auto",
 ) -> None:
     """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
 
@@ -43,6 +44,7 @@ def tune_policy(
             scenario,
             seed,
             progress=lambda steps: bar.update(line, advance=steps),
+            backend=backend,
         )
     command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
@@ -66,6 +68,7 @@ def train(
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
     ] = None,
     trust: Trust = False,
+    backend: Backend = "auto",
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
@@ -91,7 +94,7 @@ def train(
             f"training needs more packages: pip install 'filtergym[agents]' ({error})"
         ) from error
     torch.set_num_threads(1)  # networks this small run slower on more
-    run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario)
+    run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario, backend=backend)
     run = training_run.opened_run(out, run, resume)
     with progress_bar() as bar:
         line = bar.add_task(f"training {algo}", total=run.steps)

@@ -16,11 +16,13 @@ from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.tables import results_table
 from .terminal import (
+    Backend,
     Environment,
     Episodes,
     Experiment,
     ScenarioName,
     Split,
+    Threads,
     Trust,
     console,
     parsed_settings,
@@ -62,6 +64,8 @@ def evaluate_policies(
     out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
     json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     trust: Trust = False,
+    backend: Backend = "auto",
+    threads: Threads = 1,
 ) -> None:
     """Run policies over the same noise and compare them.
 
@@ -89,6 +93,8 @@ def evaluate_policies(
             control,
             progress=lambda done: bar.update(line, advance=done),
             trust=trust,
+            backend=backend,
+            threads=threads,
             **keywords,
         )
     records = tidy_records(dataset)
@@ -114,6 +120,8 @@ def benchmark(
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
+    backend: Backend = "auto",
+    threads: Threads = 1,
 ) -> None:
     """Run every environment with its policies; quick by default, resumes after an interruption.
 
@@ -128,7 +136,7 @@ def benchmark(
         def finished(records: list[Record]) -> None:
             console.print(results_table(records))
 
-        run_benchmark(out, full, seed, environment or (), split, started, finished)
+        run_benchmark(out, full, seed, environment or (), split, started, finished, backend, threads)
     console.print(f"records in {out / 'benchmark.json'}, figures beside it")
 
 

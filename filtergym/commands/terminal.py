@@ -26,6 +26,10 @@ Trust = Annotated[
         "--trust", help="Load files and modules that can execute code: you made them, or know who did."
     ),
 ]
+Backend = Annotated[
+    str, typer.Option(help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.")
+]
+Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
 Split = Annotated[str, typer.Option(help="test, validation or train.")]
 
 

@@ -86,12 +86,26 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
 
 
 def run_cell(
-    cell: Cell, seed: int, split: str, folder: Path, progress: Callable[[int], None]
+    cell: Cell,
+    seed: int,
+    split: str,
+    folder: Path,
+    progress: Callable[[int], None],
+    backend: str = "auto",
+    threads: int = 1,
 ) -> list[Record]:
     """Evaluate one cell, save its figures, and return its records."""
     known = baselines_of(cell.environment)
     dataset = evaluate(
-        cell.environment, cell.policies, cell.scenario, cell.episodes, seed, split, progress=progress
+        cell.environment,
+        cell.policies,
+        cell.scenario,
+        cell.episodes,
+        seed,
+        split,
+        progress=progress,
+        backend=backend,
+        threads=threads,
     )
     # Not all of the full benchmark's policies: nobody can tell twenty lines apart.
     clear = {*(known.benchmark or known.names), *shipped_agents(cell.environment)}
@@ -109,6 +123,8 @@ def run_benchmark(
     split: str = "test",
     started: Callable[[Cell, int], Callable[[int], None]] = lambda cell, total: lambda done: None,
     finished: Callable[[list[Record]], None] = lambda records: None,
+    backend: str = "auto",
+    threads: int = 1,
 ) -> list[Record]:
     """Run every cell, resuming at the first missing one after an interruption.
 
@@ -120,6 +136,8 @@ def run_benchmark(
         split: "test", or another one for development.
         started: called with a cell and its number of measurements; returns what is told of progress.
         finished: called with the records of each cell.
+        backend: what computes the steps, see :func:`~.envs.backend.task_on`.
+        threads: how many share the episodes, of the compiled backend.
 
     Returns:
         All records.
@@ -135,7 +153,7 @@ def run_benchmark(
         if {record.policy for record in done} == set(cell.policies):
             tick(cell.measurements)
         else:
-            done = run_cell(cell, seed, split, folder, tick)
+            done = run_cell(cell, seed, split, folder, tick, backend, threads)
             write_records(path, done)
         finished(done)
         records += done

@@ -5,7 +5,15 @@ from collections.abc import Iterator
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
+from ..compiler.library import fastest
+from ..compiler.native import processor
+from ..envs.backend import task_on
 from ..envs.catalogue import importable_name, parameter_names, task_class
+
+
+def _library(backend: str) -> str:
+    """Where the exponentials of compiled steps come from."""
+    return f" (functions of {fastest(processor()[1]).name})" if backend == "compiled" else ""
 
 
 def environment_lines(id: str) -> Iterator[str]:
@@ -16,6 +24,7 @@ def environment_lines(id: str) -> Iterator[str]:
     yield f"  {(cls.__doc__ or '').strip().partition(chr(10))[0]}"
     if cls.paper_source:
         yield f"  paper:       {cls.paper_source}"
+    task = task_on("auto", cls.id)
     rows = {
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
@@ -27,6 +36,7 @@ def environment_lines(id: str) -> Iterator[str]:
     for title, names in rows.items():
         if names:
             yield f"  {title + ':':<12} {', '.join(names)}"
+    yield f"  {'backend:':<12} {task.backend}{_library(task.backend)}"
     for title, table in (("references", known.references), ("bounds", known.bounds)):
         if table:
             yield f"  {title}:"
