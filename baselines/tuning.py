@@ -18,7 +18,7 @@ import numpy
 
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, make_task, nearest, short_name, task_class
-from ..envs.task import Task
+from ..envs.task import Episode, Task
 from ..evaluation.competitors import Kind
 from ..evaluation.files import write_text
 from ..evaluation.rollout import run_estimator, run_policy
@@ -46,6 +46,10 @@ class Tuned:
     seed: int
 
 
+def _cost(task: Task, episode: Episode) -> numpy.ndarray:
+    return task.cost(episode)
+
+
 def mean_cost(
     id: str,
     scenario: Any,
@@ -59,12 +63,14 @@ def mean_cost(
     task = task_on(backend, id, tunable.control, scenario, **keywords)
     total = 0.0
 
-    def record(state: Any) -> None:
+    def add(cost: numpy.ndarray) -> None:
         nonlocal total
-        total += float(task.cost(state)[: len(seeds)].sum())
+        total += float(cost[: len(seeds)].sum())
 
-    run = run_policy if tunable.control else run_estimator
-    run(task, make(task), seeds, record, lambda _: None)
+    if tunable.control:
+        run_policy(task, make(task), seeds, add, lambda _: None, _cost)
+    else:
+        run_estimator(task, make(task), seeds, lambda episode: add(task.cost(episode)), lambda _: None)
     return total / (len(seeds) * task.horizon)
 
 

@@ -20,7 +20,7 @@ from ..compiler.functions import DTYPES, Function, Specialised, empty_lanes, lea
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from .observation import Array
-from .reward import reward
+from .reward import cost_reward
 from .task import Episode, Task
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
@@ -35,10 +35,14 @@ MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
 
 
-def _steered(kind: str, task: Task, episode: Episode, action: Array) -> tuple[Any, Array]:
-    """Bank after the action, and what is paid for it."""
+Report = Callable[[Task, Episode], Any]
+"""What somebody wants to know of every episode after the action: nested tuples or dictionaries of arrays."""
+
+
+def _steered(report: Report, task: Task, episode: Episode, action: Array) -> tuple[Any, Any]:
+    """Bank after the action, and the report on it."""
     after = task.act(episode, action)
-    return after.bank, reward(kind, task, after, None, None)
+    return after.bank, report(task, after)
 
 
 def _moved_on(task: Task, truth: Any, bank: Any, noise: Array) -> tuple[Any, Any, Any, Array]:
@@ -61,7 +65,7 @@ class Programs:
         self.refused: set[Any] = set()
         """Functions that could not be traced."""
         self._functions: dict[Any, Function] = {}
-        self._halves: dict[str, tuple[Specialised, Specialised]] = {}
+        self._halves: dict[Report, tuple[Specialised, Specialised]] = {}
 
     @functools.cached_property
     def episode(self) -> Episode:
@@ -70,10 +74,11 @@ class Programs:
         start = self.function(cls.begin).specialised(
             numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
         )
-        return self.function(cls.measure).specialised(start.example(), self._row).example()
+        return self.function(cls.measure).specialised(start.example(), self.row).example()
 
     @property
-    def _row(self) -> numpy.ndarray:
+    def row(self) -> numpy.ndarray:
+        """Noise of one measurement, of the right shape."""
         return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
 
     def function(self, function: Callable[..., Any]) -> Function:
@@ -82,21 +87,21 @@ class Programs:
             self._functions[function] = Function(functools.partial(function, self.traced), self.graph)
         return self._functions[function]
 
-    def halves(self, kind: str) -> tuple[Specialised, Specialised]:
-        """Both halves of a step: the action with its reward of some kind, and the way to the next observation.
+    def halves(self, report: Report) -> tuple[Specialised, Specialised]:
+        """Both halves of a step: the action with a report on it, and the way to the next observation.
 
         Raises:
             NotTraceable: if the task is no straight line of arithmetic.
         """
-        if kind not in self._halves:
+        if report not in self._halves:
             episode, space = self.episode, self.traced.action_space
             discrete = isinstance(space, gymnasium.spaces.Discrete)
             action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
             steer = Specialised(
-                functools.partial(_steered, kind, self.traced),
+                functools.partial(_steered, report, self.traced),
                 self.graph,
                 (episode, action),
-                # A part of the bank that the action leaves alone; never what is paid, which comes last.
+                # A part of the bank that the action leaves alone; never the report, which comes last.
                 shared=lambda output, input: (
                     input < len(leaves(episode)) and output < len(leaves(episode.bank))
                 ),
@@ -104,15 +109,15 @@ class Programs:
             advance = Specialised(
                 functools.partial(_moved_on, self.traced),
                 self.graph,
-                (episode.truth, steer.example()[0], self._row),
+                (episode.truth, steer.example()[0], self.row),
                 turned=True,
                 # A part of the truth that stays: both copies of the episodes may have the same one.
                 shared=lambda output, input: output == input < len(leaves(episode.truth)),
             )
             if [leaf.shape for leaf in advance.outputs[:-1]] != [leaf.shape[:-1] for leaf in leaves(episode)]:
                 raise NotTraceable("the arrays of an episode change their shapes from step to step")
-            self._halves[kind] = steer, advance
-        return self._halves[kind]
+            self._halves[report] = steer, advance
+        return self._halves[report]
 
 
 class _Compiled(Task):
@@ -173,7 +178,7 @@ def _traced(cls: type[Task], parameters: Any, control: str) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
         programs = Programs(cls(parameters, control, namespace), graph)
-    programs.halves("cost")
+    programs.halves(cost_reward)
     return programs
 
 
@@ -223,29 +228,40 @@ def warn_of(what: str, error: BaseException) -> None:
     warnings.warn(f"{what} is not compiled and runs with NumPy: {error}{line}", stacklevel=2)
 
 
+def can_step(task: Any, report: Report) -> bool:
+    """Whether a task's steps are compiled, and a report on them can be."""
+    if task.backend != "compiled" or report in task.programs.refused:
+        return False
+    try:
+        task.programs.halves(report)
+    except NotTraceable as error:
+        task.programs.refused.add(report)
+        warn_of(f"{report.__qualname__} of {task.id}", error)
+        return False
+    return True
+
+
 class Stepper:
     """Episodes of a compiled task in memory of their own, stepped by actions.
 
     Args:
         task: compiled.
-        kind: reward that is paid.
+        report: made of every episode after the action.
         width: lanes, a multiple of eight.
 
     Attributes:
         action: to be written before a step, ``(..., width)``.
-        paid: for the last action, ``(width,)``.
         shown: last observation, ``(width, fields)``.
     """
 
-    def __init__(self, task: Any, kind: str, width: int) -> None:
-        steer, advance = task.programs.halves(kind)
+    def __init__(self, task: Any, report: Report, width: int) -> None:
+        steer, advance = task.programs.halves(report)
         episode = task.programs.episode
         truths = len(leaves(episode.truth))
         self.width, self._threads = width, task.threads
         self._template, self._kinds = advance.template, advance.outputs
         self.action = empty_lanes(steer.inputs[-1].shape, width)
         self.action[...] = 0.0
-        self.paid = numpy.empty(width)
         self.shown = numpy.empty((width, *advance.outputs[-1].shape))
         first = [empty_lanes(leaf.shape, width) for leaf in advance.outputs[:-1]]
         second = [
@@ -253,15 +269,18 @@ class Stepper:
             for i, same in enumerate(advance.same[:-1])
         ]
         self._copies = (first, second)
-        steered = [empty_lanes(leaf.shape, width) for leaf in steer.outputs[:-1]]
-        nothing = numpy.zeros((len(task.programs._row), width))
+        banks = len(leaves(episode.bank))
+        written = [empty_lanes(leaf.shape, width) for leaf in steer.outputs]
+        self._reported, self._report_template = written, steer.template[1]
+        self._report_kinds = steer.outputs
+        nothing = numpy.zeros((len(task.programs.row), width))
         self._steer, self._advance = [], []
         for now, then in ((first, second), (second, first)):
-            self._steer.append(steer.bound([*now, self.action], [*steered, self.paid]))
-            bank = [steered[i] if same is None else now[same] for i, same in enumerate(steer.same[:-1])]
+            self._steer.append(steer.bound([*now, self.action], written))
+            bank = [written[i] if same is None else now[same] for i, same in enumerate(steer.same[:banks])]
             self._advance.append(advance.bound([*now[:truths], *bank, nothing], [*then, self.shown]))
         self._now = 0
-        self._row_entry = 1 + 2 * (truths + len(steer.same) - 1)
+        self._row_entry = 1 + 2 * (truths + banks)
 
     def load(self, episode: Episode) -> None:
         """Go on from other episodes."""
@@ -301,6 +320,13 @@ class Stepper:
                 advance(start, end)
 
         run_over(tiles, self.width, self._threads)
+
+    def report(self) -> Any:
+        """Return the last report, in arrays ``(..., width)`` that stay as they are."""
+        kinds = self._report_kinds
+        return mapped(
+            lambda i: self._reported[i].astype(DTYPES[kinds[i].kind], order="C"), self._report_template
+        )
 
     def show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""

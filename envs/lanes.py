@@ -30,9 +30,9 @@ import numpy
 
 from ..compiler.functions import address_of, mapped
 from ..filters.ordered_sums import ordered_sum
-from .compiled import MANY, Stepper
+from .compiled import MANY, Report, Stepper, can_step
 from .observation import Array
-from .reward import reward
+from .reward import OWN_PAY
 from .task import Episode, Task
 
 LANE_MULTIPLE = 8
@@ -104,7 +104,7 @@ class Lanes:
             self._paper_action = self._constant_action(paper)
         self._episodes: list[Any] = [None, None]
         """The task's episodes and the paper's; None where they are in a stepper's memory."""
-        self._steppers: dict[str, list[Stepper]] = {}
+        self._steppers: dict[Report, list[Stepper]] = {}
         self._moving: list[Stepper] = []
         """Those whose memory holds the episodes."""
         self._shown: Any = None
@@ -294,48 +294,60 @@ class Lanes:
             action: batch first, as the action space has it.
             kind: one of :data:`~.reward.REWARDS`.
         """
-        if self.task.backend != "compiled":
-            widened, rewards = self.widened(action), []
+        answers = self.decide(action, OWN_PAY[kind])
+        return mean_of([own if paper is None else own - paper for own, paper in answers])[: self.count]
+
+    def decide(self, action: Array, report: Report) -> list[tuple[Any, Any]]:
+        """Apply one decision and report on it.
+
+        Args:
+            action: batch first, as the action space has it.
+            report: function of a task and its episodes after the action; not made anew for each call.
+
+        Returns:
+            The reports on every measurement that the decision held for, arrays ``(..., width)``: of the task, and of
+            ``paper`` (None without).
+        """
+        answers: list[tuple[Any, Any]] = []
+        if self._moving is not self._steppers.get(report) and not self._move(report):
+            widened = self.widened(action)
 
             def record(state: Any, paper_state: Any) -> None:
-                rewards.append(reward(kind, self.task, state, self.paper, paper_state))
+                own = self.task.run(report, state)
+                answers.append((own, self.paper and self.paper.run(report, paper_state)))
 
             self.step(lambda state: self.task.act(state, widened), record)
-            return mean_of(rewards)[: self.count]
-        if self._moving is not self._steppers.get(kind):
-            self._move(kind)
-        steppers, interval = self._moving, self.task.decision_interval
-        steppers[0].action[..., : self.count] = action.T if action.ndim == 2 else action
+            return answers
+        own, *paper = self._moving
+        own.action[..., : self.count] = action.T if action.ndim == 2 else action
         if self._shown_to:
             self._show(numpy.empty_like(self._shown))
+        interval = self.task.decision_interval
         mean = self._mean_fields if interval > 1 else []
-        rewards, total = [], 0.0
+        total: Any = 0.0
         for _ in range(interval):
             self._next_row()
             row = self._ring_start + self._clock % self._slots * self._ring_stride
-            for stepper in steppers:
+            for stepper in self._moving:
                 stepper.step(row)
-            paid = steppers[0].paid[: self.count].copy()
-            for paper in steppers[1:]:
-                paid -= paper.paid[: self.count]
-            rewards.append(paid)
+            answers.append((own.report(), paper[0].report() if paper else None))
             if mean:
                 total = total + self._shown[:, mean]
         if mean:
             self._shown[:, mean] = total / interval
         self.decisions += 1
-        return mean_of(rewards)
+        return answers
 
-    def _move(self, kind: str) -> None:
-        """Put the episodes into the memory of the steppers that pay so."""
-        if kind not in self._steppers:
+    def _move(self, report: Report) -> bool:
+        """Put the episodes into the memory of the steppers that make a report; False where there can be none."""
+        if report not in self._steppers:
             tasks = [self.task] if self.paper is None else [self.task, self.paper]
-            # Both are paid their own cost; the difference is the relative reward.
-            own = "cost" if kind == "relative" else kind
-            self._steppers[kind] = [Stepper(task, own, self.width) for task in tasks]
-            for stepper in self._steppers[kind][1:]:
+            if not all(can_step(task, report) for task in tasks):
+                return False
+            self._steppers[report] = [Stepper(task, report, self.width) for task in tasks]
+            for stepper in self._steppers[report][1:]:
                 stepper.action[...] = self._paper_action
-        steppers, shown = self._steppers[kind], self._observed()
+        steppers, shown = self._steppers[report], self._observed()
         self._settle()
         for stepper, episode in zip(steppers, self._episodes, strict=False):
             stepper.load(episode)
@@ -343,6 +355,7 @@ class Lanes:
         self._shown, self._shown_to = steppers[0].shown, False
         self._shown[...] = shown.T
         self._ring_start, self._ring_stride = address_of(self._ring), self._ring.strides[0]
+        return True
 
     def _show(self, memory: numpy.ndarray) -> None:
         """Let observations be written into other memory from now on."""

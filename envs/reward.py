@@ -6,18 +6,36 @@ the reported Gaussian's density at the truth, which pays for an honest covarianc
 positive where the agent does better than the paper.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 from ..filters.gaussian import log_density
 from .observation import Array
 from .task import Task, huber
 
-REWARDS = ("cost", "log-likelihood", "relative")
-
 
 def capped_cost(task: Task, state: Any) -> Array:
     """Cost of the estimate, linear beyond the task's Huber bound, ``(N,)``."""
     return huber(task.cost(state), task.huber_bound, task.xp)
+
+
+def cost_reward(task: Task, state: Any) -> Array:
+    """Minus the capped cost of the estimate, ``(N,)``."""
+    return -capped_cost(task, state)
+
+
+def log_likelihood_reward(task: Task, state: Any) -> Array:
+    """Log-density of the truth under what is reported, ``(N,)``."""
+    return log_density(task.error(state), task.covariance(state))[0]
+
+
+OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
+    "cost": cost_reward,
+    "log-likelihood": log_likelihood_reward,
+    "relative": cost_reward,
+}
+"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away."""
+REWARDS = tuple(OWN_PAY)
 
 
 def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: Any) -> Array:
@@ -30,12 +48,8 @@ def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: A
         paper: the same task under the control of the paper's algorithm, for "relative".
         paper_state: its state on the same noise.
     """
-    if kind == "log-likelihood":
-        return log_density(task.error(state), task.covariance(state))[0]
-    if kind == "relative":
-        assert paper is not None
-        return capped_cost(paper, paper_state) - capped_cost(task, state)
-    return -capped_cost(task, state)
+    paid = OWN_PAY[kind](task, state)
+    return paid - OWN_PAY[kind](paper, paper_state) if kind == "relative" and paper is not None else paid
 
 
 def paper_task(task: Task) -> Task:

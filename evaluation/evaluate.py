@@ -80,12 +80,17 @@ def _run_chunk(
     def keep(name: str, values: numpy.ndarray) -> None:
         series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
-    def record(state: Any) -> None:
-        for name, values in task.run(_measured_and_tracked if tracks else _measured, state).items():
+    report = _measured_and_tracked if tracks else _measured
+
+    def keep_all(found: dict[str, numpy.ndarray]) -> None:
+        for name, values in found.items():
             keep(name, values)
 
+    def record(episode: Episode) -> None:
+        keep_all(task.run(report, episode))
+
     if kind == "policy":
-        run_policy(task, actor, seeds, record, tick)
+        run_policy(task, actor, seeds, keep_all, tick, report)
     elif kind == "estimator":
         run_estimator(task, actor, seeds, record, tick, name, first_episode)
     elif kind == "reference":

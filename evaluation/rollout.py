@@ -9,6 +9,7 @@ from typing import Any
 import numpy
 
 from ..compiler.functions import mapped
+from ..envs.compiled import Report
 from ..envs.environment import checked_action
 from ..envs.lanes import Lanes, padded_width
 from ..envs.observation import Array
@@ -48,7 +49,12 @@ def _episodes_of_calls(policy: Any, lanes: Lanes) -> list[numpy.ndarray]:
 
 
 def run_policy(
-    task: Task, policy: Any, seeds: Sequence[int], record: Callable[[Any], None], tick: Progress
+    task: Task,
+    policy: Any,
+    seeds: Sequence[int],
+    record: Callable[[Any], None],
+    tick: Progress,
+    report: Report = lambda task, episode: episode,
 ) -> None:
     """Run a policy over one episode for each seed.
 
@@ -56,7 +62,8 @@ def run_policy(
         task: the estimation problem, under the policy's control.
         policy: anything with Stable-Baselines3's ``predict``.
         seeds: of the episodes, all run side by side.
-        record: called with every state after the action; lanes beyond ``len(seeds)`` are padding.
+        record: called after every action with the report on it; lanes beyond ``len(seeds)`` are padding.
+        report: function of the task and the state after the action; default: the state itself.
         tick: told of progress.
     """
     lanes = started_lanes(task, seeds)
@@ -72,12 +79,8 @@ def run_policy(
             start = numpy.full(len(call), first)
             answer, memories[c] = policy.predict(shown[call], memories[c], start, deterministic=True)
             answers.append(checked_action(task.action_space, answer, len(call)))
-        action = lanes.widened(numpy.concatenate(answers)[: lanes.count])
-
-        def update(state: Any, action: Array = action) -> Any:
-            return task.act(state, action)
-
-        lanes.step(update, lambda state, _: record(state))
+        for found, _ in lanes.decide(numpy.concatenate(answers)[: lanes.count], report):
+            record(found)
         first = False
         tick(lanes.count * task.decision_interval)
 
