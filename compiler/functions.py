@@ -70,7 +70,8 @@ class Specialised:
         graph: where the constants that the function refers to were made.
         parts: arguments, or others like them.
         turned: write the last array of the answer lane by lane, ``(N, rows)``.
-        shared: of an output and the input that it repeats, both by number: whether nothing need be written.
+        unchanged: an input that is handed on as it is stands for the output: any input for any output (None), or only
+            for the output of the same number among so many first ones.
 
     Attributes:
         inputs: arrays that it reads.
@@ -88,14 +89,19 @@ class Specialised:
         graph: Graph,
         parts: Sequence[Any],
         turned: bool = False,
-        shared: Callable[[int, int], bool] = lambda output, input: True,
+        unchanged: int | None = None,
     ) -> None:
         self.inputs = [_leaf(array) for part in parts for array in leaves(part)]
         with namespace.tracing(graph):
             places = iter(range(len(self.inputs)))
             traced = [mapped(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
-            answer = function(*traced)
-            made = [namespace.asarray(array) for array in leaves(answer)]
+            try:
+                answer = function(*traced)
+                made = [namespace.asarray(array) for array in leaves(answer)]
+            except namespace.NotTraceable:
+                raise
+            except Exception as error:  # a function may stumble over symbols in any way
+                raise namespace.NotTraceable(f"{type(error).__name__}: {error}") from error
         count = iter(range(len(made)))
         self.template = mapped(lambda _: next(count), answer)
         self.outputs = [_leaf(array) for array in made]
@@ -105,7 +111,10 @@ class Specialised:
             if array.nodes.size
         }
         same = [given.get((_leaf(array), array.nodes.tobytes())) for array in made]
-        self.same = [i if i is not None and shared(output, i) else None for output, i in enumerate(same)]
+        self.same = [
+            i if unchanged is None or (i == output and output < unchanged) else None
+            for output, i in enumerate(same)
+        ]
         wanted = [
             Result(len(self.inputs) + place, row, node)
             for place, array in enumerate(made)
@@ -149,6 +158,10 @@ class Specialised:
             part = memory[first : first + count]
             outputs.append(part.reshape(*leaf.shape, width) if same is None else None)
             first += count
+        if self.lane_first[-1]:
+            last = numpy.empty((width, rows[-1]))
+            table[-2:] = [address_of(last), rows[-1]]
+            outputs[-1] = last.T.reshape(*self.outputs[-1].shape, width)
         call = Call(
             self.native, numpy.array(table, dtype=numpy.int64), [memory, *arrays], self.program.constants
         )
@@ -229,20 +242,26 @@ class Function:
     Args:
         function: of nested tuples of arrays ``(..., N)``; it returns the same.
         graph: where the constants that the function refers to were made.
+        turned: as :class:`Specialised` has it.
+        unchanged: likewise.
 
     Raises:
         NotTraceable: when it is called, if it is no straight line of arithmetic.
     """
 
-    def __init__(self, function: Callable[..., Any], graph: Graph) -> None:
-        self.function, self.graph = function, graph
+    def __init__(
+        self, function: Callable[..., Any], graph: Graph, turned: bool = False, unchanged: int | None = None
+    ) -> None:
+        self.function, self.graph, self.turned, self.unchanged = function, graph, turned, unchanged
         self._specialised: dict[Any, Specialised] = {}
 
     def specialised(self, *parts: Any) -> Specialised:
         """Return the function for arguments of this structure."""
         key = tuple(_structure(part) for part in parts)
         if key not in self._specialised:
-            self._specialised[key] = Specialised(self.function, self.graph, parts)
+            self._specialised[key] = Specialised(
+                self.function, self.graph, parts, self.turned, self.unchanged
+            )
         return self._specialised[key]
 
     def __call__(self, *parts: Any, threads: int = 1) -> Any:

@@ -6,27 +6,38 @@ further for whoever only steps: it keeps the episodes in its own memory, bound t
 
 import functools
 import importlib.util
+import itertools
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
 
 from ..compiler import namespace
-from ..compiler.functions import DTYPES, Function, Specialised, empty_lanes, leaves, mapped, run_over
+from ..compiler.functions import (
+    DTYPES,
+    Call,
+    Function,
+    Leaf,
+    Specialised,
+    empty_lanes,
+    leaves,
+    mapped,
+    run_over,
+)
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
+from .draws import Draws
 from .observation import Array
-from .reward import cost_reward
 from .task import Episode, Task
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether steps can be compiled here."""
-METHODS = ("begin", "measure", "act", "observe", "mean", "cost", "error", "covariance", "track", "records")
-"""Of a task, those that are compiled."""
+REPORTS = ("observe", "mean", "cost", "error", "covariance", "track", "records")
+"""Methods of a task that are compiled as they are."""
 TILE = 1024
 """Lanes that go through both halves of a step before the next: they stay in the second-level cache."""
 REMEMBERED = 8
@@ -39,16 +50,46 @@ Report = Callable[[Task, Episode], Any]
 """What somebody wants to know of every episode after the action: nested tuples or dictionaries of arrays."""
 
 
-def _steered(report: Report, task: Task, episode: Episode, action: Array) -> tuple[Any, Any]:
-    """Bank after the action, and the report on it."""
-    after = task.act(episode, action)
-    return after.bank, report(task, after)
+# A step in four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
+# what is long, the bank, is compiled once for all of them.
 
 
-def _moved_on(task: Task, truth: Any, bank: Any, noise: Array) -> tuple[Any, Any, Any, Array]:
-    """Truth, measurement and bank at the next measurement, and what is shown of them."""
-    episode = task.measure(Episode(truth, None, bank), noise)
-    return episode.truth, episode.measurement, episode.bank, task.observe(episode)
+def _acted(task: Task, bank: Any, measurement: Any, action: Array) -> Any:
+    """Bank after the action."""
+    return task.bank.act(bank, measurement, action)
+
+
+def _advanced(task: Task, truth: Any, bank: Any, noise: Array) -> tuple[Any, Any]:
+    """Truth at the next measurement, and the measurement."""
+    return task.world.advance(truth, noise, task.bank.feedback(bank))
+
+
+def _predicted(task: Task, bank: Any, measurement: Any) -> tuple[Any, Array]:
+    """Bank at the measurement, and what is shown of it."""
+    predicted = task.bank.predict(bank, measurement)
+    if not task.fields:  # somebody else estimates
+        return predicted, task.xp.zeros((0, 1))
+    return predicted, task.observe(Episode(None, measurement, predicted))
+
+
+def _world_begun(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]:
+    """Truth at the start of the track, and what everyone is told of it."""
+    return task.world.begin(Draws(uniforms, task.xp), normals)
+
+
+def _bank_started(task: Task, initial: Any) -> Any:
+    """Bank at the start of the track."""
+    return task.bank.start(initial)
+
+
+class Parts(NamedTuple):
+    """Programs of a step, and what they are made for."""
+
+    act: Specialised
+    advance: Specialised
+    predict: Specialised
+    episode: Episode
+    """After the measurement, its arrays of the right shapes."""
 
 
 class Programs:
@@ -65,59 +106,81 @@ class Programs:
         self.refused: set[Any] = set()
         """Functions that could not be traced."""
         self._functions: dict[Any, Function] = {}
-        self._halves: dict[Report, tuple[Specialised, Specialised]] = {}
 
-    @functools.cached_property
-    def episode(self) -> Episode:
-        """An episode at a measurement, its arrays of the right shapes."""
-        noise, cls = self.traced.noise, type(self.traced)
-        start = self.function(cls.begin).specialised(
-            numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
-        )
-        return self.function(cls.measure).specialised(start.example(), self.row).example()
-
-    @property
-    def row(self) -> numpy.ndarray:
-        """Noise of one measurement, of the right shape."""
-        return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
-
-    def function(self, function: Callable[..., Any]) -> Function:
+    def function(self, function: Callable[..., Any], **options: Any) -> Function:
         """Compiled form of ``function(task, ...)``."""
         if function not in self._functions:
-            self._functions[function] = Function(functools.partial(function, self.traced), self.graph)
+            options = {"unchanged": 0, **options}
+            self._functions[function] = Function(
+                functools.partial(function, self.traced), self.graph, **options
+            )
         return self._functions[function]
 
-    def halves(self, report: Report) -> tuple[Specialised, Specialised]:
-        """Both halves of a step: the action with a report on it, and the way to the next observation.
+    @functools.cached_property
+    def acted(self) -> Function:
+        """The action; a part of the bank that it leaves alone is not written again."""
+        return self.function(_acted, unchanged=None)
+
+    @functools.cached_property
+    def advanced(self) -> Function:
+        """The world; a part of the truth that stays is not written again."""
+        return self.function(_advanced, unchanged=len(leaves(self.begun[0].example()[0])))
+
+    @functools.cached_property
+    def predicted(self) -> Function:
+        """The bank at the next measurement."""
+        return self.function(_predicted, turned=True)
+
+    @functools.cached_property
+    def begun(self) -> tuple[Specialised, Specialised]:
+        """World and bank at the start of the track."""
+        noise = self.traced.noise
+        uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
+        world = self.function(_world_begun).specialised(uniforms, normals)
+        return world, self.function(_bank_started).specialised(world.example()[1])
+
+    @functools.cached_property
+    def first(self) -> Parts:
+        """Parts of the way from the start of the track over the first measurement."""
+        world, bank = self.begun
+        return self._parts(world.example()[0], bank.example())
+
+    @functools.cached_property
+    def later(self) -> Parts:
+        """Parts of the way from an action to the next.
 
         Raises:
-            NotTraceable: if the task is no straight line of arithmetic.
+            NotTraceable: if one is no straight line of arithmetic.
         """
-        if report not in self._halves:
-            episode, space = self.episode, self.traced.action_space
-            discrete = isinstance(space, gymnasium.spaces.Discrete)
-            action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
-            steer = Specialised(
-                functools.partial(_steered, report, self.traced),
-                self.graph,
-                (episode, action),
-                # A part of the bank that the action leaves alone; never the report, which comes last.
-                shared=lambda output, input: (
-                    input < len(leaves(episode)) and output < len(leaves(episode.bank))
-                ),
-            )
-            advance = Specialised(
-                functools.partial(_moved_on, self.traced),
-                self.graph,
-                (episode.truth, steer.example()[0], self.row),
-                turned=True,
-                # A part of the truth that stays: both copies of the episodes may have the same one.
-                shared=lambda output, input: output == input < len(leaves(episode.truth)),
-            )
-            if [leaf.shape for leaf in advance.outputs[:-1]] != [leaf.shape[:-1] for leaf in leaves(episode)]:
-                raise NotTraceable("the arrays of an episode change their shapes from step to step")
-            self._halves[report] = steer, advance
-        return self._halves[report]
+        first = self.first
+        later = self._parts(first.advance.example()[0], first.act.example())
+        shapes = [
+            [leaf.shape for leaf in (*parts.advance.inputs, *parts.predict.inputs, *parts.predict.outputs)]
+            for parts in (first, later)
+        ]
+        if shapes[0] != shapes[1] or first.advance.same != later.advance.same:
+            raise NotTraceable("the arrays of an episode change their shapes from step to step")
+        return later
+
+    def _parts(self, truth: Any, bank: Any) -> Parts:
+        row = numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
+        space = self.traced.action_space
+        discrete = isinstance(space, gymnasium.spaces.Discrete)
+        action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
+        advance = self.advanced.specialised(truth, bank, row)
+        following, measurement = advance.example()
+        predict = self.predicted.specialised(bank, measurement)
+        predicted = predict.example()[0]
+        act = self.acted.specialised(predicted, measurement, action)
+        return Parts(act, advance, predict, Episode(following, measurement, predicted))
+
+    def reported(self, report: Report) -> Specialised:
+        """A report on an episode.
+
+        Raises:
+            NotTraceable: if it is no straight line of arithmetic.
+        """
+        return self.function(report).specialised(self.later.episode)
 
 
 class _Compiled(Task):
@@ -149,6 +212,23 @@ class _Compiled(Task):
                 warn_of(f"{function.__qualname__} of {self.id}", error)
         return function(self.original, *parts)
 
+    def begin(self, uniforms: Array, normals: Array) -> Episode:
+        """Episode at the start of the track."""
+        truth, initial = self.run(_world_begun, uniforms, normals)
+        return Episode(truth, initial, self.run(_bank_started, initial))
+
+    def measure(self, episode: Episode, noise: Array) -> Episode:
+        """Steps 1 and 2."""
+        functions, threads = self.programs, self.threads
+        truth, measurement = functions.advanced(episode.truth, episode.bank, noise, threads=threads)
+        bank, _ = functions.predicted(episode.bank, measurement, threads=threads)
+        return Episode(truth, measurement, bank)
+
+    def act(self, episode: Episode, action: Array) -> Episode:
+        """Step 4."""
+        arguments = (episode.bank, episode.measurement, action)
+        return episode._replace(bank=self.programs.acted(*arguments, threads=self.threads))
+
 
 def _method(name: str) -> Callable[..., Any]:
     def method(self: _Compiled, *parts: Any) -> Any:
@@ -158,7 +238,7 @@ def _method(name: str) -> Callable[..., Any]:
     return method
 
 
-for _name in METHODS:
+for _name in REPORTS:
     setattr(_Compiled, _name, _method(_name))
 
 
@@ -177,8 +257,13 @@ def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
 def _traced(cls: type[Task], parameters: Any, control: str) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        programs = Programs(cls(parameters, control, namespace), graph)
-    programs.halves(cost_reward)
+        try:
+            programs = Programs(cls(parameters, control, namespace), graph)
+        except NotTraceable:
+            raise
+        except Exception as error:  # a task may stumble over symbols in any way
+            raise NotTraceable(f"{type(error).__name__}: {error}") from error
+    _ = programs.later
     return programs
 
 
@@ -208,12 +293,7 @@ def compiled(task: Task, threads: int = 1) -> Task:
         raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
     # Parameters that hold arrays are traced each time.
     trace = _remembered if _hashes(task.parameters) else _traced
-    try:
-        return _wrapped(task, trace(type(task), task.parameters, task.control), threads)
-    except NotTraceable:
-        raise
-    except Exception as error:  # a task may stumble over symbols in any way
-        raise NotTraceable(f"{type(error).__name__}: {error}") from error
+    return _wrapped(task, trace(type(task), task.parameters, task.control), threads)
 
 
 def warn_of(what: str, error: BaseException) -> None:
@@ -233,7 +313,7 @@ def can_step(task: Any, report: Report) -> bool:
     if task.backend != "compiled" or report in task.programs.refused:
         return False
     try:
-        task.programs.halves(report)
+        task.programs.reported(report)
     except NotTraceable as error:
         task.programs.refused.add(report)
         warn_of(f"{report.__qualname__} of {task.id}", error)
@@ -255,30 +335,58 @@ class Stepper:
     """
 
     def __init__(self, task: Any, report: Report, width: int) -> None:
-        steer, advance = task.programs.halves(report)
-        episode = task.programs.episode
-        truths = len(leaves(episode.truth))
+        act, advance, predict, episode = task.programs.later
+        tell = task.programs.reported(report)
+        truths, told, banks = (len(leaves(part)) for part in episode)
         self.width, self._threads = width, task.threads
-        self._template, self._kinds = advance.template, advance.outputs
-        self.action = empty_lanes(steer.inputs[-1].shape, width)
+        count = itertools.count()
+        self._template, self._kinds = mapped(lambda _: next(count), episode), _kinds(leaves(episode))
+        self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
+
+        def memory(outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
+            return [empty_lanes(leaf.shape, width) for leaf in outputs]
+
+        self.action = empty_lanes(act.inputs[-1].shape, width)
         self.action[...] = 0.0
-        self.shown = numpy.empty((width, *advance.outputs[-1].shape))
-        first = [empty_lanes(leaf.shape, width) for leaf in advance.outputs[:-1]]
-        second = [
-            first[i] if same is not None else empty_lanes(first[i].shape[:-1], width)
-            for i, same in enumerate(advance.same[:-1])
-        ]
+        self.shown = numpy.empty((width, *predict.outputs[-1].shape))
+        self._reported = memory(tell.outputs)
+        # Episodes go to and fro between two copies, which share what stays as it is.
+        first, second = (memory([*advance.outputs, *predict.outputs[:-1]]) for _ in range(2))
+        for i, same in enumerate(advance.same):
+            if same is not None:
+                second[i] = first[i]
         self._copies = (first, second)
-        banks = len(leaves(episode.bank))
-        written = [empty_lanes(leaf.shape, width) for leaf in steer.outputs]
-        self._reported, self._report_template = written, steer.template[1]
-        self._report_kinds = steer.outputs
-        nothing = numpy.zeros((len(task.programs.row), width))
-        self._steer, self._advance = [], []
+        written = memory(act.outputs)
+        nothing = numpy.zeros((advance.inputs[-1].rows, width))
+        self._calls, self._begin = [], []
+        world, start = task.programs.begun
+        self._drawn = memory(world.inputs)
+        initial = memory(world.outputs[truths:])
+        begun = task.programs.first
         for now, then in ((first, second), (second, first)):
-            self._steer.append(steer.bound([*now, self.action], written))
-            bank = [written[i] if same is None else now[same] for i, same in enumerate(steer.same[:banks])]
-            self._advance.append(advance.bound([*now[:truths], *bank, nothing], [*then, self.shown]))
+            truth, said, bank = now[:truths], now[truths : truths + told], now[truths + told :]
+            steered = [*bank, *said, self.action]
+            acted = [own if i is None else steered[i] for own, i in zip(written, act.same, strict=True)]
+            self._calls.append(
+                (
+                    act.bound(steered, written),
+                    tell.bound([*truth, *said, *acted], self._reported),
+                    advance.bound([*truth, *acted, nothing], then[: truths + told]),
+                    predict.bound(
+                        [*acted, *then[truths : truths + told]], [*then[truths + told :], self.shown]
+                    ),
+                )
+            )
+            self._begin.append(
+                (
+                    world.bound(self._drawn, [*truth, *initial]),
+                    start.bound(initial, written),
+                    begun.advance.bound([*truth, *written, nothing], then[: truths + told]),
+                    begun.predict.bound(
+                        [*written, *then[truths : truths + told]], [*then[truths + told :], self.shown]
+                    ),
+                )
+            )
         self._now = 0
         self._row_entry = 1 + 2 * (truths + banks)
 
@@ -294,10 +402,19 @@ class Stepper:
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
-        memory = self._copies[self._now]
-        return Episode(
-            *mapped(lambda i: memory[i].astype(DTYPES[self._kinds[i].kind], order="C"), self._template[:3])
-        )
+        return _kept(self._template, self._copies[self._now], self._kinds)
+
+    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, row: int) -> None:
+        """Start new episodes everywhere and let their first measurement arrive.
+
+        Args:
+            uniforms: of the scenario, ``(uniforms, width)``.
+            normals: of the start of the track, ``(initial_normals, width)``.
+            row: address of the measurement's noise.
+        """
+        for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
+            memory[...] = values
+        self._run(self._begin[self._now], row)
 
     def step(self, row: int) -> None:
         """Apply the action and go on to the next measurement.
@@ -305,31 +422,38 @@ class Stepper:
         Args:
             row: address of its noise.
         """
-        steer, advance = self._steer[self._now], self._advance[self._now]
-        advance.table[self._row_entry] = row
+        self._run(self._calls[self._now], row)
+
+    def _run(self, calls: tuple[Call, ...], row: int) -> None:
+        calls[2].table[self._row_entry] = row
         self._now = 1 - self._now
         if self.width <= TILE:
-            steer.native(steer.address, 0, self.width)
-            advance.native(advance.address, 0, self.width)
+            for call in calls:
+                call.native(call.address, 0, self.width)
             return
 
         def tiles(first: int, last: int) -> None:
             for start in range(first, last, TILE):
-                end = min(start + TILE, last)
-                steer(start, end)
-                advance(start, end)
+                for call in calls:
+                    call(start, min(start + TILE, last))
 
         run_over(tiles, self.width, self._threads)
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
-        kinds = self._report_kinds
-        return mapped(
-            lambda i: self._reported[i].astype(DTYPES[kinds[i].kind], order="C"), self._report_template
-        )
+        return _kept(self._report_template, self._reported, self._report_kinds)
 
     def show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
         self.shown = memory
-        for advance in self._advance:
-            advance.replace(len(advance.arrays) - 1, memory)
+        for *_, predict in (*self._calls, *self._begin):
+            predict.replace(len(predict.arrays) - 1, memory)
+
+
+def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:
+    return [array.dtype.kind for array in arrays]
+
+
+def _kept(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+    """Copies of arrays of numbers in their places, in their own types."""
+    return mapped(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)

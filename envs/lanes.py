@@ -217,6 +217,15 @@ class Lanes:
         index = numpy.asarray(chosen)
         # The padding lanes fly an average episode without noise.
         scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
+        if everyone and self._moving and self._begun is None:
+            if self._shown_to:
+                self._show(numpy.empty_like(self._shown))
+            for stepper in self._moving:
+                stepper.begin(scenario, start, self._row_address())
+            self._interval_mean = None
+            self._started[index] = self._clock
+            self.decisions[index] = 0
+            return
         row = self._ring[self._clock % self._slots]
         first_row = row[:, index if xp is numpy else xp.asarray(chosen, device=task.device)]
         width = padded_width(len(chosen))
@@ -287,6 +296,9 @@ class Lanes:
                 self._draw_rows(due, [self._children[lane] for lane in due], numpy.empty((len(due), 0)))
         return self._ring[self._clock % self._slots]
 
+    def _row_address(self) -> int:
+        return self._ring_start + self._clock % self._slots * self._ring_stride
+
     def pay(self, action: Array, kind: str) -> Array:
         """Apply one decision and return what is paid for it, the mean over its measurements, ``(count,)``.
 
@@ -327,7 +339,7 @@ class Lanes:
         total: Any = 0.0
         for _ in range(interval):
             self._next_row()
-            row = self._ring_start + self._clock % self._slots * self._ring_stride
+            row = self._row_address()
             for stepper in self._moving:
                 stepper.step(row)
             answers.append((own.report(), paper[0].report() if paper else None))

@@ -1,0 +1,313 @@
+"""Compiled steps: as near to NumPy's as rounding allows, the same bits for every N, everywhere that NumPy goes."""
+
+import multiprocessing
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.baselines.tuning import tune
+from filtergym.envs import compiled as compiled_tasks
+from filtergym.envs.backend import task_on
+from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.compiled import compiled
+from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.maneuvering_target import TASK as MANEUVERING
+from filtergym.envs.maneuvering_target.world import RadarWorld
+
+import filtergym
+
+pytest.importorskip("llvmlite")
+
+TOLERANCES = {
+    "filtergym/LooselyCoupledNavigation-v0": 1e-13,
+    "filtergym/ManeuveringTarget-v0": 1e-11,
+    "filtergym/RadarEsmTracking-v0": 1e-13,
+    "filtergym/TightlyCoupledNavigation-v0": 1e-4,
+    "filtergym/UavAutopilot-v0": 1e-12,
+}
+"""Of observations and rewards, over whole episodes: several times what `benchmarks/parity.py` finds."""
+KEYWORDS = {"filtergym/TightlyCoupledNavigation-v0": {"horizon": 120}}
+
+
+def pair(env_id, count, **keywords):
+    """The same vector environment on both backends."""
+    made = [gym.make_vec(env_id, num_envs=count, backend=b, **keywords) for b in ("compiled", "numpy")]
+    assert [env.unwrapped.backend for env in made] == ["compiled", "numpy"]
+    return made
+
+
+def assert_near(one, other, env_id):
+    tolerance = TOLERANCES.get(env_id, 1e-12)
+    np.testing.assert_allclose(one, other, rtol=tolerance, atol=tolerance)
+
+
+def flown(env, actions, **reset):
+    """Everything that episodes show."""
+    found = [env.reset(seed=3, **reset)[0]]
+    for action in actions:
+        found += [np.asarray(part) for part in env.step(action)[:4]]
+    return found
+
+
+def sampled(env, count):
+    env.action_space.seed(0)
+    return [env.action_space.sample() for _ in range(count)]
+
+
+def test_whole_episodes_are_those_of_numpy(env_id, control):
+    envs = pair(env_id, 8, control=control, **KEYWORDS.get(env_id, {}))
+    actions = sampled(envs[0], envs[0].unwrapped.last_decision + 2)
+    for one, other in zip(*(flown(env, actions) for env in envs), strict=True):
+        assert_near(one, other, env_id)
+
+
+def test_every_scenario_is_that_of_numpy(env_id, short):
+    for scenario in catalogue()[env_id].scenarios:
+        envs = pair(env_id, 3, scenario=scenario, **short)
+        for one, other in zip(*(flown(env, sampled(envs[0], 8)) for env in envs), strict=True):
+            assert_near(one, other, env_id)
+
+
+@pytest.mark.parametrize("reward", ["cost", "relative", "log-likelihood"])
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
+    envs = pair(env_id, 5, reward=reward, autoreset_mode=mode, **short)
+    shortened = np.arange(5) % 3
+    runs = [flown(env, sampled(envs[0], 12), options={"shortened_by": shortened}) for env in envs]
+    for one, other in zip(*runs, strict=True):
+        assert_near(one, other, env_id)
+
+
+def test_details_are_those_of_numpy(env_id, control, short):
+    envs = pair(env_id, 3, control=control, detailed_info=True, **short)
+    for env in envs:
+        env.reset(seed=2)
+    for action in sampled(envs[0], 3):
+        infos = [env.step(action)[4] for env in envs]
+        assert infos[0].keys() == infos[1].keys()
+        for name, values in infos[1].items():
+            assert infos[0][name].shape == values.shape
+            assert infos[0][name].dtype == values.dtype, name
+            scale = max(1.0, np.nanmax(np.abs(values))) if values.size else 1.0
+            np.testing.assert_allclose(
+                infos[0][name] / scale, values / scale, rtol=1e-6, atol=1e-10, err_msg=name
+            )
+
+
+@pytest.mark.parametrize("count", [1, 7, 64, 1100])
+def test_every_lane_is_the_single_environment(count):
+    """For widths below and above those at which memory, tiles and copies are treated otherwise; also by threads."""
+    short = {"horizon": 6, "decision_interval": 2}
+    for env_id in ("filtergym/ManeuveringTarget-v0", "filtergym/UavAutopilot-v0"):
+        single = gym.make(env_id, backend="compiled", **short)
+        vectors = [
+            gym.make_vec(env_id, num_envs=count, backend="compiled", threads=threads, **short)
+            for threads in (1, 2)
+        ]
+        actions = sampled(vectors[0], 3)
+        runs = [flown(vector, actions) for vector in vectors]
+        for one, other in zip(*runs, strict=True):
+            np.testing.assert_array_equal(one, other)
+        for lane in {0, count // 2, count - 1}:
+            alone = [single.reset(seed=3 + lane)[0]]
+            for action in actions:
+                alone += [np.asarray(part) for part in single.step(action[lane])[:4]]
+            for one, other in zip(runs[0], alone, strict=True):
+                np.testing.assert_array_equal(one[lane], other)
+
+
+def test_observations_stay_the_callers(env_id, short):
+    """What was handed out is not written over by later steps or resets."""
+    env = gym.make_vec(env_id, num_envs=70, backend="compiled", **short)
+    actions = sampled(env, 9)
+    kept = flown(env, actions)
+    copies = [part.copy() for part in kept]
+    env.step(actions[0])
+    env.reset(options={"reset_mask": np.arange(70) < 3})
+    for one, other in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
+    """Looking at the state between steps changes nothing, and shows what the details say."""
+    plain, looked_at = (
+        gym.make(env_id, control=control, backend="compiled", **short).unwrapped for _ in range(2)
+    )
+    first, second = plain.reset(seed=5)[0], looked_at.reset(seed=5)[0]
+    np.testing.assert_array_equal(first, second)
+    for step in range(5):
+        action = random_actions(plain.action_space, 1, step)[0]
+        state = looked_at.lanes.state
+        task = looked_at.task
+        expected = task.cost(task.act(state, looked_at.lanes.widened(np.asarray(action)[None])))
+        looked_at.lanes.state = state  # through the arrays, not the stepper's memory
+        one, other = plain.step(action), looked_at.step(action)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert one[1] == other[1]
+        assert np.isfinite(expected[0])
+
+
+def test_snapshots_are_gone_back_to(env_id, short):
+    env = gym.make_vec(env_id, num_envs=3, backend="compiled", **short).unwrapped
+    actions = sampled(env, 6)
+    flown(env, actions[:2])
+    snapshot = env.lanes.snapshot()
+    runs = []
+    for _ in range(2):
+        env.lanes.restore(snapshot)
+        runs.append([np.asarray(part) for action in actions[2:] for part in env.step(action)[:2]])
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def _elsewhere(pipe):
+    env = gym.make("filtergym/ManeuveringTarget-v0", backend="compiled", horizon=5)
+    env.reset(seed=1)
+    pipe.send([env.step(np.zeros(1))[0] for _ in range(4)])
+
+
+@pytest.mark.parametrize("way", ["fork", "spawn"])
+def test_other_processes_see_the_same(way):
+    if way not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {way} here")
+    here, there = multiprocessing.Pipe()
+    _elsewhere(there)  # before the fork, so that code is loaded already
+    context = multiprocessing.get_context(way)
+    process = context.Process(target=_elsewhere, args=(there,))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # threads of other tests
+        process.start()
+    process.join(120)
+    assert process.exitcode == 0
+    for one, other in zip(here.recv(), here.recv(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_environments_are_made_in_threads():
+    def flight(seed):
+        env = gym.make_vec("filtergym/LooselyCoupledNavigation-v0", num_envs=8, backend="compiled", horizon=7)
+        return flown(env, [np.zeros(env.action_space.shape)] * 5)
+
+    compiled_tasks._remembered.cache_clear()
+    with ThreadPoolExecutor(4) as pool:
+        first, *others = pool.map(flight, range(4))
+    for other in others:
+        for one, two in zip(first, other, strict=True):
+            np.testing.assert_array_equal(one, two)
+
+
+# --- which backend
+
+
+def test_backends_by_name(monkeypatch):
+    assert gym.make("filtergym/UavAutopilot-v0").unwrapped.backend == "compiled"
+    assert gym.make("filtergym/UavAutopilot-v0", backend="numpy").unwrapped.backend == "numpy"
+    with pytest.raises(ValueError, match="did you mean 'compiled'"):
+        gym.make("filtergym/UavAutopilot-v0", backend="compile")
+    with pytest.raises(ValueError, match="make_vec"):
+        gym.make("filtergym/UavAutopilot-v0", backend="torch")
+    with pytest.raises(ValueError, match="threads must be at least 1"):
+        gym.make_vec("filtergym/UavAutopilot-v0", num_envs=2, threads=0)
+    # Without llvmlite.
+    monkeypatch.setattr("filtergym.envs.backend.AVAILABLE", False)
+    monkeypatch.setattr(compiled_tasks, "AVAILABLE", False)
+    assert gym.make("filtergym/UavAutopilot-v0").unwrapped.backend == "numpy"
+    with pytest.raises(ImportError, match=r"pip install 'filtergym\[fast\]'"):
+        gym.make("filtergym/UavAutopilot-v0", backend="compiled")
+
+
+class Branching(RadarWorld):
+    """Its arithmetic depends on a branch that depends on the numbers."""
+
+    def advance(self, truth, noise, feedback):
+        if truth.scan[0] > 3.0:  # the line to name
+            noise = 2.0 * noise
+        return super().advance(truth, noise, feedback)
+
+
+class Outlandish(RadarWorld):
+    """It calls what the namespace does not have."""
+
+    def advance(self, truth, noise, feedback):
+        return super().advance(truth, self.xp.cumsum(noise, axis=0), feedback)
+
+
+@pytest.mark.parametrize(
+    ("world", "told"),
+    [
+        (Branching, r"depends on the numbers.*test_compiled\.py, line \d+: if truth\.scan"),
+        (Outlandish, "cumsum"),
+    ],
+)
+def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
+    monkeypatch.setattr(MANEUVERING, "World", world)
+    compiled_tasks._remembered.cache_clear()
+    with pytest.warns(UserWarning, match=told) as said:
+        env = gym.make(MANEUVERING.id)
+    assert len([w for w in said if "runs with NumPy" in str(w.message)]) == 1
+    assert env.unwrapped.backend == "numpy"
+    env.reset(seed=0)
+    assert np.isfinite(env.step(np.zeros(1))[1])
+    with pytest.raises(ValueError, match="cannot be compiled"):
+        gym.make(MANEUVERING.id, backend="compiled")
+    compiled_tasks._remembered.cache_clear()
+
+
+def test_a_report_that_cannot_be_traced_is_made_with_numpy():
+    task = task_on("compiled", MANEUVERING.id, horizon=5)
+
+    def odd(task, episode):
+        return {"cost": task.cost(episode), "largest": np.full(8, float(task.cost(episode).max()))}
+
+    env = TaskVectorEnv(MANEUVERING.id, 3, backend="compiled", horizon=5)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="odd of filtergym/ManeuveringTarget-v0 is not compiled"):
+        ((found, _),) = env.lanes.decide(np.zeros((3, 1)), odd)
+    assert found["largest"][0] == found["cost"].max()
+    with pytest.warns(UserWarning, match="is not compiled"):
+        task.run(lambda task, episode: float(episode.max()), np.ones((2, 8)))
+
+
+def test_the_task_is_still_what_it_was():
+    task = make_task(MANEUVERING.id, "evidence")
+    fast = compiled(task)
+    assert isinstance(fast, MANEUVERING)
+    assert fast.backend == "compiled"
+    assert fast.under("gain").backend == "compiled"
+    assert fast.under("gain").control == "gain"
+    assert fast.fields == task.fields
+    assert fast.original is task
+    assert fast.estimated_outside().fields == ()
+
+
+def test_two_scenarios_share_their_code(tmp_path, monkeypatch):
+    """Numbers are told apart from code, so that other parameters need no other compilation."""
+    monkeypatch.setenv("FILTERGYM_COMPILER_CACHE", str(tmp_path))
+    counts = []
+    for sigma in (40.0, 41.5):
+        env = TaskEnv("filtergym/ManeuveringTarget-v0", backend="compiled", range_sigma=sigma)
+        env.reset(seed=0)
+        env.step(np.zeros(1))
+        counts.append(len(list(Path(tmp_path).iterdir())))
+    assert counts[0] == counts[1]
+
+
+def test_evaluation_and_tuning_say_the_same_on_both_backends():
+    keywords = {"episodes": 16, "horizon": 20}
+    one, other = (
+        filtergym.evaluate(
+            "ManeuveringTarget", ["imm", "kalman-imm", "known-turn"], backend=backend, **keywords
+        )
+        for backend in ("compiled", "numpy")
+    )
+    for name in ("error", "nees", "cost", "nis"):
+        np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-9)
+    id = "filtergym/ManeuveringTarget-v0"
+    tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["imm"]
+    budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
+    found = [tune(id, "imm", tunable, budget, episodes=8, backend=b) for b in ("compiled", "numpy")]
+    assert found[0].values == pytest.approx(found[1].values, rel=1e-5)
+    assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)
