@@ -3,24 +3,25 @@
     python benchmarks/throughput.py [--environment ID] [--size N] [--seconds S] [--json FILE]
 
 **What is timed.** The public ``step``, of the environment that ``gymnasium.make`` makes (wrappers included) and
-of the vector environments of ``gymnasium.make_vec``: action check, filters, reward, observation, autoreset
-(NEXT_STEP; every 100 steps or at the end of the episode, whichever comes first; for long episodes that is more
-resets than they really have). Every step is one measurement (``decision_interval`` 1). One thread. Actions are
-random and drawn beforehand, in float32 as the space has them.
+of the vector environments of ``gymnasium.make_vec``: action check, filters, reward, observation. Every step is one
+measurement (``decision_interval`` 1) and carries its share of a reset: that of all environments, over the length of
+an episode. One thread. Actions are random and drawn beforehand, in float32 as the space has them.
 
-A row is the median over rounds of 101 steps, repeated until the row's share of ``--seconds`` is spent. What is
-dear is found out by three steps: where a single round would take more than six shares, the size is left out,
+A row is the median over rounds of a reset and 128 steps (fewer where episodes are shorter), repeated until the row's
+share of ``--seconds`` is spent. What is dear is found out by three steps: where a single round would take more than six shares, the size is left out,
 and so are the larger ones. A size that is asked for by ``--size`` is measured whatever it costs.
 
 Where other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
 process was given; both are shown, and floors and ratios use the latter for both sides.
 
-**Floor.** The elementwise operations of one public step, counted as torch dispatches them (additions, products,
-comparisons, selections: one each; square roots, exponentials, logarithms, angles: one function each; a matrix
-product: two per term), times the measured cost of one in NumPy on operands in the first-level cache:
-``multiply`` for operations, ``exp`` for functions (the cheapest of them). Code that fuses operations in
-registers can pass this floor; code that calls the array library for each operation cannot. At N = 1 it does
-not matter: the time is Python's, some microseconds for each of the array library's calls.
+**Floor.** Of what calls an array library: the elementwise operations of one public step, counted as torch dispatches
+them (additions, products, comparisons, selections: one each; square roots, exponentials, logarithms, angles: one
+function each; a matrix product: two per term), times the measured cost of one in NumPy on operands in the
+first-level cache: ``multiply`` for operations, ``exp`` for functions (the cheapest of them). Code that fuses
+operations in registers can pass this floor; code that calls the array library for each operation cannot. Of compiled
+steps: the operations and functions that are left in the programs of a step, times the cost of one in compiled
+programs that do nothing but add and multiply in registers, or nothing but exponentials. Neither counts the noise,
+resets, or what Python does around a step, which is all that matters at N = 1.
 
 **Peer.** See ``peer_imm.py``; the ratio is that of the rates in the same run.
 
@@ -44,7 +45,13 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 import gymnasium
 import numpy
 import peer_imm
+from filtergym.compiler import namespace
+from filtergym.compiler.functions import Specialised
+from filtergym.compiler.program import Graph
+from filtergym.envs.backend import task_on
 from filtergym.envs.catalogue import catalogue
+from filtergym.envs.compiled import AVAILABLE
+from filtergym.envs.reward import cost_reward
 
 import filtergym
 
@@ -55,8 +62,8 @@ except ImportError:
     torch = None  # type: ignore[assignment]
     TorchDispatchMode = object  # type: ignore[assignment, misc]
 
-STEPS = 100
-"""Steps between two autoresets, at most."""
+STEPS = 128
+"""Steps of a round, at most: whole blocks of noise of the long episodes."""
 SIZES = (1, 256, 4096)
 DEAR = 6.0
 """Shares of the time that one round may take."""
@@ -73,6 +80,13 @@ class Backend(NamedTuple):
 
     name: str
     keywords: dict[str, Any]
+
+
+class Costs(NamedTuple):
+    """Seconds per number."""
+
+    operation: float
+    function: float
 
 
 class Row(NamedTuple):
@@ -118,8 +132,8 @@ class _Counter(TorchDispatchMode):
         return result
 
 
-def elementwise_costs() -> tuple[float, float]:
-    """Seconds per number of ``multiply`` and of ``exp`` on operands in the first-level cache."""
+def elementwise_costs() -> Costs:
+    """Costs of ``multiply`` and of ``exp`` on operands in the first-level cache."""
     a, b = numpy.linspace(-1.0, 1.0, 1024), numpy.empty(1024)
 
     def cost(operation: numpy.ufunc, *operands: numpy.ndarray) -> float:
@@ -129,11 +143,56 @@ def elementwise_costs() -> tuple[float, float]:
 
         return statistics.median(seconds(thousand)[1] for _ in range(21)) / (1000 * len(b))
 
-    return cost(numpy.multiply, a, a), cost(numpy.exp, a)
+    return Costs(cost(numpy.multiply, a, a), cost(numpy.exp, a))
 
 
-def arithmetic_floor(id: str, control: str, operation: float, function: float) -> float | None:
-    """Steps per second if a step took only its elementwise operations, at the given costs in seconds."""
+def compiled_costs() -> Costs:
+    """Costs of an addition or product, and of an exponential, in compiled programs that do nothing else."""
+    chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
+
+    def arithmetic(x: Any) -> Any:
+        for i in range(links):
+            x = x * x if i % 2 else x + x
+        return x
+
+    def exponentials(x: Any) -> Any:
+        return namespace.stack([namespace.exp(x[i] + 0.01 * j) for i in range(chains) for j in range(4)])
+
+    def cost(function: Callable[[Any], Any], count: int) -> float:
+        special = Specialised(function, Graph(), [x])
+        call = special.bound([x], [numpy.empty((special.outputs[0].rows, 8))])
+
+        def thousand() -> None:
+            for _ in range(1000):
+                call(0, 8)
+
+        def thousand_of_nothing() -> None:
+            for _ in range(1000):
+                call(0, 0)
+
+        taken, empty = (
+            statistics.median(seconds(many)[1] for _ in range(21)) for many in (thousand, thousand_of_nothing)
+        )
+        return (taken - empty) / (1000 * 8 * count)
+
+    return Costs(cost(arithmetic, chains * links), cost(exponentials, chains * 4))
+
+
+def compiled_floor(id: str, control: str, costs: Costs) -> float | None:
+    """Steps per second if a step took only the arithmetic of its programs."""
+    task: Any = task_on("auto", id, control)
+    if task.backend != "compiled":
+        return None
+    parts = task.programs.later
+    halves = [parts.act, parts.advance, parts.predict, task.programs.reported(cost_reward)]
+    names = [step.operation for special in halves for step in special.program.steps]
+    functions = sum(name in FUNCTIONS or name == "pow" for name in names)
+    operations = sum(name not in ("input", "constant") for name in names) - functions
+    return 1.0 / (operations * costs.operation + functions * costs.function)
+
+
+def arithmetic_floor(id: str, control: str, costs: Costs) -> float | None:
+    """Steps per second if a step took only its elementwise operations."""
     if torch is None:
         return None
     lanes, counter = 64, _Counter()
@@ -146,7 +205,7 @@ def arithmetic_floor(id: str, control: str, operation: float, function: float) -
         with counter:
             env.step(action)
     env.close()
-    return lanes / (counter.operations * operation + counter.functions * function)
+    return lanes / (counter.operations * costs.operation + counter.functions * costs.function)
 
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:
@@ -156,30 +215,35 @@ def seconds(call: Callable[[], object]) -> tuple[float, float]:
     return time.perf_counter() - begin, time.process_time() - begin_processor
 
 
-def single_round(id: str, control: str) -> tuple[Callable[[], object], Callable[[int], object], int]:
-    """Episodes of ``gymnasium.make``: a function that starts one, one that takes steps, the steps of a round."""
-    env = gymnasium.make(id, control=control, decision_interval=1)
+class Episodes(NamedTuple):
+    """What is timed."""
+
+    start: Callable[[], object]
+    steps: Callable[[int], object]
+    """Takes a number of steps."""
+    length: int
+    """Steps of an episode, the one that resets included."""
+
+
+def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
+    """Episodes of ``gymnasium.make``."""
+    env: Any = gymnasium.make(id, control=control, decision_interval=1, **backend)
     env.action_space.seed(0)
     action = env.action_space.sample()
 
     def steps(count: int) -> None:
         for _ in range(count):
-            if env.step(action)[3]:
-                env.reset()
+            env.step(action)
 
-    return lambda: env.reset(seed=0), steps, STEPS
+    return Episodes(lambda: env.reset(seed=0), steps, env.unwrapped.lanes.decisions_per_episode)
 
 
-def vector_round(
-    id: str, control: str, size: int, backend: dict[str, Any]
-) -> tuple[Callable[[], object], Callable[[int], object], int]:
+def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episodes:
     """Return the same of ``gymnasium.make_vec``."""
-    env = gymnasium.make_vec(
-        id, num_envs=size, control=control, max_episode_steps=STEPS, decision_interval=1, **backend
-    )
+    env: Any = gymnasium.make_vec(id, num_envs=size, control=control, decision_interval=1, **backend)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(8)]
-    if backend:
+    if backend["backend"] == "torch":
         actions = [torch.as_tensor(action, device=backend["device"]) for action in actions]
 
     def steps(count: int) -> None:
@@ -187,28 +251,27 @@ def vector_round(
             observation, reward, *_ = env.step(action)
         float(observation[0, 0] + reward[0])  # waits for a device that runs behind
 
-    return lambda: env.reset(seed=0), steps, STEPS + 1
+    return Episodes(lambda: env.reset(seed=0), steps, env.unwrapped.last_decision + 1)
 
 
-def measure(
-    start: Callable[[], object], steps: Callable[[int], object], count: int, share: float, dearest: float
-) -> tuple[list[tuple[float, float]], float]:
-    """Times of rounds of ``count`` steps, and what a round was expected to take, all in seconds.
+def measure(episodes: Episodes, share: float, dearest: float) -> tuple[list[tuple[float, float]], float]:
+    """Times of a step in several rounds, and what a round was expected to take, all in seconds.
 
     Args:
-        start: begins the episodes.
-        steps: takes a number of steps.
-        count: steps of a round.
+        episodes: to time.
         share: time for all rounds; there is at least one.
         dearest: expected time of a round from which on none is made.
     """
-    resetting = seconds(start)[0]
-    steps(2)  # warm caches and clocks
-    expected = resetting + count * seconds(lambda: steps(1))[0]
+    count = min(STEPS, episodes.length - 1)
+    episodes.start()
+    episodes.steps(2)  # compile; warm caches and clocks
+    expected = seconds(episodes.start)[0] + count * seconds(lambda: episodes.steps(1))[0]
     rounds: list[tuple[float, float]] = []
     begin = time.perf_counter()
     while expected <= dearest and (not rounds or time.perf_counter() - begin < share):
-        rounds.append(seconds(lambda: steps(count)))
+        reset, steps = seconds(episodes.start), seconds(lambda: episodes.steps(count))
+        times = [s / count + r / episodes.length for r, s in zip(reset, steps, strict=True)]
+        rounds.append((times[0], times[1]))
     return rounds, expected
 
 
@@ -217,7 +280,7 @@ def _millions(rate: float | None) -> str:
 
 
 def _line(*columns: str) -> None:
-    widths = (28, 9, 10, 6, 9, 9, 13, 8, 7, 7)
+    widths = (28, 9, 13, 6, 9, 9, 13, 8, 7, 7)
     aligned = (
         f"{text:<{width}}" if i < 3 else f"{text:>{width}}"
         for i, (text, width) in enumerate(zip(columns, widths, strict=True))
@@ -242,18 +305,23 @@ def _show(row: Row) -> None:
 
 def measured(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[Row]:
     """Measure every environment and control; rows come as they are measured."""
-    backends = [Backend("numpy", {})]
+    backends = [Backend("numpy", {"backend": "numpy"})]
+    if AVAILABLE:
+        backends.insert(0, Backend("compiled", {"backend": "compiled"}))
+    on_arrays = len(backends)
     if torch is not None:
         torch.set_num_threads(1)
         devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
         backends += [Backend(f"torch {d}", {"backend": "torch", "device": d}) for d in devices]
     cells = [(id, control) for id in ids for control in catalogue()[id].controls]
-    share = total / (len(cells) * (1 + len(backends) * len(sizes or SIZES)))
+    share = total / (len(cells) * (on_arrays + len(backends) * len(sizes or SIZES)))
     dearest = DEAR * share if sizes is None else float("inf")
-    operation, function = elementwise_costs()
+    costs = elementwise_costs()
+    native = compiled_costs() if AVAILABLE else costs
     peer_runs: list[float] = []
     for id, control in cells:
-        floor = arithmetic_floor(id, control, operation, function)
+        floors = {"compiled": compiled_floor(id, control, native)}
+        array_floor = arithmetic_floor(id, control, costs)
         has_peer = id == peer_imm.PEER_OF and control != "gain"
         if has_peer:  # before every control, so that the peer meets the same disturbances
             peer_runs += [peer_imm.imm_steps_per_second(500) for _ in range(3)]
@@ -261,37 +329,40 @@ def measured(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[
         def row(
             backend: str,
             size: int,
-            count: int,
             rounds: list[tuple[float, float]],
             id: str = id,
             control: str = control,
-            floor: float | None = floor,
+            floors: dict[str, float | None] = floors,
+            array_floor: float | None = array_floor,
             peer: float | None = statistics.median(peer_runs) if has_peer else None,
         ) -> Row:
-            wall, processor = (statistics.median(times) / count for times in zip(*rounds, strict=True))
+            wall, processor = (statistics.median(times) for times in zip(*rounds, strict=True))
+            floor = floors.get(backend.removeprefix("make "), array_floor)
             if "cuda" in backend:  # the time of the processor is not that of the device
                 processor, floor = wall, None
             rate = size / processor
             times_peer = rate / peer if peer else None
             return Row(id, control, backend, size, len(rounds), wall, size / wall, rate, floor, times_peer)
 
-        *single, count = single_round(id, control)
-        rounds, _ = measure(*single, count, share, float("inf"))
-        yield row("make", 1, count, rounds)
+        for backend in backends[:on_arrays]:
+            rounds, _ = measure(single(id, control, backend.keywords), share, float("inf"))
+            yield row(f"make {backend.name}", 1, rounds)
         for backend in backends:
             for size in sorted(sizes or SIZES):
-                *vector, count = vector_round(id, control, size, backend.keywords)
-                rounds, expected = measure(*vector, count, share, dearest)
+                rounds, expected = measure(vector(id, control, size, backend.keywords), share, dearest)
                 if not rounds:
                     short = id.removeprefix("filtergym/")
                     print(
-                        f"{short} {control} {backend.name}: N = {size} is left out, {STEPS} steps take "
+                        f"{short} {control} {backend.name}: N = {size} is left out, a round takes "
                         f"{expected:.0f} s; ask for it with --size",
                         flush=True,
                     )
                     break
-                yield row(backend.name, size, count, rounds)
-    print(f"NumPy: {1e9 * operation:.2f} ns per multiply, {1e9 * function:.2f} ns per exp, in cache.")
+                yield row(backend.name, size, rounds)
+    for name, found in (("NumPy", costs), ("compiled", native)):
+        print(
+            f"{name}: {1e9 * found.operation:.3g} ns per operation, {1e9 * found.function:.3g} ns per exp, in cache."
+        )
     if peer_runs:
         rate = statistics.median(peer_runs)
         print(f"Peer, filterpy IMMEstimator in a loop: {rate:.0f} steps per second of processor time.")
@@ -303,7 +374,7 @@ def main() -> None:
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
     parser.add_argument("--size", action="append", type=int, metavar="N", help="only this N; may be repeated")
     parser.add_argument(
-        "--seconds", type=float, default=70.0, help="time for all rounds together (default 70)"
+        "--seconds", type=float, default=120.0, help="time for all rounds together (default 120)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows to this file")
     arguments = parser.parse_args()
