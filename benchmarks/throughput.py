@@ -8,8 +8,9 @@ measurement (``decision_interval`` 1) and carries its share of a reset: that of 
 an episode. One thread. Actions are random and drawn beforehand, in float32 as the space has them.
 
 A row is the median over rounds of a reset and 128 steps (fewer where episodes are shorter), repeated until the row's
-share of ``--seconds`` is spent. What is dear is found out by three steps: where a single round would take more than six shares, the size is left out,
-and so are the larger ones. A size that is asked for by ``--size`` is measured whatever it costs.
+share of ``--seconds`` is spent. What is dear is found out by three steps: where a single round would take more than
+six shares, the size is left out, and so are the larger ones. A size that is asked for by ``--size`` is measured
+whatever it costs.
 
 Where other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
 process was given; both are shown, and floors and ratios use the latter for both sides.
