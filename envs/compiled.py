@@ -47,6 +47,15 @@ def _moved_on(task: Task, truth: Any, bank: Any, noise: Array) -> tuple[Any, Any
     return episode.truth, episode.measurement, episode.bank, task.observe(episode)
 
 
+def steered_and_moved_on(
+    kind: str, task: Task, episode: Episode, action: Array, noise: Array
+) -> tuple[Episode, Array, Array]:
+    """Both halves of a step: episodes at the next measurement, what is paid for the action, and what is shown."""
+    bank, paid = _steered(kind, task, episode, action)
+    truth, measurement, bank, shown = _moved_on(task, episode.truth, bank, noise)
+    return Episode(truth, measurement, bank), paid, shown
+
+
 class Programs:
     """What is traced of a task, for all that have its parameters.
 
@@ -70,10 +79,11 @@ class Programs:
         start = self.function(cls.begin).specialised(
             numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
         )
-        return self.function(cls.measure).specialised(start.example(), self._row).example()
+        return self.function(cls.measure).specialised(start.example(), self.row).example()
 
     @property
-    def _row(self) -> numpy.ndarray:
+    def row(self) -> numpy.ndarray:
+        """Noise of a measurement."""
         return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
 
     def function(self, function: Callable[..., Any]) -> Function:
@@ -104,7 +114,7 @@ class Programs:
             advance = Specialised(
                 functools.partial(_moved_on, self.traced),
                 self.graph,
-                (episode.truth, steer.example()[0], self._row),
+                (episode.truth, steer.example()[0], self.row),
                 turned=True,
                 # A part of the truth that stays: both copies of the episodes may have the same one.
                 shared=lambda output, input: output == input < len(leaves(episode.truth)),
@@ -247,7 +257,7 @@ class Stepper:
         ]
         self._copies = (first, second)
         steered = [empty_lanes(leaf.shape, width) for leaf in steer.outputs[:-1]]
-        nothing = numpy.zeros((len(task.programs._row), width))
+        nothing = numpy.zeros((len(task.programs.row), width))
         self._steer, self._advance = [], []
         for now, then in ((first, second), (second, first)):
             self._steer.append(steer.bound([*now, self.action], [*steered, self.paid]))
