@@ -32,6 +32,7 @@ from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from .draws import Draws
 from .observation import Array
+from .reward import OWN_PAY
 from .task import Episode, Task
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
@@ -90,6 +91,15 @@ class Parts(NamedTuple):
     predict: Specialised
     episode: Episode
     """After the measurement, its arrays of the right shapes."""
+
+
+def stepped(
+    kind: str, task: Task, episode: Episode, action: Array, noise: Array
+) -> tuple[Episode, Array, Array]:
+    """A whole step: episodes at the next measurement, what is paid for the action, and what is shown."""
+    after = task.act(episode, action)
+    following = task.measure(after, noise)
+    return following, OWN_PAY[kind](task, after), task.observe(following)
 
 
 class Programs:
@@ -162,12 +172,16 @@ class Programs:
             raise NotTraceable("the arrays of an episode change their shapes from step to step")
         return later
 
+    @property
+    def row(self) -> numpy.ndarray:
+        """Noise of a measurement."""
+        return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
+
     def _parts(self, truth: Any, bank: Any) -> Parts:
-        row = numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
         space = self.traced.action_space
         discrete = isinstance(space, gymnasium.spaces.Discrete)
         action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
-        advance = self.advanced.specialised(truth, bank, row)
+        advance = self.advanced.specialised(truth, bank, self.row)
         following, measurement = advance.example()
         predict = self.predicted.specialised(bank, measurement)
         predicted = predict.example()[0]

@@ -273,7 +273,7 @@ class Lanes:
             paper_posterior: Any = self.paper and self.paper.act(self.paper_state, self._paper_action)
             if record is not None:
                 record(posterior, paper_posterior)
-            row = self._next_row()
+            row = self.next_row()
             if not isinstance(row, numpy.ndarray):
                 # Autograd may keep it until the backward pass, when the ring has long been written over.
                 row = row.clone()
@@ -287,7 +287,7 @@ class Lanes:
             self._interval_mean = shown / task.decision_interval
         self.decisions += 1
 
-    def _next_row(self) -> Array:
+    def next_row(self) -> Array:
         """Noise of the next measurement, ``(row width, width)``."""
         self._clock += 1
         if self._in_blocks:
@@ -338,7 +338,7 @@ class Lanes:
         mean = self._mean_fields if interval > 1 else []
         total: Any = 0.0
         for _ in range(interval):
-            self._next_row()
+            self.next_row()
             row = self._row_address()
             for stepper in self._moving:
                 stepper.step(row)
