@@ -83,10 +83,15 @@ class Traced:
             return Traced(self.nodes[key], self.dtype)
         place = next(i for i, k in enumerate(keys) if isinstance(k, Traced))
         others = tuple(slice(None) if i == place else k for i, k in enumerate(keys))
-        if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others):
-            raise NotTraceable("only one index of an array may depend on numbers, the others be slices")
-        dropped = builtins.sum(isinstance(k, int) for k in others[:place])
-        return take(Traced(self.nodes[others], self.dtype), keys[place], axis=place - dropped)
+        whole = [i for i, k in enumerate(keys) if isinstance(k, Traced | int)]
+        if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others) or (
+            len(whole) != whole[-1] - whole[0] + 1  # NumPy puts the axis first then
+        ):
+            raise NotTraceable("one index may depend on numbers, whole ones stand beside it, the others be slices")
+        axis = place - builtins.sum(isinstance(k, int) for k in others[:place])
+        if Ellipsis in others[:place]:  # counted from the last axis then
+            axis = place - len(keys) + builtins.sum(isinstance(k, int) for k in others[place:])
+        return take(Traced(self.nodes[others], self.dtype), keys[place], axis=axis)
 
     def __pow__(self, exponent: Any) -> "Traced":
         return square(self) if isinstance(exponent, int | float) and exponent == 2 else pow(self, exponent)
