@@ -284,9 +284,7 @@ broadcast_to, expand_dims, squeeze = (
     _moved(numpy.expand_dims),
     _moved(numpy.squeeze),
 )
-flip, roll, tile, repeat, tril, triu = (
-    _moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat, numpy.tril, numpy.triu)
-)
+flip, roll, tile, repeat = (_moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat))
 concat, stack = _gathered(numpy.concat), _gathered(numpy.stack)
 
 
@@ -295,17 +293,38 @@ def _made(make: Callable[..., Any]) -> Callable[..., Traced]:
 
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
-        like = tuple(a.nodes if isinstance(a, Traced) else a for a in arguments)
-        first = arguments[0]
-        return asarray(make(*like, dtype=dtype or (first.dtype if isinstance(first, Traced) else None)))
+        return asarray(make(*arguments, dtype=dtype))
 
     return function
 
 
-zeros, ones, full, eye, arange = (
-    _made(m) for m in (numpy.zeros, numpy.ones, numpy.full, numpy.eye, numpy.arange)
-)
-zeros_like, ones_like, full_like = _made(numpy.zeros_like), _made(numpy.ones_like), _made(numpy.full_like)
+zeros, ones, eye, arange = (_made(make) for make in (numpy.zeros, numpy.ones, numpy.eye, numpy.arange))
+
+
+def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
+    """Array of one value, which may depend on numbers."""
+    return broadcast_to(asarray(value, dtype), shape)
+
+
+def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
+    """Array of one value, shaped like another."""
+    x = asarray(x)
+    return full(x.shape, value, dtype=dtype or x.dtype)
+
+
+zeros_like, ones_like = functools.partial(full_like, value=0), functools.partial(full_like, value=1)
+
+
+def tril(x: Any, /, *, k: int = 0) -> Traced:
+    """Lower triangle, zeros above it."""
+    x = asarray(x)
+    return where(numpy.tri(*x.shape[-2:], k, dtype=bool), x, zeros_like(x))
+
+
+def triu(x: Any, /, *, k: int = 0) -> Traced:
+    """Upper triangle, zeros below it."""
+    x = asarray(x)
+    return where(numpy.tri(*x.shape[-2:], k - 1, dtype=bool), zeros_like(x), x)
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
