@@ -87,7 +87,9 @@ class Traced:
         if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others) or (
             len(whole) != whole[-1] - whole[0] + 1  # NumPy puts the axis first then
         ):
-            raise NotTraceable("one index may depend on numbers, whole ones stand beside it, the others be slices")
+            raise NotTraceable(
+                "one index may depend on numbers, whole ones stand beside it, the others be slices"
+            )
         axis = place - builtins.sum(isinstance(k, int) for k in others[:place])
         if Ellipsis in others[:place]:  # counted from the last axis then
             axis = place - len(keys) + builtins.sum(isinstance(k, int) for k in others[place:])
@@ -135,14 +137,14 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _joined(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Arrays as traced ones of one kind, numbers or truth values, and their common type; Python's own have none."""
-    typed = [array.dtype for array in arrays if hasattr(array, "dtype")]
+    """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
     found = [asarray(array) for array in arrays]
-    weak = [float64 if isinstance(a, float) else int64 for a in arrays if isinstance(a, int | float)]
-    if builtins.all(array.dtype == bool for array in found):
-        return found, bool
-    kinds = [*typed, *(kind for kind in weak if kind == float64 or not typed)] or [float64]
-    return [_numbers(array) for array in found], numpy.result_type(*kinds)
+    # NumPy asks Python's own numbers only for their kind.
+    kinds = [
+        a if isinstance(a, int | float) else traced.dtype for a, traced in zip(arrays, found, strict=True)
+    ]
+    dtype = numpy.result_type(*kinds)
+    return found if dtype == bool else [_numbers(array) for array in found], dtype
 
 
 def _binary(name: str, result: Any = None) -> Callable[..., Any]:
@@ -234,7 +236,7 @@ def isfinite(x: Any) -> Traced:
 def where(condition: Any, one: Any, other: Any) -> Traced:
     """Choose by a condition."""
     arrays, dtype = _joined([one, other])
-    return _elementwise("where", [asarray(condition), *arrays], dtype)
+    return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
 def clip(x: Any, min: Any = None, max: Any = None) -> Traced:  # noqa: A002
@@ -354,9 +356,9 @@ def _chosen(graph: Graph, row: list[int], index: int) -> int:
     return chosen
 
 
-def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
+def _reduction(operation: Callable[..., Any], of_numbers: Any = False) -> Callable[..., Traced]:
     def function(x: Any, /, *, axis: int | tuple[int, ...] | None = None, keepdims: Any = False) -> Traced:
-        x = asarray(x)
+        x = _numbers(asarray(x)) if of_numbers else asarray(x)
         axes = tuple(range(x.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
         moved = numpy.moveaxis(x.nodes, axes, range(len(axes)))
         parts = moved.reshape(-1, *moved.shape[len(axes) :])
@@ -366,7 +368,7 @@ def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
     return function
 
 
-sum, prod, max, min = (_reduction(o) for o in (add, multiply, maximum, minimum))  # noqa: A001
+sum, prod, max, min = (_reduction(o, of_numbers=True) for o in (add, multiply, maximum, minimum))  # noqa: A001
 any, all = _reduction(logical_or), _reduction(logical_and)  # noqa: A001
 
 
