@@ -60,6 +60,8 @@ def mapped(function: Callable[[Any], Any], part: Any) -> Any:
 
 def _leaf(array: Any) -> Leaf:
     kind = array.dtype.kind
+    if kind not in "fiub":
+        raise namespace.NotTraceable(f"arrays of {array.dtype} cannot be traced")
     return Leaf(array.shape[:-1], "i" if kind == "u" else kind)
 
 
@@ -95,8 +97,15 @@ class Specialised:
         with namespace.tracing(graph):
             places = iter(range(len(self.inputs)))
             traced = [mapped(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
-            answer = function(*traced)
-            made = [namespace.asarray(array) for array in leaves(answer)]
+            try:
+                answer = function(*traced)
+                made = [namespace.asarray(array) for array in leaves(answer)]
+            except namespace.NotTraceable:
+                raise
+            except Exception as error:  # a function may stumble over symbols in any way
+                raise namespace.NotTraceable(f"{type(error).__name__}: {error}") from error
+        if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
+            raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
         count = iter(range(len(made)))
         self.template = mapped(lambda _: next(count), answer)
         self.outputs = [_leaf(array) for array in made]
