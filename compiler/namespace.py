@@ -332,6 +332,8 @@ def triu(x: Any, /, *, k: int = 0) -> Traced:
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
     """Entries by their place; places that depend on numbers choose from a table of constants, or one by one."""
     x, indices = asarray(x), asarray(indices)
+    if indices.dtype == bool:
+        raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
     graph, rows = _OPEN.get(), numpy.moveaxis(x.nodes, axis, -1)
     choices = rows.reshape(-1, rows.shape[-1])
     taken = [
@@ -349,9 +351,12 @@ def _chosen(graph: Graph, row: list[int], index: int) -> int:
         return row[int(graph.values[index])]
     if None not in values and not builtins.any(graph.logical[node] for node in row):
         return graph.take(numpy.array(values, dtype=float), index)
+    # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
+    from_end = graph.node("add", index, graph.constant(len(row)))
+    index = graph.node("where", graph.node("less", index, graph.constant(0.0)), from_end, index)
     chosen = row[0]
     for place, node in enumerate(row[1:], 1):
-        here = graph.node("equal", index, graph.constant(float(place)))
+        here = graph.node("greater_equal", index, graph.constant(place))
         chosen = graph.node("where", here, node, chosen)
     return chosen
 
