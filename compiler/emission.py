@@ -132,9 +132,10 @@ class _Part:
             self.choice(a, rest[0], rest[1], kind, name)
         elif operation == "number":
             self.choice(a, ONE, ZERO, name=name)
-        elif operation == "sign":  # of zero and of what is no number: itself
+        elif operation == "sign":  # of what is no number: itself
             low = self.choice(self.compare("olt", a, ZERO), MINUS_ONE, a)
-            self.choice(self.compare("ogt", a, ZERO), ONE, low, name=name)
+            sign = self.choice(self.compare("ogt", a, ZERO), ONE, low)
+            self.new(f"fadd {VECTOR} {sign}, {ZERO}", name)  # zero for minus zero
         elif operation == "remainder":  # with the sign of the divisor
             quotient = self.new(f"fdiv {VECTOR} {a}, {rest[0]}")
             whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
