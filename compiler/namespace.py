@@ -30,12 +30,13 @@ class NotTraceable(TypeError):
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Let the arithmetic inside make expressions of a graph."""
-    token = _OPEN.set(graph)
-    try:
-        yield graph
-    finally:
-        _OPEN.reset(token)
+    """Let the arithmetic inside make expressions of a graph; other threads wait with theirs."""
+    with graph.lock:
+        token = _OPEN.set(graph)
+        try:
+            yield graph
+        finally:
+            _OPEN.reset(token)
 
 
 def _refused(self: Any, *_: Any) -> Any:

@@ -4,6 +4,7 @@ An expression is a number: its place in the :class:`Graph`. One that is made aga
 subexpressions), one of constants is computed at once, and what no result needs never enters a program.
 """
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -61,9 +62,11 @@ class Graph:
         arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
         values: value of a constant, None of what varies.
         tables: what ``take`` reads, ``(length,)`` each.
+        lock: held by whoever adds expressions.
     """
 
     def __init__(self) -> None:
+        self.lock = threading.RLock()
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
