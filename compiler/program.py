@@ -133,6 +133,9 @@ class Graph:
             if values[0] is not None:
                 return arguments[1 if values[0] else 2]
             return arguments[1] if arguments[1] == arguments[2] else None
+        if name in ("maximum", "minimum"):
+            # The code takes the other one where a comparison is false: of a constant it must be a number.
+            return next((a for a, v in zip(arguments, values, strict=True) if v is not None and v != v), None)
         if name == "negative":
             inner = arguments[0]
             return self.arguments[inner][0] if self.operations[inner] == "negative" else None
