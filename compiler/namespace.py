@@ -52,7 +52,7 @@ class Traced:
     """
 
     __slots__ = ("dtype", "nodes")
-    __array_ufunc__ = None  # NumPy leaves mixed arithmetic to the methods below
+    __array_priority__ = 1  # NumPy leaves mixed arithmetic to the methods below
     device = None
     __bool__ = __float__ = __int__ = __index__ = __complex__ = _refused
 
@@ -250,6 +250,8 @@ def clip(x: Any, min: Any = None, max: Any = None) -> Traced:  # noqa: A002
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
     """Array of another type; from numbers to whole numbers the fraction is cut off."""
     x, dtype = asarray(x), numpy.dtype(dtype)
+    if dtype.kind not in "fiub":
+        raise NotTraceable(f"arrays of {dtype} cannot be traced")
     if dtype == bool:
         return x if x.dtype == bool else not_equal(x, 0.0)
     if x.dtype == bool:
@@ -391,6 +393,8 @@ def matmul(a: Any, b: Any, /) -> Traced:
     """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out."""
     a, b = asarray(a), asarray(b)
     left, right = (a[None] if a.ndim == 1 else a), (b[:, None] if b.ndim == 1 else b)
+    if left.shape[-1] != right.shape[-2]:
+        raise ValueError(f"matrices of {a.shape} and {b.shape} have no product")
     product = functools.reduce(
         add, (left[..., :, k, None] * right[..., k, None, :] for k in range(left.shape[-1]))
     )
