@@ -136,11 +136,8 @@ class _Part:
             low = self.choice(self.compare("olt", a, ZERO), MINUS_ONE, a)
             sign = self.choice(self.compare("ogt", a, ZERO), ONE, low)
             self.new(f"fadd {VECTOR} {sign}, {ZERO}", name)  # zero for minus zero
-        elif operation == "remainder":  # with the sign of the divisor
-            quotient = self.new(f"fdiv {VECTOR} {a}, {rest[0]}")
-            whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
-            product = self.new(f"fmul {VECTOR} {rest[0]}, {whole}")
-            self.new(f"fsub {VECTOR} {a}, {product}", name)
+        elif operation == "remainder":
+            self._remainder(a, rest[0], name)
         elif operation in ("maximum", "minimum") and (limited := self._constant_first(arguments)):
             # One instruction: where the comparison is false, also for what is no number, the second is taken.
             how = "ogt" if operation == "maximum" else "olt"
@@ -151,6 +148,17 @@ class _Part:
             )
             listed = ", ".join(f"{VECTOR} {value}" for value in (a, *rest))
             self.new(f"call {VECTOR} {callee}({listed})", name)
+
+    def _remainder(self, a: str, b: str, name: str) -> None:
+        """With the sign of the divisor, rounded once as long as the quotient is below ``2^53``."""
+        quotient = self.new(f"fdiv {VECTOR} {a}, {b}")
+        whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
+        minus = self.new(f"fneg {VECTOR} {whole}")
+        rest = self.new(f"call {VECTOR} @llvm.fma.v8f64({VECTOR} {b}, {VECTOR} {minus}, {VECTOR} {a})")
+        # The quotient may have been rounded up to a whole number: then the rest is on the other side of zero.
+        above = self.new(f"fadd {VECTOR} {rest}, {b}")
+        opposite = self.compare("olt", self.new(f"fmul {VECTOR} {rest}, {b}"), ZERO)
+        self.choice(opposite, above, rest, name=name)
 
     def _constant_first(self, arguments: tuple[int, ...]) -> tuple[str, str] | None:
         for one, other in (arguments, arguments[::-1]):
@@ -286,6 +294,7 @@ def _declarations(program: Program, library: Library) -> Iterator[str]:
     """Intrinsics, and functions of eight lanes made of the library's."""
     used = {step.operation for step in program.steps}
     yield f"declare {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr>, i32, {TRUTH}, {VECTOR})"
+    yield f"declare {VECTOR} @llvm.fma.v8f64({', '.join([VECTOR] * 3)})"
     for name in sorted(set(_INTRINSIC.values())):
         operands = ", ".join([VECTOR] * (2 if name in ("maximum", "minimum") else 1))
         yield f"declare {VECTOR} @llvm.{name}.v8f64({operands})"

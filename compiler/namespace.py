@@ -179,8 +179,9 @@ def _logical(name: str) -> Callable[..., Any]:
 
 
 def _floor_divide(one: Any, other: Any) -> Traced:
-    quotient = divide(one, other)
-    return Traced(floor(quotient).nodes, _joined([one, other])[1])
+    # The quotient itself may be rounded up to a whole number that it does not reach.
+    quotient = divide(subtract(one, remainder(one, other)), other)
+    return Traced(round(quotient).nodes, _joined([one, other])[1])
 
 
 add, subtract, multiply, remainder = (_binary(n) for n in ("add", "subtract", "multiply", "remainder"))
