@@ -139,7 +139,8 @@ class Specialised:
         arrays = [*inputs, *outputs]
         table = [self.program.constants.ctypes.data]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
-            stride = array.strides[0 if lane_first else -2] // array.itemsize if array.ndim > 1 else 0
+            step = array.strides[0] if lane_first else array.strides[-2] if array.ndim > 1 else 0
+            stride = step // array.itemsize
             table += [array.ctypes.data, stride]
         return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
@@ -250,6 +251,8 @@ class Function:
         given = [array for part in parts for array in leaves(part)]
         special = self.specialised(*parts)
         count = max(array.shape[-1] for array in given)
+        if any(array.shape[-1] not in (1, count) for array in given):
+            raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
         width = -(-count // LANES) * LANES
         arrays = [_ready(array, width) for array in given]
         outputs = [given[same] if same is not None else None for same in special.same]
@@ -283,6 +286,6 @@ def _ready(array: Any, width: int) -> numpy.ndarray:
     even = all(array.strides[i] == array.strides[i + 1] * array.shape[i + 1] for i in range(array.ndim - 2))
     return (
         array
-        if array.strides[-1] == array.itemsize and even and rows >= 0
+        if array.strides[-1] == array.itemsize and even and rows >= 0 and rows % array.itemsize == 0
         else numpy.ascontiguousarray(array)
     )
