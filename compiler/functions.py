@@ -15,7 +15,6 @@ from .library import Library
 from .native import Native, native
 from .program import Graph, Program, Result, program
 
-
 DTYPES: dict[str, Any] = {"f": numpy.float64, "i": numpy.int64, "b": numpy.bool_}
 FEWEST = 512
 """Lanes that are worth a thread."""

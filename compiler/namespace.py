@@ -19,12 +19,12 @@ import numpy
 from .program import COMPARISONS, Graph
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
-bool = numpy.dtype("bool")  # noqa: A001  (the standard's name)
+bool = numpy.dtype("bool")
 pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
-class NotTraceable(TypeError):
+class NotTraceable(TypeError):  # noqa: N818  (no error of whoever wrote the function)
     """A function does what no straight line of arithmetic can do."""
 
 
@@ -70,7 +70,7 @@ class Traced:
     ndim = property(lambda self: self.nodes.ndim)
     size = property(lambda self: self.nodes.size)
     T = property(lambda self: Traced(self.nodes.T, self.dtype))
-    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))
+    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))  # noqa: N815  (the standard's name)
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -100,12 +100,15 @@ class Traced:
         return square(self) if isinstance(exponent, int | float) and exponent == 2 else pow(self, exponent)
 
     def sum(self, axis: int | None = None) -> "Traced":
+        """Sum over an axis, or all."""
         return sum(self, axis=axis)
 
     def reshape(self, *shape: Any) -> "Traced":
+        """Return the same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
 
     def copy(self) -> "Traced":
+        """Return the array itself, as nothing changes it."""
         return self
 
 
@@ -189,15 +192,15 @@ divide, maximum, minimum = _binary("divide", float64), _binary("maximum"), _bina
 less, less_equal, greater, greater_equal, equal, not_equal = (_binary(name, bool) for name in COMPARISONS)
 logical_and, logical_or, logical_not = (_logical(f"logical_{name}") for name in ("and", "or", "not"))
 floor_divide = _floor_divide
-negative, abs, sign = (_unary(name, result=None) for name in ("negative", "absolute", "sign"))  # noqa: A001
-floor, ceil, trunc, round = (_unary(n, result=None) for n in ("floor", "ceil", "trunc", "rint"))  # noqa: A001
+negative, abs, sign = (_unary(name, result=None) for name in ("negative", "absolute", "sign"))
+floor, ceil, trunc, round = (_unary(n, result=None) for n in ("floor", "ceil", "trunc", "rint"))
 sqrt, exp, expm1, exp2, log, log1p, log2, log10, sin, cos, tan = (
-    _unary(n) for n in "sqrt exp expm1 exp2 log log1p log2 log10 sin cos tan".split()
+    _unary(n) for n in ["sqrt", "exp", "expm1", "exp2", "log", "log1p", "log2", "log10", "sin", "cos", "tan"]
 )
 asin, acos, atan, sinh, cosh, tanh, asinh, acosh, atanh = (
-    _unary(n) for n in "asin acos atan sinh cosh tanh asinh acosh atanh".split()
+    _unary(n) for n in ["asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"]
 )
-atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))  # noqa: A001
+atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))
 
 
 def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
@@ -241,7 +244,7 @@ def where(condition: Any, one: Any, other: Any) -> Traced:
     return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
-def clip(x: Any, min: Any = None, max: Any = None) -> Traced:  # noqa: A002
+def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
     """Limit."""
     if min is not None:
         x = maximum(x, min)
@@ -377,8 +380,8 @@ def _reduction(operation: Callable[..., Any], of_numbers: Any = False) -> Callab
     return function
 
 
-sum, prod, max, min = (_reduction(o, of_numbers=True) for o in (add, multiply, maximum, minimum))  # noqa: A001
-any, all = _reduction(logical_or), _reduction(logical_and)  # noqa: A001
+sum, prod, max, min = (_reduction(o, of_numbers=True) for o in (add, multiply, maximum, minimum))
+any, all = _reduction(logical_or), _reduction(logical_and)
 
 
 def sort(x: Any, /, *, axis: int = -1) -> Traced:

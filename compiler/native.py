@@ -7,8 +7,6 @@ from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
 
-import numpy
-
 from . import cache
 from .emission import emitted
 from .library import Library, fastest
