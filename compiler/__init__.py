@@ -12,6 +12,6 @@ that the namespace lacks) raises :class:`~.namespace.NotTraceable`.
 
 Differences from NumPy that are wanted: what is zero for every finite number is zero, also of what is not finite (a
 product with a constant zero, zero divided by anything, a difference of the same thing); the sign of a zero may differ;
-numbers that are no numbers spread through ``sort``; library functions may differ in their last bits. Results are the same for every number of lanes and of threads; between
-processors, and between libraries, they differ in last bits.
+NaN spreads through ``sort``; library functions may differ in their last bits. Results are the same for every number of
+lanes and of threads; between processors, and between libraries, they differ in last bits.
 """

@@ -98,9 +98,9 @@ class _Part:
             if operation == "input":
                 self.new(f"load {VECTOR}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
             elif operation == "constant" and logical:
-                self.compare("une", self.constant(*arguments), ZERO, f"%v{step}")
+                self.compare("une", self.constant(arguments[0]), ZERO, f"%v{step}")
             elif operation == "constant":
-                self.constant(*arguments, name=f"%v{step}")
+                self.constant(arguments[0], f"%v{step}")
             else:
                 kind = TRUTH if logical else VECTOR
                 self.new(f"load {kind}, ptr {self.scratch(step)}, align 64", f"%v{step}")
@@ -115,7 +115,7 @@ class _Part:
         name, kind = f"%v{index}", TRUTH if logical else VECTOR
         self.known.add(index)
         if operation == "take":
-            self._take(*arguments, name=name)
+            self._take(arguments, name)
             return
         a, *rest = (self.value(argument) for argument in arguments)
         if operation in _INFIX:
@@ -166,7 +166,8 @@ class _Part:
                 return self.value(one), self.value(other)
         return None
 
-    def _take(self, start: int, length: int, index: int, name: str) -> None:
+    def _take(self, arguments: tuple[int, ...], name: str) -> None:
+        start, length, index = arguments
         place = self.value(index)
         size, last = _splat(f"{length}.0"), _splat(f"{length - 1}.0")
         from_end = self.new(f"fadd {VECTOR} {place}, {size}")

@@ -207,19 +207,16 @@ def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, other: operation(other, self) if not isinstance(other, Traced) else NotImplemented
 
 
+_METHODS: dict[str, Callable[..., Any]]
 _METHODS = {"add": add, "sub": subtract, "mul": multiply, "truediv": divide, "floordiv": floor_divide}
 _METHODS |= {"mod": remainder, "and": logical_and, "or": logical_or}
 for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
     setattr(Traced, f"__r{_name}__", _reflected(_operation))
-for _name, _operation in zip(
-    ("lt", "le", "gt", "ge", "eq", "ne"),
-    (less, less_equal, greater, greater_equal, equal, not_equal),
-    strict=True,
-):
+_METHODS = {"lt": less, "le": less_equal, "gt": greater, "ge": greater_equal, "eq": equal, "ne": not_equal}
+_METHODS |= {"neg": negative, "abs": abs, "invert": logical_not, "rpow": _reflected(pow)}
+for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
-Traced.__rpow__ = lambda self, base: pow(base, self)  # type: ignore[attr-defined]
-Traced.__neg__, Traced.__abs__, Traced.__invert__ = negative, abs, logical_not  # type: ignore[attr-defined]
 Traced.__hash__ = None  # type: ignore[assignment]
 
 
@@ -327,13 +324,13 @@ zeros_like, ones_like = functools.partial(full_like, value=0), functools.partial
 def tril(x: Any, /, *, k: int = 0) -> Traced:
     """Lower triangle, zeros above it."""
     x = asarray(x)
-    return where(numpy.tri(*x.shape[-2:], k, dtype=bool), x, zeros_like(x))
+    return where(numpy.tril(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def triu(x: Any, /, *, k: int = 0) -> Traced:
     """Upper triangle, zeros below it."""
     x = asarray(x)
-    return where(numpy.tri(*x.shape[-2:], k - 1, dtype=bool), zeros_like(x), x)
+    return where(numpy.triu(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
@@ -353,9 +350,9 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _chosen(graph: Graph, row: list[int], index: int) -> int:
-    values = [graph.values[node] for node in row]
-    if graph.values[index] is not None:
-        return row[int(graph.values[index])]
+    values, known = [graph.values[node] for node in row], graph.values[index]
+    if known is not None:
+        return row[int(known)]
     if None not in values and not builtins.any(graph.logical[node] for node in row):
         return graph.take(numpy.array(values, dtype=float), index)
     # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
@@ -406,5 +403,6 @@ def matmul(a: Any, b: Any, /) -> Traced:
     return product[..., 0] if b.ndim == 1 else product
 
 
-Traced.__matmul__ = matmul  # type: ignore[attr-defined]
-Traced.__rmatmul__ = lambda self, other: matmul(other, self)  # type: ignore[attr-defined]
+_METHODS = {"matmul": matmul, "rmatmul": _reflected(matmul)}
+for _name, _operation in _METHODS.items():
+    setattr(Traced, f"__{_name}__", _operation)

@@ -98,8 +98,9 @@ class Graph:
 
     def take(self, table: numpy.ndarray, index: int) -> int:
         """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
-        if self.values[index] is not None:
-            return self.constant(table[int(self.values[index])])
+        known = self.values[index]
+        if known is not None:
+            return self.constant(table[int(known)])
         key = ("table", table.tobytes())
         if key not in self._found:
             self._found[key] = len(self.tables)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ROOMS = ("filters", "envs", "evaluation", "baselines", "agents", "filtergym")
+ROOMS = ("compiler", "filters", "envs", "evaluation", "baselines", "agents", "filtergym")
 FILES = [path.relative_to(ROOT) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
 
 
