@@ -10,7 +10,8 @@ straight line without branches (:mod:`.program`). It is emitted as LLVM code tha
 Nothing here knows what the functions compute. What cannot be traced (a branch that depends on the numbers, a function
 that the namespace lacks) raises :class:`~.namespace.NotTraceable`.
 
-Two differences from NumPy are wanted: a product with a constant zero is zero, also of what is not finite, and library
-functions may differ in their last bits. Results are the same for every number of lanes and of threads; between
-processors, and between libraries, they differ in last bits.
+Differences from NumPy that are wanted: what is zero for every finite number is zero, also of what is not finite (a
+product with a constant zero, zero divided by anything, a difference of the same thing); the sign of a zero may differ;
+NaN spreads through ``sort``; library functions may differ in their last bits. Results are the same for every number of
+lanes and of threads; between processors, and between libraries, they differ in last bits.
 """

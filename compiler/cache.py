@@ -13,6 +13,8 @@ from pathlib import Path
 
 LIMIT = 256 * 2**20
 """Bytes that the folder may hold."""
+SUFFIX = ".code"
+"""Of entries; nothing else in the folder is touched."""
 SWITCH = "FILTERGYM_COMPILER_CACHE"
 """Environment variable: a folder to use in place of the default one, or ``off``."""
 
@@ -42,12 +44,13 @@ def kept(name: str) -> bytes | None:
     place = folder()
     if place is None:
         return None
+    path = place / f"{name}{SUFFIX}"
     try:
-        whole = (place / name).read_bytes()
-        # What was used is young again.
-        os.utime(place / name)
+        whole = path.read_bytes()
     except OSError:
         return None
+    with contextlib.suppress(OSError):  # in a folder of somebody else's
+        os.utime(path)  # what was used is young again
     checksum, code = whole[:32], whole[32:]
     return code if hashlib.sha256(code).digest() == checksum else None
 
@@ -60,11 +63,11 @@ def keep(name: str, code: bytes) -> None:
     with contextlib.suppress(OSError):
         # Nobody else may write what is going to be executed.
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle, partial = tempfile.mkstemp(dir=place, prefix=".partial-")
+        handle, partial = tempfile.mkstemp(dir=place, prefix=".partial-", suffix=SUFFIX)
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(hashlib.sha256(code).digest() + code)
-            os.replace(partial, place / name)
+            os.replace(partial, place / f"{name}{SUFFIX}")
         except OSError:
             os.unlink(partial)
             raise
@@ -73,12 +76,10 @@ def keep(name: str, code: bytes) -> None:
 
 def _bound(place: Path) -> None:
     """Remove the oldest entries until the folder is small enough."""
-    entries = sorted((path.stat() for path in place.iterdir()), key=lambda stat: stat.st_mtime)
-    total = sum(stat.st_size for stat in entries)
-    if total <= LIMIT:
-        return
-    for path in sorted(place.iterdir(), key=lambda path: path.stat().st_mtime):
-        total -= path.stat().st_size
-        path.unlink(missing_ok=True)
+    entries = [(path, path.stat()) for path in place.glob(f"*{SUFFIX}")]
+    total = sum(stat.st_size for _, stat in entries)
+    for path, stat in sorted(entries, key=lambda entry: entry[1].st_mtime):
         if total <= LIMIT:
             return
+        total -= stat.st_size
+        path.unlink(missing_ok=True)

@@ -115,7 +115,7 @@ class _Part:
         name, kind = f"%v{index}", TRUTH if logical else VECTOR
         self.known.add(index)
         if operation == "take":
-            self._take(name, *arguments)
+            self._take(arguments, name)
             return
         a, *rest = (self.value(argument) for argument in arguments)
         if operation in _INFIX:
@@ -132,14 +132,12 @@ class _Part:
             self.choice(a, rest[0], rest[1], kind, name)
         elif operation == "number":
             self.choice(a, ONE, ZERO, name=name)
-        elif operation == "sign":  # of zero and of what is no number: itself
+        elif operation == "sign":  # of what is no number: itself
             low = self.choice(self.compare("olt", a, ZERO), MINUS_ONE, a)
-            self.choice(self.compare("ogt", a, ZERO), ONE, low, name=name)
-        elif operation == "remainder":  # with the sign of the divisor
-            quotient = self.new(f"fdiv {VECTOR} {a}, {rest[0]}")
-            whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
-            product = self.new(f"fmul {VECTOR} {rest[0]}, {whole}")
-            self.new(f"fsub {VECTOR} {a}, {product}", name)
+            sign = self.choice(self.compare("ogt", a, ZERO), ONE, low)
+            self.new(f"fadd {VECTOR} {sign}, {ZERO}", name)  # zero for minus zero
+        elif operation == "remainder":
+            self._remainder(a, rest[0], name)
         elif operation in ("maximum", "minimum") and (limited := self._constant_first(arguments)):
             # One instruction: where the comparison is false, also for what is no number, the second is taken.
             how = "ogt" if operation == "maximum" else "olt"
@@ -151,13 +149,25 @@ class _Part:
             listed = ", ".join(f"{VECTOR} {value}" for value in (a, *rest))
             self.new(f"call {VECTOR} {callee}({listed})", name)
 
+    def _remainder(self, a: str, b: str, name: str) -> None:
+        """With the sign of the divisor, rounded once as long as the quotient is below ``2^53``."""
+        quotient = self.new(f"fdiv {VECTOR} {a}, {b}")
+        whole = self.new(f"call {VECTOR} @llvm.floor.v8f64({VECTOR} {quotient})")
+        minus = self.new(f"fneg {VECTOR} {whole}")
+        rest = self.new(f"call {VECTOR} @llvm.fma.v8f64({VECTOR} {b}, {VECTOR} {minus}, {VECTOR} {a})")
+        # The quotient may have been rounded up to a whole number: then the rest is on the other side of zero.
+        above = self.new(f"fadd {VECTOR} {rest}, {b}")
+        opposite = self.compare("olt", self.new(f"fmul {VECTOR} {rest}, {b}"), ZERO)
+        self.choice(opposite, above, rest, name=name)
+
     def _constant_first(self, arguments: tuple[int, ...]) -> tuple[str, str] | None:
         for one, other in (arguments, arguments[::-1]):
             if self.program.steps[one].operation == "constant":
                 return self.value(one), self.value(other)
         return None
 
-    def _take(self, name: str, start: int, length: int, index: int) -> None:
+    def _take(self, arguments: tuple[int, ...], name: str) -> None:
+        start, length, index = arguments
         place = self.value(index)
         size, last = _splat(f"{length}.0"), _splat(f"{length - 1}.0")
         from_end = self.new(f"fadd {VECTOR} {place}, {size}")
@@ -285,6 +295,7 @@ def _declarations(program: Program, library: Library) -> Iterator[str]:
     """Intrinsics, and functions of eight lanes made of the library's."""
     used = {step.operation for step in program.steps}
     yield f"declare {VECTOR} @llvm.masked.gather.v8f64.v8p0(<{LANES} x ptr>, i32, {TRUTH}, {VECTOR})"
+    yield f"declare {VECTOR} @llvm.fma.v8f64({', '.join([VECTOR] * 3)})"
     for name in sorted(set(_INTRINSIC.values())):
         operands = ", ".join([VECTOR] * (2 if name in ("maximum", "minimum") else 1))
         yield f"declare {VECTOR} @llvm.{name}.v8f64({operands})"

@@ -59,6 +59,8 @@ def mapped(function: Callable[[Any], Any], part: Any) -> Any:
 
 def _leaf(array: Any) -> Leaf:
     kind = array.dtype.kind
+    if kind not in "fiub":
+        raise namespace.NotTraceable(f"arrays of {array.dtype} cannot be traced")
     return Leaf(array.shape[:-1], "i" if kind == "u" else kind)
 
 
@@ -102,6 +104,8 @@ class Specialised:
                 raise
             except Exception as error:  # a function may stumble over symbols in any way
                 raise namespace.NotTraceable(f"{type(error).__name__}: {error}") from error
+        if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
+            raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
         count = iter(range(len(made)))
         self.template = mapped(lambda _: next(count), answer)
         self.outputs = [_leaf(array) for array in made]
@@ -274,6 +278,8 @@ class Function:
         given = [array for part in parts for array in leaves(part)]
         special = self.specialised(*parts)
         count = max(array.shape[-1] for array in given)
+        if any(array.shape[-1] not in (1, count) for array in given):
+            raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
         width = -(-count // LANES) * LANES
         outputs = special.called([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []
@@ -304,16 +310,18 @@ def _ready(array: Any, width: int) -> numpy.ndarray:
         array = numpy.concatenate([array, padding], axis=-1)
     if array.flags.c_contiguous:
         return array
-    strides, shape = array.strides, array.shape
+    strides, shape, size = array.strides, array.shape, array.itemsize
     even = all(strides[i] == strides[i + 1] * shape[i + 1] for i in range(array.ndim - 2))
-    return array if strides[-1] == array.itemsize and even else numpy.ascontiguousarray(array)
+    rows = strides[-2] if array.ndim > 1 else 0
+    fits = strides[-1] == size and even and rows >= 0 and rows % size == 0
+    return array if fits else numpy.ascontiguousarray(array)
 
 
 def address_of(array: numpy.ndarray) -> int:
     """Address of an array's first number."""
-    return array.__array_interface__["data"][0]
+    return int(array.__array_interface__["data"][0])
 
 
 def _stride(array: numpy.ndarray, axis: int) -> int:
     """Numbers from one row to the next."""
-    return array.strides[axis] // array.itemsize if array.ndim > 1 else 0
+    return array.strides[axis] // array.itemsize if array.ndim > 1 or axis == 0 else 0

@@ -15,7 +15,7 @@ from .program import FUNCTIONS
 BINARY = frozenset(("atan2", "pow", "hypot"))
 VARIANTS = {"avx512f": ("e", 8), "avx2": ("d", 4), "sse4.1": ("b", 2), "neon": ("n", 2)}
 """Glibc's letter for the vectors of an instruction set, and how many numbers they hold."""
-ROUNDING = ("floor", "ceil", "trunc", "rint")
+ROUNDING = ("floor", "ceil", "trunc", "rint", "fma")
 """What LLVM asks the C library for where the processor has no instruction."""
 
 

@@ -24,18 +24,19 @@ pi, inf, nan, newaxis = numpy.pi, numpy.inf, numpy.nan, None
 _OPEN: ContextVar[Graph] = ContextVar("graph")
 
 
-class NotTraceable(TypeError):  # noqa: N818  (that is what a function is)
+class NotTraceable(TypeError):  # noqa: N818  (no error of whoever wrote the function)
     """A function does what no straight line of arithmetic can do."""
 
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Let the arithmetic inside make expressions of a graph."""
-    token = _OPEN.set(graph)
-    try:
-        yield graph
-    finally:
-        _OPEN.reset(token)
+    """Let the arithmetic inside make expressions of a graph; other threads wait with theirs."""
+    with graph.lock:
+        token = _OPEN.set(graph)
+        try:
+            yield graph
+        finally:
+            _OPEN.reset(token)
 
 
 def _refused(self: Any, *_: Any) -> Any:
@@ -51,7 +52,7 @@ class Traced:
     """
 
     __slots__ = ("dtype", "nodes")
-    __array_ufunc__ = None  # NumPy leaves mixed arithmetic to the methods below
+    __array_priority__ = 1  # NumPy leaves mixed arithmetic to the methods below
     device = None
     __bool__ = __float__ = __int__ = __index__ = __complex__ = _refused
 
@@ -69,9 +70,7 @@ class Traced:
     ndim = property(lambda self: self.nodes.ndim)
     size = property(lambda self: self.nodes.size)
     T = property(lambda self: Traced(self.nodes.T, self.dtype))
-    mT = property(  # noqa: N815  (the standard's name)
-        lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype)
-    )
+    mT = property(lambda self: Traced(self.nodes.swapaxes(-1, -2), self.dtype))  # noqa: N815  (the standard's name)
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -85,10 +84,17 @@ class Traced:
             return Traced(self.nodes[key], self.dtype)
         place = next(i for i, k in enumerate(keys) if isinstance(k, Traced))
         others = tuple(slice(None) if i == place else k for i, k in enumerate(keys))
-        if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others):
-            raise NotTraceable("only one index of an array may depend on numbers, the others be slices")
-        dropped = builtins.sum(isinstance(k, int) for k in others[:place])
-        return take(Traced(self.nodes[others], self.dtype), keys[place], axis=place - dropped)
+        whole = [i for i, k in enumerate(keys) if isinstance(k, Traced | int)]
+        if not builtins.all(k is Ellipsis or isinstance(k, slice | int) for k in others) or (
+            len(whole) != whole[-1] - whole[0] + 1  # NumPy puts the axis first then
+        ):
+            raise NotTraceable(
+                "one index may depend on numbers, whole ones stand beside it, the others be slices"
+            )
+        axis = place - builtins.sum(isinstance(k, int) for k in others[:place])
+        if Ellipsis in others[:place]:  # counted from the last axis then
+            axis = place - len(keys) + builtins.sum(isinstance(k, int) for k in others[place:])
+        return take(Traced(self.nodes[others], self.dtype), keys[place], axis=axis)
 
     def __pow__(self, exponent: Any) -> "Traced":
         return square(self) if isinstance(exponent, int | float) and exponent == 2 else pow(self, exponent)
@@ -112,15 +118,15 @@ class Traced:
         return matmul(other, self)
 
     def sum(self, axis: int | None = None) -> "Traced":
-        """Sum over an axis."""
+        """Sum over an axis, or all."""
         return sum(self, axis=axis)
 
     def reshape(self, *shape: Any) -> "Traced":
-        """Same entries in another shape."""
+        """Return the same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
 
     def copy(self) -> "Traced":
-        """Nothing changes an array in place."""
+        """Return the array itself, as nothing changes it."""
         return self
 
 
@@ -153,14 +159,14 @@ def _numbers(array: Traced) -> Traced:
 
 
 def _joined(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
-    """Arrays as traced ones of one kind, numbers or truth values, and their common type; Python's own have none."""
-    typed = [array.dtype for array in arrays if hasattr(array, "dtype")]
+    """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
     found = [asarray(array) for array in arrays]
-    weak = [float64 if isinstance(a, float) else int64 for a in arrays if isinstance(a, int | float)]
-    if builtins.all(array.dtype == bool for array in found):
-        return found, bool
-    kinds = [*typed, *(kind for kind in weak if kind == float64 or not typed)] or [float64]
-    return [_numbers(array) for array in found], numpy.result_type(*kinds)
+    # NumPy asks Python's own numbers only for their kind.
+    kinds = [
+        a if isinstance(a, int | float) else traced.dtype for a, traced in zip(arrays, found, strict=True)
+    ]
+    dtype = numpy.result_type(*kinds)
+    return found if dtype == bool else [_numbers(array) for array in found], dtype
 
 
 def _binary(name: str, result: Any = None) -> Callable[..., Any]:
@@ -194,8 +200,9 @@ def _logical(name: str) -> Callable[..., Any]:
 
 
 def _floor_divide(one: Any, other: Any) -> Traced:
-    quotient = divide(one, other)
-    return Traced(floor(quotient).nodes, _joined([one, other])[1])
+    # The quotient itself may be rounded up to a whole number that it does not reach.
+    quotient = divide(subtract(one, remainder(one, other)), other)
+    return Traced(round(quotient).nodes, _joined([one, other])[1])
 
 
 add, subtract, multiply, remainder = (_binary(n) for n in ("add", "subtract", "multiply", "remainder"))
@@ -218,16 +225,14 @@ def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, other: operation(other, self) if not isinstance(other, Traced) else NotImplemented
 
 
+_METHODS: dict[str, Callable[..., Any]]
 _METHODS = {"add": add, "sub": subtract, "mul": multiply, "truediv": divide, "floordiv": floor_divide}
 _METHODS |= {"mod": remainder, "and": logical_and, "or": logical_or}
 for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
     setattr(Traced, f"__r{_name}__", _reflected(_operation))
-for _name, _operation in zip(
-    ("lt", "le", "gt", "ge", "eq", "ne"),
-    (less, less_equal, greater, greater_equal, equal, not_equal),
-    strict=True,
-):
+_METHODS = {"lt": less, "le": less_equal, "gt": greater, "ge": greater_equal, "eq": equal, "ne": not_equal}
+for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
 Traced.__hash__ = None  # type: ignore[assignment]
 
@@ -250,7 +255,7 @@ def isfinite(x: Any) -> Traced:
 def where(condition: Any, one: Any, other: Any) -> Traced:
     """Choose by a condition."""
     arrays, dtype = _joined([one, other])
-    return _elementwise("where", [asarray(condition), *arrays], dtype)
+    return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
 def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
@@ -263,6 +268,8 @@ def clip(x: Any, min: Any = None, max: Any = None) -> Traced:
 def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
     """Array of another type; from numbers to whole numbers the fraction is cut off."""
     x, dtype = asarray(x), numpy.dtype(dtype)
+    if dtype.kind not in "fiub":
+        raise NotTraceable(f"arrays of {dtype} cannot be traced")
     if dtype == bool:
         return x if x.dtype == bool else not_equal(x, 0.0)
     if x.dtype == bool:
@@ -300,9 +307,7 @@ broadcast_to, expand_dims, squeeze = (
     _moved(numpy.expand_dims),
     _moved(numpy.squeeze),
 )
-flip, roll, tile, repeat, tril, triu = (
-    _moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat, numpy.tril, numpy.triu)
-)
+flip, roll, tile, repeat = (_moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat))
 concat, stack = _gathered(numpy.concat), _gathered(numpy.stack)
 
 
@@ -311,22 +316,45 @@ def _made(make: Callable[..., Any]) -> Callable[..., Traced]:
 
     @functools.wraps(make)
     def function(*arguments: Any, dtype: Any = None, device: Any = None) -> Traced:
-        like = tuple(a.nodes if isinstance(a, Traced) else a for a in arguments)
-        first = arguments[0]
-        return asarray(make(*like, dtype=dtype or (first.dtype if isinstance(first, Traced) else None)))
+        return asarray(make(*arguments, dtype=dtype))
 
     return function
 
 
-zeros, ones, full, eye, arange = (
-    _made(m) for m in (numpy.zeros, numpy.ones, numpy.full, numpy.eye, numpy.arange)
-)
-zeros_like, ones_like, full_like = _made(numpy.zeros_like), _made(numpy.ones_like), _made(numpy.full_like)
+zeros, ones, eye, arange = (_made(make) for make in (numpy.zeros, numpy.ones, numpy.eye, numpy.arange))
+
+
+def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
+    """Array of one value, which may depend on numbers."""
+    return broadcast_to(asarray(value, dtype), shape)
+
+
+def full_like(x: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
+    """Array of one value, shaped like another."""
+    x = asarray(x)
+    return full(x.shape, value, dtype=dtype or x.dtype)
+
+
+zeros_like, ones_like = functools.partial(full_like, value=0), functools.partial(full_like, value=1)
+
+
+def tril(x: Any, /, *, k: int = 0) -> Traced:
+    """Lower triangle, zeros above it."""
+    x = asarray(x)
+    return where(numpy.tril(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
+
+
+def triu(x: Any, /, *, k: int = 0) -> Traced:
+    """Upper triangle, zeros below it."""
+    x = asarray(x)
+    return where(numpy.triu(numpy.ones(x.shape[-2:], dtype=bool), k), x, zeros_like(x))
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
     """Entries by their place; places that depend on numbers choose from a table of constants, or one by one."""
     x, indices = asarray(x), asarray(indices)
+    if indices.dtype == bool:
+        raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
     graph, rows = _OPEN.get(), numpy.moveaxis(x.nodes, axis, -1)
     choices = rows.reshape(-1, rows.shape[-1])
     taken = [
@@ -339,21 +367,24 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
 
 
 def _chosen(graph: Graph, row: list[int], index: int) -> int:
-    values = [graph.values[node] for node in row]
-    if graph.values[index] is not None:
-        return row[int(graph.values[index] or 0.0)]
+    values, known = [graph.values[node] for node in row], graph.values[index]
+    if known is not None:
+        return row[int(known)]
     if None not in values and not builtins.any(graph.logical[node] for node in row):
         return graph.take(numpy.array(values, dtype=float), index)
+    # As a table is read: a negative index counts from the last, one outside is that of the nearest end.
+    from_end = graph.node("add", index, graph.constant(len(row)))
+    index = graph.node("where", graph.node("less", index, graph.constant(0.0)), from_end, index)
     chosen = row[0]
     for place, node in enumerate(row[1:], 1):
-        here = graph.node("equal", index, graph.constant(float(place)))
+        here = graph.node("greater_equal", index, graph.constant(place))
         chosen = graph.node("where", here, node, chosen)
     return chosen
 
 
-def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
+def _reduction(operation: Callable[..., Any], of_numbers: Any = False) -> Callable[..., Traced]:
     def function(x: Any, /, *, axis: int | tuple[int, ...] | None = None, keepdims: Any = False) -> Traced:
-        x = asarray(x)
+        x = _numbers(asarray(x)) if of_numbers else asarray(x)
         axes = tuple(range(x.ndim)) if axis is None else axis if isinstance(axis, tuple) else (axis,)
         moved = numpy.moveaxis(x.nodes, axes, range(len(axes)))
         parts = moved.reshape(-1, *moved.shape[len(axes) :])
@@ -363,7 +394,7 @@ def _reduction(operation: Callable[..., Any]) -> Callable[..., Traced]:
     return function
 
 
-sum, prod, max, min = (_reduction(o) for o in (add, multiply, maximum, minimum))
+sum, prod, max, min = (_reduction(o, of_numbers=True) for o in (add, multiply, maximum, minimum))
 any, all = _reduction(logical_or), _reduction(logical_and)
 
 
@@ -380,6 +411,8 @@ def matmul(a: Any, b: Any, /) -> Traced:
     """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out."""
     a, b = asarray(a), asarray(b)
     left, right = (a[None] if a.ndim == 1 else a), (b[:, None] if b.ndim == 1 else b)
+    if left.shape[-1] != right.shape[-2]:
+        raise ValueError(f"matrices of {a.shape} and {b.shape} have no product")
     product = functools.reduce(
         add, (left[..., :, k, None] * right[..., k, None, :] for k in range(left.shape[-1]))
     )

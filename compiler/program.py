@@ -4,6 +4,7 @@ An expression is a number: its place in the :class:`Graph`. One that is made aga
 subexpressions), one of constants is computed at once, and what no result needs never enters a program.
 """
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -61,9 +62,11 @@ class Graph:
         arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
         values: value of a constant, None of what varies.
         tables: what ``take`` reads, ``(length,)`` each.
+        lock: held by whoever adds expressions.
     """
 
     def __init__(self) -> None:
+        self.lock = threading.RLock()
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
@@ -95,8 +98,9 @@ class Graph:
 
     def take(self, table: numpy.ndarray, index: int) -> int:
         """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
-        if self.values[index] is not None:
-            return self.constant(table[int(self.values[index] or 0.0)])
+        known = self.values[index]
+        if known is not None:
+            return self.constant(table[int(known)])
         key = ("table", table.tobytes())
         if key not in self._found:
             self._found[key] = len(self.tables)
@@ -130,6 +134,9 @@ class Graph:
             if values[0] is not None:
                 return arguments[1 if values[0] else 2]
             return arguments[1] if arguments[1] == arguments[2] else None
+        if name in ("maximum", "minimum"):
+            # The code takes the other one where a comparison is false: of a constant it must be a number.
+            return next((a for a, v in zip(arguments, values, strict=True) if v is not None and v != v), None)
         if name == "negative":
             inner = arguments[0]
             return self.arguments[inner][0] if self.operations[inner] == "negative" else None

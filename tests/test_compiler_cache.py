@@ -1,0 +1,220 @@
+"""What compiled code is kept for: the next process, and nothing that goes wrong on the way is anybody's trouble."""
+
+import errno
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from filtergym.compiler import cache, native
+from filtergym.compiler.functions import Function
+from filtergym.compiler.program import Graph
+
+pytest.importorskip("llvmlite")
+
+NUMBERS = np.linspace(0.0, 7.0, 8)
+TIME = 1_700_000_000
+"""Seconds, long ago."""
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """Folder of the cache; not there yet."""
+    monkeypatch.setenv(cache.SWITCH, str(tmp_path / "above" / "compiled"))
+    return tmp_path / "above" / "compiled"
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    """Load a small program as a new process would; returns how often it was compiled."""
+    compiled = []
+    monkeypatch.setattr(
+        cache, "keep", lambda name, code, keep=cache.keep: (compiled.append(name), keep(name, code))
+    )
+
+    def load():
+        monkeypatch.setattr(native, "_LOADED", {})
+        compiled.clear()
+        result = Function(lambda x: x * 2.5 + x, Graph())(NUMBERS)
+        np.testing.assert_array_equal(result, NUMBERS * 2.5 + NUMBERS)
+        return len(compiled)
+
+    return load
+
+
+def files(place):
+    return sorted(path.name for path in place.iterdir())
+
+
+def test_the_next_process_need_not_compile(place, loaded):
+    assert loaded() == 1
+    assert len(files(place)) == 1
+    assert loaded() == 0
+    assert len(files(place)) == 1
+    if os.name == "posix":  # nobody else may write what is going to be executed
+        assert place.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda whole: b"",
+        lambda whole: whole[:20],
+        lambda whole: whole[:-1],
+        lambda whole: whole + b"more",
+        lambda whole: whole[:100] + bytes([whole[100] ^ 1]) + whole[101:],
+        lambda whole: bytes([whole[0] ^ 1]) + whole[1:],
+    ],
+    ids=["empty", "beginning", "truncated", "longer", "changed", "other checksum"],
+)
+def test_a_damaged_entry_is_replaced(place, loaded, damage):
+    loaded()
+    entry = next(place.iterdir())
+    whole = entry.read_bytes()
+    entry.write_bytes(damage(whole))
+    assert loaded() == 1
+    assert hashlib.sha256(entry.read_bytes()[32:]).digest() == entry.read_bytes()[:32]
+    assert loaded() == 0
+
+
+def test_off_keeps_nothing(tmp_path, loaded, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(cache.SWITCH, "off")
+    assert cache.folder() is None
+    assert [loaded(), loaded()] == [1, 1]
+    assert not files(tmp_path)
+
+
+def test_the_default_folder_is_the_users(monkeypatch):
+    platformdirs = pytest.importorskip("platformdirs")
+    monkeypatch.delenv(cache.SWITCH, raising=False)
+    assert cache.folder().is_relative_to(platformdirs.user_cache_path("filtergym"))
+
+
+def test_a_folder_that_is_a_file_is_left_alone(place, loaded):
+    place.parent.mkdir()
+    place.write_text("mine")
+    assert [loaded(), loaded()] == [1, 1]
+    assert place.read_text() == "mine"
+
+
+def refuse(*_, **__):
+    raise PermissionError(errno.EACCES, "refused")
+
+
+@pytest.mark.parametrize("call", ["pathlib.Path.mkdir", "tempfile.mkstemp", "os.replace"])
+def test_a_folder_that_cannot_be_written_is_no_trouble(place, loaded, call, monkeypatch):
+    monkeypatch.setattr(call, refuse)
+    assert [loaded(), loaded()] == [1, 1]
+    assert not place.exists() or not files(place)
+
+
+def test_a_folder_that_cannot_be_read_is_no_trouble(place, loaded, monkeypatch):
+    loaded()
+    monkeypatch.setattr("pathlib.Path.read_bytes", refuse)
+    assert loaded() == 1
+
+
+def test_an_entry_that_cannot_be_touched_is_used(place, loaded, monkeypatch):
+    loaded()
+    monkeypatch.setattr("os.utime", refuse)
+    assert loaded() == 0
+
+
+def test_a_full_disk_leaves_no_partial_file(place, loaded, monkeypatch):
+    class Full:
+        def __init__(self, handle, mode):
+            os.close(handle)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def write(self, _):
+            raise OSError(errno.ENOSPC, "no space left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fdopen", Full)
+        assert loaded() == 1
+        assert not files(place)
+    assert [loaded(), loaded()] == [1, 0]
+
+
+def test_the_folder_stays_below_its_limit_and_what_was_used_stays(place, monkeypatch):
+    monkeypatch.setattr(cache, "LIMIT", 1000)
+    for age, name in enumerate(("c", "b", "a")):
+        cache.keep(name, b"." * 268)  # 300 with its checksum
+        os.utime(place / f"{name}{cache.SUFFIX}", (TIME - age, TIME - age))
+    assert cache.kept("a") == b"." * 268  # the oldest, but used: now the youngest
+    (place / "mine.txt").write_bytes(b"." * 5000)
+    os.utime(place / "mine.txt", (0, 0))
+    cache.keep("d", b"." * 268)
+    assert [name for name in "abcd" if cache.kept(name) is not None] == ["a", "c", "d"]
+    # What is not the cache's own does not count and does not go.
+    assert (place / "mine.txt").exists()
+    cache.keep("e", b"." * 2000)
+    assert files(place) == ["mine.txt"]
+
+
+def test_names_tell_texts_apart():
+    names = {
+        cache.key(*texts)
+        for texts in (("a", "b"), ("ab",), ("a", "b", ""), ("", "ab"), ("b", "a"), ("1:a", "b"))
+    }
+    assert len(names) == 6
+
+
+def test_code_is_that_of_one_processor(place, loaded, monkeypatch):
+    name, features = native.processor()
+    assert loaded() == 1
+    monkeypatch.setattr(native, "processor", lambda: (name, f"{features},+one-more"))
+    kind = native.llvm().Target.from_default_triple()
+    monkeypatch.setattr(native, "_target", lambda: kind.create_target_machine(cpu=name, features=features))
+    assert loaded() == 1
+    monkeypatch.setattr(native, "processor", lambda: ("another", features))
+    assert loaded() == 1
+    assert len(files(place)) == 3
+
+
+SCRIPT = """
+import sys, numpy
+from filtergym.compiler import cache, namespace
+from filtergym.compiler.functions import Function
+from filtergym.compiler.program import Graph
+print("ready", flush=True)
+sys.stdin.readline()
+compiled = []
+keep = cache.keep
+cache.keep = lambda *entry: (compiled.append(entry), keep(*entry))
+result = Function(lambda x: namespace.exp(x) * namespace.sin(x) / 3.0 + x, Graph())(numpy.arange(16.0))
+print(len(compiled), result.tobytes().hex())
+"""
+
+
+def test_processes_that_compile_the_same_at_once_share_one_entry(place):
+    def started(seed):
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        return subprocess.Popen(
+            [sys.executable, "-c", SCRIPT],
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+
+    both = [started(seed) for seed in "12"]
+    for process in both:
+        assert process.stdout.readline() == "ready\n"
+    for process in both:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    answers = [process.communicate(timeout=60)[0].split() for process in both]
+    assert [process.returncode for process in both] == [0, 0]
+    assert answers[0][1] == answers[1][1]
+    assert len(files(place)) == 1
+    later = started("3").communicate("go\n", timeout=60)[0].split()
+    assert later[1:] == ["0", answers[0][1]]

@@ -1,0 +1,240 @@
+"""Programs against NumPy: whatever is traced, folded, cut into parts and compiled has the bits of the same function."""
+
+import numpy as np
+import pytest
+from filtergym.compiler import cache, emission, functions, namespace
+from filtergym.compiler.emission import emitted
+from filtergym.compiler.functions import Function, Specialised
+from filtergym.compiler.library import portable
+from filtergym.compiler.program import Graph
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("llvmlite")
+
+WIDTHS = (8, 16, 24, 520)
+ONE = ("sqrt", "abs", "sign", "negative", "floor", "ceil", "trunc", "round")
+TWO = ("add", "multiply", "divide")
+COMPARED = ("less", "less_equal", "greater", "greater_equal", "equal", "not_equal")
+LOGICAL = ("logical_and", "logical_or", "logical_not")
+CHOICES = ("where", "where of truths", "number of truth")
+WITHOUT_CONSTANTS = (*ONE, *TWO, *COMPARED, *LOGICAL, *CHOICES, "add the negative")
+WITH_CONSTANTS = (*ONE, *TWO, *COMPARED, *LOGICAL, *CHOICES, "subtract", "maximum", "minimum")
+CONSTANTS = (0.0, 1.0, -1.0, -0.0, 0.3, True, False)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_kept(monkeypatch):
+    monkeypatch.setenv(cache.SWITCH, "off")
+
+
+def recipes(names):
+    """Random straight lines: names of operations, each with the places of its operands, counted backwards."""
+    operand = st.integers(0, 30)
+    return st.lists(st.tuples(st.sampled_from(names), operand, operand, operand), min_size=15, max_size=40)
+
+
+def followed(recipe, xp, floats, whole, truth, constants=()):
+    """Numbers and truth values that a recipe makes of rows of floats, of whole numbers and of truth values."""
+    numbers, truths = [*floats, xp.astype(whole, xp.float64)], [truth]
+    for value in constants:
+        (truths if isinstance(value, bool) else numbers).append(xp.asarray(value))
+    for name, *places in recipe:
+        a, b, _ = (numbers[-1 - place % len(numbers)] for place in places)
+        p, q, r = (truths[-1 - place % len(truths)] for place in places)
+        if name in ONE:
+            numbers.append(getattr(xp, name)(a))
+        elif name == "add the negative":  # a difference of the same thing would be folded to zero
+            numbers.append(a + -b)
+        elif name == "where":
+            numbers.append(xp.where(r, a, b))
+        elif name == "where of truths":
+            truths.append(xp.where(p, q, r))
+        elif name == "number of truth":
+            numbers.append(xp.astype(p, xp.float64))
+        elif name == "logical_not":
+            truths.append(~p)
+        elif name in LOGICAL:
+            truths.append(getattr(xp, name)(p, q))
+        else:
+            (truths if name in COMPARED else numbers).append(getattr(xp, name)(a, b))
+    return numbers, truths
+
+
+def leaves(special):
+    """Rows of floats, of whole numbers and of truth values, as wide as the widest."""
+    rng = np.random.default_rng(5)
+    floats = np.where(
+        rng.random((3, WIDTHS[-1])) < 0.5,
+        rng.normal(size=(3, WIDTHS[-1])),
+        rng.integers(-3, 4, (3, WIDTHS[-1])),
+    )
+    if special:
+        values = [np.nan, np.inf, -np.inf, 0.0, -0.0, 5e-324, -1e-310, 1e300]
+        floats = np.where(rng.random(floats.shape) < 0.3, rng.choice(values, floats.shape), floats)
+    return floats, rng.integers(-3, 4, WIDTHS[-1]), rng.random(WIDTHS[-1]) < 0.5
+
+
+def computed(recipe, arrays, part, constants=()):
+    """Yield what compiled code makes of a recipe: width, numbers and truth values, for all widths and threads."""
+
+    def function(*arrays):
+        numbers, truths = followed(recipe, namespace, *arrays, constants)
+        return tuple(numbers), tuple(truths)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(emission, "PART", part)
+        patch.setattr(functions, "FEWEST", 8)
+        compiled = Function(function, Graph())
+        for width in WIDTHS:
+            for threads in (1, 2):
+                yield width, *compiled(*(array[..., :width] for array in arrays), threads=threads)
+
+
+@pytest.mark.parametrize("part", [3, 7, 100])
+@settings(max_examples=25)
+@given(recipe=recipes(WITHOUT_CONSTANTS))
+def test_random_programs_have_numpys_bits_also_of_what_is_not_finite(part, recipe):
+    arrays = leaves(special=True)
+    with np.errstate(all="ignore"):
+        numbers, truths = followed(recipe, np, *arrays)
+    for width, made, decided in computed(recipe, arrays, part):
+        for expected, result in zip(numbers, made, strict=True):
+            np.testing.assert_array_equal(result, expected[:width])
+            known = ~np.isnan(result)
+            np.testing.assert_array_equal(np.signbit(result)[known], np.signbit(expected[:width])[known])
+        for expected, result in zip(truths, decided, strict=True):
+            assert result.dtype == bool
+            np.testing.assert_array_equal(result, expected[:width])
+
+
+@pytest.mark.parametrize("part", [3, 7, 100])
+@settings(max_examples=25)
+@given(recipe=recipes(WITH_CONSTANTS))
+def test_random_programs_with_constants_are_numpys_where_all_is_finite(part, recipe):
+    arrays = leaves(special=False)
+    with np.errstate(all="ignore"):
+        numbers, truths = followed(recipe, np, *arrays, CONSTANTS)
+    numbers, truths = ([np.broadcast_to(row, WIDTHS[-1]) for row in rows] for rows in (numbers, truths))
+    finite = np.isfinite(numbers).all(axis=0)
+    for width, made, decided in computed(recipe, arrays, part, CONSTANTS):
+        for expected, result in zip([*numbers, *truths], [*made, *decided], strict=True):
+            # Zeros may differ in their signs, which nothing but infinities would show.
+            np.testing.assert_array_equal(result[finite[:width]], expected[:width][finite[:width]])
+
+
+# --- what becomes of a function
+
+
+def traced(function, *shapes):
+    """Program of a function of float arrays with these shapes, beside their lanes."""
+    return Specialised(function, Graph(), [np.zeros((*shape, 8)) for shape in shapes]).program
+
+
+def operations(function, *shapes):
+    return [step.operation for step in traced(function, *shapes).steps if step.operation != "input"]
+
+
+def test_what_no_result_needs_is_not_computed():
+    def function(x):
+        namespace.exp(x) + namespace.sin(x)
+        return x * x
+
+    assert operations(function, ()) == ["multiply"]
+
+
+def test_constants_are_computed_while_tracing():
+    def function(x):
+        steps = namespace.asarray([1.0, 2.0])
+        return x * namespace.sum(namespace.exp(steps) @ namespace.eye(2) * 3.0 - 1.0)
+
+    program = traced(function, ())
+    assert [step.operation for step in program.steps] == ["input", "constant", "multiply"]
+    np.testing.assert_allclose(program.constants, [np.sum(np.exp([1.0, 2.0]) * 3.0 - 1.0)], rtol=1e-15)
+
+
+def test_the_same_thing_is_computed_once_in_either_order():
+    assert operations(lambda x, y: (x + y) * (y + x) / (x + y), (), ()) == ["add", "multiply", "divide"]
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda x, truth: x * 1.0, []),
+        (lambda x, truth: 1 * x, []),
+        (lambda x, truth: x + 0.0, []),
+        (lambda x, truth: 0 + x, []),
+        (lambda x, truth: x - 0.0, []),
+        (lambda x, truth: x / 1.0, []),
+        (lambda x, truth: namespace.negative(-x), []),
+        (lambda x, truth: x * -1.0, ["negative"]),
+        (lambda x, truth: 0.0 - x, ["negative"]),
+        (lambda x, truth: x * 0.0, ["constant"]),
+        (lambda x, truth: 0 * namespace.exp(x), ["constant"]),
+        (lambda x, truth: 0.0 / x, ["constant"]),
+        (lambda x, truth: x - x, ["constant"]),
+        (lambda x, truth: namespace.where(True, x, namespace.exp(x)), []),
+        (lambda x, truth: namespace.where(False, namespace.exp(x), x), []),
+        (lambda x, truth: namespace.where(truth, x, x), []),
+        (lambda x, truth: namespace.maximum(x, np.nan), ["constant"]),
+        (lambda x, truth: truth & True, []),
+        (lambda x, truth: truth | True, ["constant"]),
+        (lambda x, truth: truth & False, ["constant"]),
+        (lambda x, truth: False | truth, []),
+        (lambda x, truth: truth & truth, []),
+    ],
+)
+def test_less_work_for_the_same_finite_numbers(function, expected):
+    arrays = np.linspace(-2.0, 3.0, 8), np.arange(8) % 3 == 0
+    special = Specialised(function, Graph(), arrays)
+    assert [step.operation for step in special.program.steps if step.operation != "input"] == expected
+    result = Function(function, Graph())(*arrays)
+    with np.errstate(divide="ignore"), pytest.MonkeyPatch.context() as patch:
+        for name in ("where", "exp", "maximum", "negative"):
+            patch.setattr(namespace, name, getattr(np, name))
+        np.testing.assert_array_equal(result, function(*arrays))
+
+
+def test_a_product_with_zeros_of_a_matrix_vanishes():
+    transition = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.9]])
+    assert sorted(operations(lambda x: namespace.asarray(transition) @ x, (3,))) == [
+        "add",
+        "constant",
+        "constant",
+        "multiply",
+        "multiply",
+    ]
+    special = Function(lambda x: namespace.asarray(transition) @ x, Graph())
+    x = np.random.default_rng(0).normal(size=(3, 8))
+    np.testing.assert_allclose(special(x), transition @ x, rtol=1e-15)
+    x[2, 5] = np.nan  # what no zero lets through
+    assert np.isnan(special(x)).sum() == 1
+
+
+def test_functions_that_differ_only_in_numbers_have_the_same_text():
+    def text(gain, table):
+        def function(x):
+            index = namespace.astype(x > gain, namespace.int64)
+            return gain * x + namespace.asarray(table)[index]
+
+        special = Specialised(function, Graph(), [np.zeros(8)])
+        return emitted(special.program, special.lane_first, portable()), special.program.constants
+
+    (one, values), (other, others) = text(0.3, [1.5, 2.5]), text(0.7, [3.5, np.nan])
+    assert one == other
+    assert not np.array_equal(values, others)
+    assert one != text(1.0, [1.5, 2.5])[0]  # a product with one is less work
+
+
+def test_places_of_what_crosses_cuts_are_used_again(monkeypatch):
+    monkeypatch.setattr(emission, "PART", 10)
+
+    def function(x):
+        for _ in range(100):
+            x = namespace.sqrt(x * x + 1.0) / 3.0
+        return x
+
+    special = Specialised(function, Graph(), [np.zeros(8)])
+    text = emitted(special.program, special.lane_first, portable())
+    assert "@part39" in text
+    assert "%scratch = alloca <8 x double>, i64 2," in text
