@@ -236,7 +236,8 @@ def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
         for _ in range(count):
             env.step(action)
 
-    return Episodes(lambda: env.reset(seed=0), steps, env.unwrapped.lanes.decisions_per_episode)
+    env.reset(seed=0)
+    return Episodes(env.reset, steps, env.unwrapped.lanes.decisions_per_episode)
 
 
 def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episodes:
@@ -252,7 +253,8 @@ def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episode
             observation, reward, *_ = env.step(action)
         float(observation[0, 0] + reward[0])  # waits for a device that runs behind
 
-    return Episodes(lambda: env.reset(seed=0), steps, env.unwrapped.last_decision + 1)
+    env.reset(seed=0)  # later resets go on with the same generators, as an autoreset does
+    return Episodes(env.reset, steps, env.unwrapped.last_decision + 1)
 
 
 def measure(episodes: Episodes, share: float, dearest: float) -> tuple[list[tuple[float, float]], float]:

@@ -224,8 +224,8 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
 
 def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
     """Memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
-    # Rows a power of two apart would share the same few places of the cache.
-    stride = width + (LANES if width % 512 == 0 else 0)
+    # An odd number of cache lines: rows a power of two apart would share the same few places of the cache.
+    stride = width + (LANES if width // LANES % 2 == 0 else 0)
     memory = numpy.empty(math.prod(shape) * stride + LANES)
     start = -address_of(memory) // memory.itemsize % LANES
     return memory[start : start + math.prod(shape) * stride].reshape(*shape, stride)[..., :width]
