@@ -371,6 +371,26 @@ def measured(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[
         print(f"Peer, filterpy IMMEstimator in a loop: {rate:.0f} steps per second of processor time.")
 
 
+def markdown(rows: list[Row]) -> Iterator[str]:
+    """Table of a page: a line for each environment, control and backend."""
+    sizes = sorted({row.size for row in rows})
+    head = ["environment", "control", "backend", "one step of `gymnasium.make`, µs"]
+    head += [*(f"N = {size}" for size in sizes), "share of the floor", "times the peer"]
+    yield f"| {' | '.join(head)} |"
+    yield "|" + "---|" * len(head)
+    kinds = dict.fromkeys((r.environment, r.control, r.backend.removeprefix("make ")) for r in rows)
+    for environment, control, backend in kinds:
+        mine = [r for r in rows if (r.environment, r.control) == (environment, control)]
+        alone = [f"{1e6 * r.step_seconds:.0f}" for r in mine if r.backend == f"make {backend}"]
+        vectors = {r.size: r for r in mine if r.backend == backend}
+        largest = vectors[max(vectors)]
+        share = "" if largest.floor is None else f"{largest.processor_rate / largest.floor:.0%}"
+        peer = "" if largest.times_peer is None else f"{largest.times_peer:.0f}"
+        rates = [f"{vectors[size].processor_rate / 1e6:.3g}" if size in vectors else "" for size in sizes]
+        name = environment.removeprefix("filtergym/")
+        yield f"| {' | '.join([name, control, backend, *(alone or ['']), *rates, share, peer])} |"
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description="Throughput of the environments.")
@@ -380,6 +400,7 @@ def main() -> None:
         "--seconds", type=float, default=120.0, help="time for all rounds together (default 120)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows to this file")
+    parser.add_argument("--markdown", action="store_true", help="end with a table of rates for a page")
     arguments = parser.parse_args()
     ids = arguments.environment or list(catalogue())
     unknown = [id for id in ids if id not in catalogue()]
@@ -408,6 +429,8 @@ def main() -> None:
         _show(row)
         rows.append(row)
     print(f"Measured in {time.perf_counter() - begin:.0f} s.")
+    if arguments.markdown:
+        print(*markdown(rows), sep="\n")
     if arguments.json:
         versions = {"python": platform.python_version(), "numpy": numpy.__version__}
         versions |= {} if torch is None else {"torch": torch.__version__}

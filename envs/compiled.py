@@ -40,7 +40,7 @@ AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 REPORTS = ("observe", "mean", "cost", "error", "covariance", "track", "records")
 """Methods of a task that are compiled as they are."""
 TILE = 1024
-"""Lanes that go through both halves of a step before the next: they stay in the second-level cache."""
+"""Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
 REMEMBERED = 8
 """Tasks whose programs a process keeps."""
 MANY = 64
