@@ -186,8 +186,8 @@ def load_sb3_policy(
             with found.open("rb") as file:
                 normalisation = pickle.load(file)
             normalisation.training = False
-        looked = ", ".join(map(str, places))
-        return Sb3Policy(model, normalisation, control, f"model {path} (looked for {looked})")
+        looked = ", ".join(place.relative_to(path.parent).as_posix() for place in places)
+        return Sb3Policy(model, normalisation, control, f"model {path} (beside it looked for {looked})")
     except Exception as error:  # unpickling a corrupt file stumbles over anything
         raise ValueError(f"cannot read the model {path}: {error}") from error
 

@@ -172,7 +172,9 @@ class TestNormalisation:
             "evaluate", ID, "--policy", file, "--trust", "--episodes", 2, "--set", "horizon=8"
         )
         assert (code, errors.count("\n")) == (0, 1)
-        assert errors.startswith(f"Warning: model {file} (looked for ")
+        assert errors.startswith(
+            f"Warning: model {file} (beside it looked for vecnormalize.pkl, model/vecnormalize.pkl"
+        )
 
 
 ALGORITHMS = [
