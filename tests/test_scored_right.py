@@ -333,16 +333,31 @@ class TestMadePolicy:
             found = looped(made, [int(seed) for seed in dataset["episode_seed"]])
             np.testing.assert_array_equal(found, dataset["cost"].values.ravel())
 
+    def test_the_first_call_begins_an_episode(self):
+        policy = make_policy(ID, Sluggish)
+        shown = np.zeros((2, len(policy.task.fields)))
+        expected = np.full((2, 1), np.tanh(0.9 * 3.0))
+        for state in (None, policy.begin([0, 1])):
+            action, after = policy.predict(shown, state)
+            np.testing.assert_array_equal(action, expected)
+            np.testing.assert_array_equal(
+                policy.predict(shown, after)[0], np.tanh(0.9 * 0.9 * 3.0) + np.zeros((2, 1))
+            )
+
     @pytest.mark.parametrize("name", ["adaptive", "bptt"])
     def test_batches_and_episodes_that_begin_at_different_times(self, name):
         env = gymnasium.make_vec(ID, num_envs=11, autoreset_mode="SameStep", detailed_info=True, **SHORT)
         policy = make_policy(env, name)
         observation, _ = env.reset(seed=0, options={"shortened_by": np.arange(11)})
         state, start, actions = None, np.ones(11, dtype=bool), []
+        inner, memory = competitor(ID, name)(env.unwrapped.task), None
         alone = [make_policy(env, name) for _ in range(11)]
         states = [None] * 11
         for _ in range(40):
             action, state = policy.predict(observation, state, start)
+            expected, memory = inner.predict(observation, memory, start)
+            # A batch of another size: matrix products may round otherwise.
+            np.testing.assert_allclose(action, expected, rtol=1e-6, atol=1e-6)
             for i, one in enumerate(alone):
                 single, states[i] = one.predict(observation[i], states[i], start[i])
                 np.testing.assert_array_equal(single, action[i])
