@@ -12,8 +12,10 @@ _HOMES = {
     "LearnedPolicy": "learned_policy",
     "ResidualActions": "residual",
     "ResidualPolicy": "residual",
+    "Sb3Policy": "sb3_policy",
+    "load_sb3_policy": "sb3_policy",
 }
-__all__ = ["LearnedPolicy", "ResidualActions", "ResidualPolicy", "to_sb3"]
+__all__ = ["LearnedPolicy", "ResidualActions", "ResidualPolicy", "Sb3Policy", "load_sb3_policy", "to_sb3"]
 
 
 def __getattr__(name: str) -> Any:

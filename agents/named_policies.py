@@ -1,9 +1,11 @@
-"""Policies that an evaluation finds by name or file: shipped agents, exported ones, and models' zips."""
+"""Policies that an evaluation finds by name, file or folder: shipped agents, exported ones, models' zips, and runs."""
 
 from pathlib import Path
 from typing import Any
 
+from ..envs.catalogue import task_class
 from .learned_policy import pretrained_path, stored_policy
+from .training_run import best_agent, load_run
 
 
 def shipped_agents(id: str) -> list[str]:
@@ -16,22 +18,53 @@ def learned_policy(id: str, name: str, trust: bool = False) -> Any:
 
     Args:
         id: environment id.
-        name: of a shipped agent (``ppo``, ``bptt``), or a file: ``.safetensors``, or the ``.zip`` of a
-            Stable-Baselines3 model, which can execute code while it is loaded.
+        name: of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
+            Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, which
+            means its best agent.
         trust: load such a zip.
 
     Raises:
-        ValueError: if the file is not what its name says, or takes ``trust``.
+        ValueError: if the file or folder is not what its name says, or takes ``trust``.
     """
+    if name in shipped_agents(id):
+        return stored_policy(id, pretrained_path(id, name))
+    path = Path(name)
+    if path.is_dir():
+        return _agent_of_run(id, path, trust)
     if name.endswith(".safetensors"):
-        return stored_policy(id, Path(name))
-    if name.endswith(".zip"):
-        try:
-            from .sb3_training import load_sb3_policy
-        except ImportError as error:
-            raise ValueError(
-                f"policy {name!r} needs more packages: pip install 'filtergym[agents]'"
-            ) from error
-        return load_sb3_policy(Path(name), trust=trust)
-    shipped = pretrained_path(id, name)
-    return stored_policy(id, shipped) if shipped.exists() else None
+        return stored_policy(id, path)
+    return _model(id, path, None, trust) if name.endswith(".zip") else None
+
+
+def _model(id: str, path: Path, control: str | None, trust: bool) -> Any:
+    try:
+        from .sb3_policy import load_sb3_policy
+    except ImportError as error:
+        raise ValueError(f"policy '{path}' needs more packages: pip install 'filtergym[agents]'") from error
+    return load_sb3_policy(path, task_class(id).id, control, trust=trust)
+
+
+def _agent_of_run(id: str, folder: Path, trust: bool) -> Any:
+    """Load the best agent of a run, of ``filtergym train`` or of rl-zoo3: as plain arrays where there are any."""
+    if not (folder / "run.json").exists():
+        # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
+        for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
+            if (folder / f"{name}.zip").is_file():
+                return _model(id, folder / f"{name}.zip", None, trust)
+    run = load_run(folder, trust)
+    agent = best_agent(folder)
+    if agent.suffix == ".safetensors":
+        return stored_policy(id, agent)
+    own = run.environment.rpartition(":")[2]
+    if own != task_class(id).id:
+        raise ValueError(f"{folder} holds a run of {own}, not of {task_class(id).id}")
+    return _model(id, agent, run.control, trust)
+
+
+def with_normalisation(found: Any) -> Any:
+    """Return a model of Stable-Baselines3 with the normalisation that it was trained with; whatever else as it is."""
+    if isinstance(found, type) or not hasattr(found, "get_vec_normalize_env"):
+        return found
+    from .sb3_policy import Sb3Policy
+
+    return Sb3Policy(found)

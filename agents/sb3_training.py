@@ -24,7 +24,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import VecNormalize
 
 from ..envs.catalogue import make_task
@@ -32,6 +31,7 @@ from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .learned_policy import write_arrays
 from .network_arrays import network_arrays
+from .sb3_policy import Sb3Policy
 from .training_run import Bookkeeping, TrainingRun, check_trust, interruption, learning_rate_schedule
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -43,76 +43,6 @@ SPACES: dict[str, tuple[type[gymnasium.Space], ...]] = {
     "sac": (gymnasium.spaces.Box,),
     "dqn": (gymnasium.spaces.Discrete,),
 }
-
-
-class Sb3Policy:
-    """A trained model with the normalisation of its observations, as a policy for an evaluation."""
-
-    def __init__(self, model: BaseAlgorithm, normalisation: VecNormalize | None, control: str | None = None):
-        self.model, self.normalisation = model, normalisation
-        self.observation_space, self.action_space = model.observation_space, model.action_space
-        if control is not None:
-            self.control = control
-
-    def predict(
-        self,
-        observation: numpy.ndarray,
-        state: Any = None,
-        episode_start: numpy.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[numpy.ndarray, Any]:
-        """Choose actions, as Stable-Baselines3 does."""
-        if self.normalisation is not None:
-            normalised: Any = self.normalisation.normalize_obs(observation)
-            observation = normalised
-        return self.model.predict(observation, state, episode_start, deterministic)
-
-
-def load_sb3_policy(
-    path: Path, algorithm: str | None = None, control: str | None = None, *, trust: bool = False
-) -> Sb3Policy:
-    """Load a model's zip, with its ``vecnormalize.pkl`` if there is one: beside it, or where rl-zoo3 puts it.
-
-    Args:
-        path: of the zip.
-        algorithm: one of ``ALGORITHMS``; default: by the class of the model's policy.
-        control: that the model steers; default: the one that fits its action space.
-        trust: both files can execute code while they are loaded, and are not without this.
-
-    Raises:
-        ValueError: if there is no such file, it is not trusted, or not a model.
-    """
-    if not path.is_file():
-        raise ValueError(f"no model at {path}")
-    check_trust(f"model {path} is loaded with pickle", trust)
-    try:
-        if algorithm is None:
-            data = load_from_zip_file(path, device="cpu")[0] or {}
-            base = {c.__name__ for c in data["policy_class"].__mro__}
-            algorithm = next(
-                name
-                for name, policy in (
-                    ("recurrent-ppo", "RecurrentActorCriticPolicy"), ("ppo", "ActorCriticPolicy"),
-                    ("sac", "SACPolicy"), ("dqn", "DQNPolicy"),
-                )
-                if policy in base
-            )  # fmt: skip
-        model = ALGORITHMS[algorithm].load(path, device="cpu")
-        normalisation = None
-        # rl-zoo3: ENV_1/ENV.zip and ENV_1/ENV/vecnormalize.pkl.
-        for place in (path.parent, path.parent / path.parent.name.rpartition("_")[0]):
-            if (place / "vecnormalize.pkl").exists():
-                with (place / "vecnormalize.pkl").open("rb") as file:
-                    normalisation = pickle.load(file)
-                normalisation.training = False
-                break
-    except StopIteration as error:
-        raise ValueError(
-            f"{path} is a model of an algorithm that is not one of {', '.join(ALGORITHMS)}"
-        ) from error
-    except Exception as error:  # unpickling a corrupt file stumbles over anything
-        raise ValueError(f"cannot read the model {path}: {error}") from error
-    return Sb3Policy(model, normalisation, control)
 
 
 class _Trainer(BaseCallback):

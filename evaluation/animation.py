@@ -8,8 +8,10 @@ from PIL import Image
 
 from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
-from .competitors import kind_of
+from .competitors import kind_of, made
+from .evaluate import control_of
 from .files import whole_file
+from .stepping import SteppingPolicy
 
 SHADES = 7
 """Steps from a colour of the figure to white, for smooth edges."""
@@ -36,13 +38,15 @@ def episode_frames(
         raise ValueError(f"every must be at least 1, got {every}")
     if kind_of(policy) != "policy":
         raise ValueError(f"{name!r} is no policy: it does not act in the environment")
-    control = getattr(policy, "control", None)
-    world = TaskEnv(task_class(env).id, control, scenario, render_mode="rgb_array", **keywords)
+    cls = task_class(env)
+    control = control_of(policy, "policy", None, cls, name)
+    keywords = {**getattr(policy, "task_keywords", {}), **keywords}
+    world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
-    actor = policy(world.task) if callable(policy) else policy
+    actor = SteppingPolicy(world.task, made(policy, world.task))
     observation, _ = world.reset(seed=seed)
-    frames, memory, finished = [Image.fromarray(_frame(world))], None, False
+    frames, memory, finished = [Image.fromarray(_frame(world))], actor.begin([seed]), False
     taken = 0
     while not finished:
         action, memory = actor.predict(observation, memory)

@@ -30,8 +30,19 @@ def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
     return check_competitor(name, competitor, kind)
 
 
-def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
-    """Control that a run uses: the policy's own, or the one that fits a model's action space."""
+def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
+    """Return the control that a run uses: the policy's own, or the one that fits a model's action space.
+
+    Args:
+        maker: of the competitor, or the competitor itself.
+        kind: what it is.
+        control: that is demanded; None demands none.
+        cls: the environment.
+        name: of the competitor, in errors.
+
+    Raises:
+        ValueError: if the competitor cannot act in the control that is demanded, or in none.
+    """
     if kind != "policy":
         return cls.controls[0]
     own = getattr(maker, "control", None)
@@ -46,6 +57,16 @@ def _control_of(maker: Any, kind: str, control: str | None, cls: type[Task], nam
     if control is not None and own != control:
         raise ValueError(f"policy {name!r} is made for control {own!r}, not {control!r}")
     return own
+
+
+def check_shown(task: Task, policy: Any, name: str) -> None:
+    """Raise ValueError if a model takes observations of another shape than the task shows."""
+    shown = getattr(getattr(policy, "observation_space", None), "shape", None)
+    if shown is not None and shown != (len(task.fields),):
+        raise ValueError(
+            f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
+            f"{len(task.fields)} fields"
+        )
 
 
 def _measured(task: Task, episode: Episode) -> dict[str, Any]:
@@ -160,17 +181,12 @@ def evaluate(
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
         tuned_keywords = getattr(maker, "task_keywords", {})
-        controls[name] = _control_of(maker, kinds[name], control, cls, name)
+        controls[name] = control_of(maker, kinds[name], control, cls, name)
         tasks[name] = task_on(
             backend, cls.id, controls[name], scenario, threads=threads, **{**tuned_keywords, **keywords}
         )
     for name, task in tasks.items():
-        shown = getattr(getattr(competitors[name], "observation_space", None), "shape", None)
-        if shown is not None and shown != (len(task.fields),):
-            raise ValueError(
-                f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
-                f"{len(task.fields)} fields"
-            )
+        check_shown(task, competitors[name], name)
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in competitors.items():

@@ -10,16 +10,13 @@ import numpy
 
 from ..compiler.functions import mapped
 from ..envs.compiled import Report
-from ..envs.environment import checked_action
 from ..envs.lanes import Lanes, padded_width
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
-from .competitors import Policy
+from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
 """Told the number of measurements just done."""
-MODEL_ROWS = 128
-"""Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
 
 
 def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
@@ -35,17 +32,6 @@ def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], N
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
     return lanes
-
-
-def _episodes_of_calls(policy: Any, lanes: Lanes) -> list[numpy.ndarray]:
-    """Episodes that each call of ``predict`` is shown, the last one repeated to fill up.
-
-    Matrix products round by their shape, and an episode must not depend on how many others there are: the rows
-    are as many as the engine's lanes, and for a model of Stable-Baselines3 always the same.
-    """
-    rows = MODEL_ROWS if hasattr(policy, "observation_space") else lanes.width
-    firsts = range(0, lanes.count, rows)
-    return [numpy.minimum(numpy.arange(first, first + rows), lanes.count - 1) for first in firsts]
 
 
 def run_policy(
@@ -67,21 +53,12 @@ def run_policy(
         tick: told of progress.
     """
     lanes = started_lanes(task, seeds)
-    calls = _episodes_of_calls(policy, lanes)
-    memories = [
-        policy.begin([seeds[i] for i in call]) if isinstance(policy, Policy) else None for call in calls
-    ]
-    first = True
+    stepping = SteppingPolicy(task, policy)
+    memory = stepping.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
-        shown = lanes.observe()
-        answers = []
-        for c, call in enumerate(calls):
-            start = numpy.full(len(call), first)
-            answer, memories[c] = policy.predict(shown[call], memories[c], start, deterministic=True)
-            answers.append(checked_action(task.action_space, answer, len(call)))
-        for found, _ in lanes.decide(numpy.concatenate(answers)[: lanes.count], report):
+        action, memory = stepping.predict(lanes.observe(), memory)
+        for found, _ in lanes.decide(action, report):
             record(found)
-        first = False
         tick(lanes.count * task.decision_interval)
 
 

@@ -14,10 +14,10 @@ from .envs.task import Task
 from .envs.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from .names import evaluate, tidy_records
+    from .names import evaluate, make_policy, tidy_records
 
 __version__ = "0.1.0"
-__all__ = ["Trajectory", "evaluate", "register", "register_task", "tidy_records"]
+__all__ = ["Trajectory", "evaluate", "make_policy", "register", "register_task", "tidy_records"]
 
 register()
 
@@ -47,7 +47,7 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
 
 def __getattr__(name: str) -> Any:
     # On first use: an evaluation brings xarray, and making environments needs none of it.
-    if name not in ("evaluate", "tidy_records"):
+    if name not in ("evaluate", "make_policy", "tidy_records"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import names
 

@@ -3,6 +3,7 @@
 import functools
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -82,7 +83,9 @@ def main() -> None:
     debug = "--debug" in sys.argv
     open_output()
     try:
-        application()([word for word in sys.argv[1:] if word != "--debug"])
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            application()([word for word in sys.argv[1:] if word != "--debug"])
     except Exception as error:
         if debug:
             raise
@@ -91,10 +94,19 @@ def main() -> None:
             text = f"Error: not enough memory, ask for less at once: {error}"
         elif not isinstance(error, ValueError | OSError | ImportError | gymnasium.error.Error):
             text, code = f"Error: unexpected {type(error).__name__}: {error}; {REPORT}", 1
-        Console(stderr=True, highlight=False, emoji=False).print(
-            text.replace("\n", " "), style="red", markup=False, soft_wrap=True
-        )
+        _print_error(text, "red")
         sys.exit(code)
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    _print_error(f"Warning: {message}", "yellow")
+
+
+def _print_error(text: str, style: str) -> None:
+    """Print one line to standard error."""
+    Console(stderr=True, highlight=False, emoji=False).print(
+        text.replace("\n", " "), style=style, markup=False, soft_wrap=True
+    )
 
 
 if __name__ == "__main__":

@@ -3,16 +3,20 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import gymnasium
 import xarray
 
-from .agents.named_policies import learned_policy, shipped_agents
+from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
-from .envs.catalogue import imported, nearest, task_class
+from .envs.catalogue import imported, make_task, nearest, task_class
+from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
-from .evaluation.competitors import check_competitor
+from .evaluation.competitors import check_competitor, kind_of, made
+from .evaluation.evaluate import check_shown, control_of
 from .evaluation.metrics import Record
 from .evaluation.rollout import Progress
+from .evaluation.stepping import SteppingPolicy
 
 
 def competitor(env: str, name: str, *, trust: bool = False) -> Any:
@@ -21,18 +25,20 @@ def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
-            ``.zip`` of a Stable-Baselines3 model), or ``module:Class`` of a user's.
+            ``.zip`` of a Stable-Baselines3 model), the folder of a training run, or ``module:Class`` of a user's.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
         ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
     id = task_class(env).id
-    if name in baselines_of(id).names or name.endswith("-tuned"):
+    if name in baselines.own_names(id):
         return baselines.own_competitor(id, name)
     learned = learned_policy(id, name, trust)
     if learned is not None:
         return learned
+    if name.endswith("-tuned"):
+        return baselines.own_competitor(id, name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
         raise nearest("policy", name, [*baselines.own_names(id), *shipped_agents(id)])
@@ -61,7 +67,8 @@ def evaluate(
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
             (:class:`~filtergym.evaluation.competitors.Policy`), or with ``start`` and ``update``
-            (:class:`~filtergym.evaluation.competitors.Estimator`); see :func:`competitor` for what a name can be.
+            (:class:`~filtergym.evaluation.competitors.Estimator`); see :func:`competitor` for what a name can be. A
+            model of Stable-Baselines3 is shown observations as its ``VecNormalize`` normalises them, if it holds one.
         scenario: name of a scenario or a trajectory; default: the environment's training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
@@ -85,10 +92,82 @@ def evaluate(
         if named[name] not in (name, competitor(id, name)):
             raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
     objects = {
-        name: competitor(env, entry, trust=trust) if isinstance(entry, str) else entry
+        name: competitor(env, entry, trust=trust) if isinstance(entry, str) else with_normalisation(entry)
         for name, entry in named.items()
     }
     return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
+
+
+def make_policy(
+    env: Any,
+    policy: Any,
+    control: str | None = None,
+    scenario: Any = None,
+    *,
+    trust: bool = False,
+    **keywords: Any,
+) -> SteppingPolicy:
+    """Make a policy to step an environment with: the paper's, a tuned one, an agent, or one of your own.
+
+    It has Stable-Baselines3's ``predict(observation, state, episode_start, deterministic)``, for one observation as for
+    a batch, and does in a loop of your own what it does in an evaluation.
+
+    Args:
+        env: an environment, single or native vector, in which the policy acts; or the id of one, which is then made
+            with ``gymnasium.make(id, **made.keywords)``.
+        policy: a name, see :func:`competitor`, or an object or a class as in :func:`evaluate`.
+        control: for an id: demand this control; by default the policy's own.
+        scenario: for an id: of the environment.
+        trust: load a model's zip, which can execute code.
+        **keywords: for an id: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
+    """
+    if isinstance(env, str):
+        cls, task = task_class(env), None
+    else:
+        task = _task_of(env)
+        cls = task_class(task.id)
+        if control is not None or scenario is not None or keywords:
+            raise ValueError("control, scenario and parameters are the environment's own: leave them out")
+        control = task.control
+    name = policy if isinstance(policy, str) else type(policy).__name__
+    maker = competitor(cls.id, policy, trust=trust) if isinstance(policy, str) else with_normalisation(policy)
+    kind = kind_of(maker)
+    if kind != "policy":
+        raise ValueError(f"{name!r} does not act: of kind {kind}, it can be evaluated only")
+    control = control_of(maker, kind, control, cls, name)
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
+    if task is None:
+        task = make_task(cls.id, control, scenario, **keywords)
+    else:
+        for parameter, value in keywords.items():
+            own = getattr(task.parameters, parameter)
+            if own != value:
+                raise ValueError(
+                    f"policy {name!r} acts in an environment with {parameter}={value!r}, and this one has {own!r}: "
+                    "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
+                )
+    check_shown(task, maker, name)
+    return SteppingPolicy(task, check_competitor(name, made(maker, task), kind), scenario, keywords)
+
+
+def _task_of(env: Any) -> Any:
+    """Return the task of an environment.
+
+    Raises:
+        ValueError: if it is none of filtergym, or computes in torch.
+    """
+    inner = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
+    if not isinstance(inner, TaskEnv | TaskVectorEnv):
+        raise ValueError(
+            "make_policy takes the id of an environment, or one of filtergym made by gymnasium.make or make_vec, got "
+            f"{type(inner).__name__}"
+        )
+    if inner.backend == "torch":
+        raise ValueError("policies answer in NumPy arrays: make the environment with another backend")
+    return inner.task
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:

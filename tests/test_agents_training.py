@@ -24,7 +24,8 @@ from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_header
 from filtergym.agents.network_arrays import network_arrays
-from filtergym.agents.sb3_training import Sb3Policy, load_sb3_policy, train_sb3
+from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
+from filtergym.agents.sb3_training import train_sb3
 from filtergym.agents.training_run import load_run, new_run, resumed_run
 from sb3_contrib import RecurrentPPO
 
@@ -60,7 +61,7 @@ def train(run, folder, **keywords):
 def weights(algorithm, folder):
     if algorithm == "bptt":
         return torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]
-    agent = load_sb3_policy(folder / "checkpoint" / "model.zip", algorithm, trust=True)
+    agent = load_sb3_policy(folder / "checkpoint" / "model.zip", trust=True)
     statistics = agent.normalisation.obs_rms
     return {
         **agent.model.policy.state_dict(),

@@ -51,7 +51,10 @@ def evaluate_policies(
     environment: Environment,
     policy: Annotated[
         list[str] | None,
-        typer.Option(help="Policy, estimator, reference or bound; repeat for several. Also module:Class."),
+        typer.Option(
+            help="Policy, estimator, reference or bound; repeat for several. Also a file, the folder of a "
+            "training run, or module:Class."
+        ),
     ] = None,
     scenario: ScenarioName = None,
     control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,

@@ -1,0 +1,208 @@
+"""Trained models of Stable-Baselines3 and sb3-contrib as policies, with the normalisation that they expect.
+
+A model that was trained under ``VecNormalize`` knows normalised observations only, and its zip does not hold the
+statistics: they are in a file of their own. Shown raw observations such a model answers too, but badly.
+"""
+
+import pickle
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy
+from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from .training_run import check_trust
+
+LOADED: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
+    (RecurrentPPO, "RecurrentActorCriticPolicy", ""),
+    (PPO, "ActorCriticPolicy", "clip_range"),
+    (TRPO, "ActorCriticPolicy", "cg_max_steps"),
+    (A2C, "ActorCriticPolicy", ""),
+    (SAC, "SACPolicy", ""),
+    (TD3, "TD3Policy", ""),
+    (DQN, "DQNPolicy", ""),
+    (ARS, "ARSPolicy", ""),
+    (CrossQ, "CrossQPolicy", ""),
+    (QRDQN, "QRDQNPolicy", ""),
+    (TQC, "TQCPolicy", ""),
+)
+"""What a zip can hold, which does not name its algorithm. The first line that fits it: class, the policy class that its
+policy is or comes from, and a value that it must store beside ("" for none). DDPG's is loaded as TD3, which it is."""
+NAMES = "PPO, RecurrentPPO, A2C, TRPO, SAC, TD3, DDPG, TQC, CrossQ, DQN, QR-DQN and ARS"
+
+
+class Sb3Policy:
+    """A trained model with the normalisation of its observations, as a policy.
+
+    Args:
+        model: of Stable-Baselines3 or sb3-contrib.
+        normalisation: whose statistics it was trained with; default: those of the environment that the model holds, if
+            it is a ``VecNormalize``.
+        control: that the model steers; default: the one that fits its action space.
+        name: of the model, in warnings.
+
+    Raises:
+        ValueError: if the statistics are of observations of another shape than the model's.
+
+    Warns:
+        UserWarning: if the model shows that it was trained on normalised observations, and no statistics are there.
+    """
+
+    def __init__(
+        self,
+        model: BaseAlgorithm,
+        normalisation: VecNormalize | None = None,
+        control: str | None = None,
+        name: str = "",
+    ) -> None:
+        self.model = model
+        self.observation_space, self.action_space = model.observation_space, model.action_space
+        self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
+        if control is not None:
+            self.control = control
+        name = name or f"this model of {type(model).__name__}"
+        if self.normalisation is not None:
+            _check_shape(self.normalisation, model)
+        elif trained_normalised(model):
+            warnings.warn(
+                f"{name} was trained under VecNormalize, and its statistics are not here, so it is shown raw "
+                "observations and its score is not the model's: keep vecnormalize.pkl beside the zip, or in Python "
+                "pass Sb3Policy(model, normalisation)",
+                stacklevel=2,
+            )
+        if _wrapped(model):
+            warnings.warn(
+                f"{name} was trained on what Gymnasium's NormalizeObservation makes of observations, and is shown raw "
+                "ones, so its score is not the model's: train under VecNormalize instead",
+                stacklevel=2,
+            )
+
+    def predict(
+        self,
+        observation: numpy.ndarray,
+        state: Any = None,
+        episode_start: numpy.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[numpy.ndarray, Any]:
+        """Choose actions for observations as the environment shows them, as Stable-Baselines3 does."""
+        if self.normalisation is not None:
+            normalised: Any = self.normalisation.normalize_obs(observation)
+            observation = normalised
+        return self.model.predict(observation, state, episode_start, deterministic)
+
+
+def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
+    statistics: Any = normalisation.obs_rms if normalisation.norm_obs else None
+    if statistics is not None and statistics.mean.shape != model.observation_space.shape:
+        raise ValueError(
+            f"the statistics are of observations of shape {statistics.mean.shape}, the model takes "
+            f"{model.observation_space.shape}: they are another model's"
+        )
+
+
+def trained_normalised(model: BaseAlgorithm) -> bool:
+    """Whether a model shows that it was trained under ``VecNormalize``.
+
+    A model keeps, and stores, what it was shown last and, under ``VecNormalize``, what that was before; algorithms
+    with a replay buffer keep an earlier observation there without it, too. What ``VecNormalize`` normalises is float32,
+    whatever the environment shows. So where that is float64, the two say it exactly. Where it is float32 an algorithm
+    without replay buffer says it too, also where only rewards were normalised, and one with a replay buffer nothing. A
+    model that never learned says nothing either, and does not need to.
+    """
+    shown, original = model._last_obs, model._last_original_obs
+    if not isinstance(original, numpy.ndarray):
+        return False
+    if isinstance(shown, numpy.ndarray) and original.dtype != numpy.float32:
+        return bool(shown.dtype == numpy.float32)
+    return not isinstance(model, OffPolicyAlgorithm)
+
+
+def _wrapped(model: BaseAlgorithm) -> bool:
+    """Whether Gymnasium's own wrapper normalises in the environment that a model holds."""
+    env = model.get_env()
+    inner = None if env is None else env.unwrapped
+    wrapper = gymnasium.wrappers.NormalizeObservation
+    return isinstance(inner, DummyVecEnv) and any(inner.env_is_wrapped(wrapper))
+
+
+def statistics_places(path: Path, environment: str | None = None) -> Iterator[Path]:
+    """Files in which the statistics of a model's zip may be, nearest first.
+
+    Args:
+        path: of the zip.
+        environment: id of the environment that it is of.
+    """
+    steps = re.fullmatch(r"(.+)_(\d+)_steps", path.stem)
+    if steps:  # as Stable-Baselines3's CheckpointCallback names them
+        yield path.with_name(f"{steps[1]}_vecnormalize_{steps[2]}_steps.pkl")
+    yield path.parent / "vecnormalize.pkl"
+    # rl-zoo3: ENV_1/ENV.zip, ENV_1/best_model.zip and ENV_1/ENV/vecnormalize.pkl.
+    folders = [path.stem, path.absolute().parent.name.rpartition("_")[0]]
+    if environment is not None:
+        folders.append(environment.replace("/", "-"))
+    for folder in dict.fromkeys(filter(None, folders)):
+        yield path.parent / folder / "vecnormalize.pkl"
+
+
+def load_sb3_policy(
+    path: Path | str, environment: str | None = None, control: str | None = None, *, trust: bool = False
+) -> Sb3Policy:
+    """Load a model's zip with the statistics of its ``VecNormalize``, if there are any.
+
+    They are looked for in ``vecnormalize.pkl`` beside the zip, where rl-zoo3 puts them (``ENV/vecnormalize.pkl`` below
+    the folder), and beside a checkpoint of Stable-Baselines3's ``CheckpointCallback``, under its name for them.
+
+    Args:
+        path: of the zip.
+        environment: id of the environment that the model is of, by which rl-zoo3 names a folder.
+        control: that the model steers; default: the one that fits its action space.
+        trust: both files can execute code while they are loaded, and are not without this.
+
+    Raises:
+        ValueError: if there is no such file, it is not trusted, or not a model.
+
+    Warns:
+        UserWarning: if the model was trained on normalised observations, and there are no statistics.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"no model at {path}")
+    check_trust(f"model {path} is loaded with pickle", trust)
+    places = list(statistics_places(path, environment))
+    found = next((place for place in places if place.is_file()), None)
+    try:
+        model = _loaded_model(path)
+        normalisation = None
+        if found is not None:
+            with found.open("rb") as file:
+                normalisation = pickle.load(file)
+            normalisation.training = False
+        looked = ", ".join(place.relative_to(path.parent).as_posix() for place in places)
+        return Sb3Policy(model, normalisation, control, f"model {path} (beside it looked for {looked})")
+    except Exception as error:  # unpickling a corrupt file stumbles over anything
+        raise ValueError(f"cannot read the model {path}: {error}") from error
+
+
+def _loaded_model(path: Path) -> BaseAlgorithm:
+    """Load a zip by the class that fits what it stores.
+
+    Raises:
+        ValueError: if none does.
+    """
+    data = load_from_zip_file(path, device="cpu")[0] or {}
+    names = {cls.__name__ for cls in data["policy_class"].__mro__}
+    for algorithm, policy, stored in LOADED:
+        if policy in names and (not stored or stored in data):
+            return algorithm.load(path, device="cpu")
+    raise ValueError(
+        f"its policy, {data['policy_class'].__name__}, is of none of the algorithms that are known: {NAMES}"
+    )

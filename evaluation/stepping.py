@@ -1,0 +1,114 @@
+"""A policy that is asked step by step, about any number of episodes, as an evaluation asks it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..envs.environment import checked_action
+from ..envs.lanes import padded_width
+from ..envs.task import Task
+from .competitors import Policy
+
+MODEL_ROWS = 128
+"""Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
+
+
+class Memory(NamedTuple):
+    """What a policy remembers between two steps."""
+
+    calls: list[Any]
+    """Of each call of the policy."""
+    fresh: bool
+    """Whether the episodes have yet to begin."""
+
+
+class SteppingPolicy(Policy):
+    """A policy for loops of one's own, where it answers what it answers in an evaluation, to the last bit.
+
+    Matrix products round by their shape, and an episode must not depend on how many others there are. So the policy
+    is asked about a multiple of eight observations, a model of Stable-Baselines3 always about as many, and the last
+    one is repeated to fill up.
+
+    Args:
+        task: the estimation problem, under the policy's control.
+        policy: anything with Stable-Baselines3's ``predict``.
+        scenario: of the environment; None is its default.
+        task_keywords: parameters of the task that the environment must be made with.
+    """
+
+    def __init__(
+        self, task: Task, policy: Any, scenario: Any = None, task_keywords: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(task)
+        self.policy = policy
+        self.control = task.control  # type: ignore[misc]  # made for it
+        self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
+
+    @property
+    def keywords(self) -> dict[str, Any]:
+        """What ``gymnasium.make`` takes for an environment that the policy acts in."""
+        scenario = {} if self.scenario is None else {"scenario": self.scenario}
+        return {"control": self.control, **scenario, **self.task_keywords}
+
+    def begin(self, seeds: Sequence[int]) -> Memory:
+        """Return the state for the first :meth:`predict` of the episodes with these seeds.
+
+        Only policies that draw numbers need it, ``random`` for one; for the others None does.
+        """
+        own = self.policy
+        return Memory(
+            [
+                own.begin([seeds[i] for i in call]) if isinstance(own, Policy) else None
+                for call in self._calls(len(seeds))
+            ],
+            True,
+        )
+
+    def predict(
+        self,
+        observation: numpy.ndarray,
+        state: Memory | None = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[numpy.ndarray, Memory]:
+        """Choose actions.
+
+        Args:
+            observation: ``(N, len(task.fields))``, or one observation without the batch axis.
+            state: what the last call returned; at the first None, or what :meth:`begin` has returned.
+            episode_start: ``(N,)`` booleans, or one; true where a new episode begins, as it does everywhere at the
+                first call.
+            deterministic: as in Stable-Baselines3.
+
+        Returns:
+            Actions, with the batch axis where the observation has it, and the state for the next call.
+
+        Raises:
+            ValueError: for a state of another number of episodes, or if the policy answers with no actions.
+        """
+        single = numpy.ndim(observation) == 1
+        batch = numpy.atleast_2d(observation)
+        calls = self._calls(len(batch))
+        start = numpy.zeros(len(batch), dtype=bool)
+        if state is None or state.fresh:
+            start[:] = True
+        elif episode_start is not None:
+            start[:] = episode_start
+        memories = [None] * len(calls) if state is None else state.calls
+        if len(memories) != len(calls):
+            raise ValueError(f"the state is not one of {len(batch)} episodes: begin anew with state=None")
+        answers, kept = [], []
+        for call, memory in zip(calls, memories, strict=True):
+            answer, after = self.policy.predict(batch[call], memory, start[call], deterministic=deterministic)
+            answers.append(checked_action(self.task.action_space, answer, len(call)))
+            kept.append(after)
+        action = numpy.concatenate(answers)[: len(batch)]
+        return (action[0] if single else action), Memory(kept, False)
+
+    def _calls(self, count: int) -> list[numpy.ndarray]:
+        """Episodes that each call of the policy is shown."""
+        rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else padded_width(count)
+        return [
+            numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
+        ]
