@@ -348,6 +348,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         "render_fps": FRAMES_PER_SECOND,
     }
     reset_options = ("reset_mask", "shortened_by")
+    pictures: "EpisodePictures | None" = None
+    """What keeps and draws the first few episodes; None without a render mode."""
 
     def __init__(
         self,
@@ -389,8 +391,6 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = num_envs
         self.render_mode = render_mode
-        self.pictures: EpisodePictures | None = None
-        """What keeps and draws the first few episodes; None without a render mode."""
         if render_mode is not None:
             from . import rendering
 
