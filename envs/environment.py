@@ -127,8 +127,9 @@ class _Face:
 
     def _rounded(self, values: Array) -> Array:
         """Numbers in the type that was asked for."""
-        xp = self.task.xp
-        return values if self.dtype == "float64" else xp.astype(values, xp.float32)
+        if self.dtype == "float64":
+            return values
+        return self.task.xp.astype(values, self.task.xp.float32)
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -274,9 +275,8 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
-        paid = self._rounded(paid)
-        shown_next = self._rounded(self.lanes.observe()[0])
-        return shown_next, float(paid[0]), False, bool(self.lanes.finished[0]), info
+        shown_next, earned = self._rounded(self.lanes.observe()[0]), float(self._rounded(paid)[0])
+        return shown_next, earned, False, bool(self.lanes.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
