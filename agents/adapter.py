@@ -80,7 +80,13 @@ class TaskVecEnv(VecEnv):
         self.metadata = env.metadata
 
     def reset(self) -> numpy.ndarray:
-        """Start new episodes with the seeds given to :meth:`seed`; options do nothing, as in the environment."""
+        """Start new episodes with the seeds given to :meth:`seed`.
+
+        Raises:
+            ValueError: for options, of which the environments have none.
+        """
+        if any(self._options):
+            raise ValueError(f"environments have no options of a reset here, got {self._options!r}")
         count = self.num_envs
         cut = numpy.arange(count) * self.env.last_decision // count
         options = {"shortened_by": cut} if self.staggered else None

@@ -9,6 +9,7 @@ from ..compiler.namespace import NotTraceable
 from .catalogue import make_task, nearest
 from .compiled import AVAILABLE, compiled, warn_of
 from .observation import Array
+from .parameters import Limits, check
 from .task import Task
 
 BACKENDS = ("auto", "compiled", "numpy", "torch")
@@ -41,8 +42,7 @@ def task_on(
             than one thread, or a task that cannot be compiled and was asked to be.
         ImportError: if the backend needs a library that is not installed.
     """
-    if threads < 1:
-        raise ValueError(f"threads must be at least 1, got {threads}")
+    check("threads", threads, int, Limits(at_least=1))
     xp, device = array_backend(backend, device)
     task = make_task(id, control, scenario, xp, device, **keywords)
     if backend == "compiled" or (backend == "auto" and AVAILABLE):

@@ -18,10 +18,14 @@ import gymnasium
 import numpy
 
 from .task import Scenario, Task
-from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory
+from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory, trajectory_of
 
 ADDED: dict[str, type[Task]] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""
+
+
+ScenarioChoice = str | Path | Trajectory | Mapping[str, Any] | None
+"""What names a scenario: a name, the path of a file, a trajectory or its fields, or None for the environment's own."""
 
 
 def catalogue() -> dict[str, type[Task]]:
@@ -40,12 +44,23 @@ def _shipped() -> dict[str, type[Task]]:
     return {room.TASK.id: room.TASK for room in rooms}
 
 
+class UnknownKeyword(TypeError, ValueError):  # noqa: N818  (a name says what it is)
+    """A keyword that an environment does not take: a TypeError as of any function, which clients look for who try
+    whether an environment takes one, and a ValueError as for every other wrong name.
+    """
+
+
 def nearest(kind: str, name: Any, valid: Iterable[str]) -> ValueError:
     """Say which name is unknown and what was probably meant."""
+    return ValueError(f"unknown {kind} {name!r}: {_meant(name, valid)}")
+
+
+def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None) -> str:
     valid = list(valid)
     close = difflib.get_close_matches(str(name), valid, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(map(repr, close))}?" if close else f"choose from {', '.join(valid)}"
-    return ValueError(f"unknown {kind} {name!r}: {hint}")
+    if close:
+        return f"did you mean {' or '.join(map(repr, close))}?"
+    return f"choose from {', '.join(valid if choices is None else choices)}" if valid else "there are none"
 
 
 def imported(module: str, refusal: str) -> ModuleType:
@@ -74,6 +89,10 @@ def task_class(id: str) -> type[Task]:
     Raises:
         ValueError: if there is none, or its module cannot be imported.
     """
+    if not isinstance(id, str):
+        raise ValueError(
+            f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {id!r}"
+        )
     module, colon, own = id.partition(":")
     if colon:
         imported(module, f"cannot import {module!r}, which registers environment {own!r}")
@@ -100,33 +119,52 @@ def parameter_names(cls: type[Task]) -> list[str]:
     return [f.name for f in dataclasses.fields(cls.Parameters)]
 
 
-def check_names(cls: type[Task], keywords: Iterable[str]) -> None:
-    """Raise ValueError if a keyword is no parameter of an environment."""
+def check_names(cls: type[Task], keywords: Iterable[str], others: Iterable[str] = ()) -> None:
+    """Raise :class:`UnknownKeyword` if a keyword is no parameter of an environment.
+
+    Args:
+        cls: the environment.
+        keywords: that were given as parameters.
+        others: what could have been meant beside parameters.
+    """
     known = parameter_names(cls)
     for name in keywords:
         if name not in known:
-            raise nearest("parameter", name, known)
+            hint = _meant(name, [*others, *known], choices=known)
+            raise UnknownKeyword(f"unexpected keyword argument {name!r}, no parameter of {cls.id}: {hint}")
 
 
 def find_scenario(
-    cls: type[Task], scenario: str | Trajectory | None, keywords: Mapping[str, Any] | None = None
+    cls: type[Task],
+    scenario: ScenarioChoice,
+    keywords: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """Return a scenario by name (default: the environment's own), or make one from a user's trajectory.
 
     Args:
         cls: the environment.
-        scenario: a name, a trajectory, or the path of a CSV or NetCDF file with one.
+        scenario: a name, a trajectory (also as a dictionary of its fields, as it comes out of JSON), or the path of a
+            CSV or NetCDF file with one.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
         ValueError: for an unknown scenario or parameter, or a file that holds no trajectory.
     """
     check_names(cls, keywords or ())
-    if isinstance(scenario, str) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
+    if isinstance(scenario, str | Path) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
         scenario = read_trajectory(Path(scenario))
+    elif isinstance(scenario, Mapping):
+        scenario = trajectory_of(scenario)
     if isinstance(scenario, Trajectory):
         return cls.scenario_from_trajectory(scenario, keywords or {})
-    name = scenario or cls.default_scenario
+    name = cls.default_scenario if scenario is None else scenario
+    if isinstance(name, Path):
+        name = str(name)
+    if not isinstance(name, str):
+        raise ValueError(
+            f"a scenario is a name, a Trajectory or the path of a file with one, got {name!r}: choose from "
+            f"{', '.join(cls.scenarios)}"
+        )
     if name not in cls.scenarios:
         raise nearest("scenario", name, cls.scenarios)
     return cls.scenarios[name]
@@ -135,7 +173,7 @@ def find_scenario(
 def make_task(
     id: str,
     control: str | None = None,
-    scenario: str | Trajectory | None = None,
+    scenario: ScenarioChoice = None,
     xp: ModuleType = numpy,
     device: Any = None,
     **keywords: Any,
@@ -145,7 +183,7 @@ def make_task(
     Args:
         id: environment id.
         control: what the action steers; default: the first of the environment's controls.
-        scenario: name, or a :class:`~filtergym.envs.trajectory.Trajectory` where the environment takes one.
+        scenario: as :func:`find_scenario` takes it.
         xp: array namespace, NumPy or ``array_api_compat.torch``.
         device: where a torch task keeps its arrays.
         **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
@@ -154,7 +192,7 @@ def make_task(
         ValueError: for an unknown name or a parameter out of its limits.
     """
     cls = task_class(id)
-    control = control or cls.controls[0]
+    control = cls.controls[0] if control is None else control
     if control not in cls.controls:
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)

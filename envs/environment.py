@@ -1,28 +1,50 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
+import inspect
 import math
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from .backend import host_array, is_tensor, task_on, tensor_on
-from .catalogue import find_scenario, nearest
+from .catalogue import ScenarioChoice, check_names, find_scenario, nearest, task_class
 from .lanes import Lanes, mean_of
 from .observation import Array, Field
+from .parameters import Limits, check, frozen
 from .reward import REWARDS, paper_task, reward
+from .specification import told
 from .task import Task
-from .trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from .rendering import EpisodePicture
+    from .rendering import EpisodePicture, EpisodePictures
+
+FRAMES_PER_SECOND = 10
+DTYPES = ("float64", "float32")
+"""Types of observations and rewards; inside everything is float64."""
 
 
-def _observation_space(task: Task) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (len(task.fields),), numpy.float64)
+def _checked_seed(seed: Any) -> int | None:
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | numpy.integer) or seed < 0:
+        raise ValueError(f"a seed is None or an integer of at least 0, got {seed!r}")
+    return int(seed)
+
+
+def _checked_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options of a reset are a dictionary or None, got {options!r}")
+    for name in options:
+        if name not in known:
+            raise nearest("option of a reset", name, known)
+    return options
 
 
 FEW = 16
@@ -73,14 +95,50 @@ class _Face:
     lanes: Lanes
     reward_kind: str
     detailed_info: bool
+    dtype: str
+    """Of observations and rewards: "float64" or "float32"."""
+    last_decision: int
+    """Actions after which an episode is truncated."""
+    reset_options: ClassVar[tuple[str, ...]] = ()
+    """Names that ``options`` of a reset may have."""
+    _spec: EnvSpec | None = None
 
-    def _open(self, task: Task, reward_kind: str, count: int, detailed_info: bool) -> None:
+    def _check(
+        self, task: str, reward_kind: str, detailed_info: bool, dtype: str, names: Iterable[str]
+    ) -> None:
+        """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
+        check_names(task_class(task), names, inspect.signature(type(self)).parameters)
         if reward_kind not in REWARDS:
             raise nearest("reward", reward_kind, REWARDS)
+        if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
+            raise nearest("dtype", dtype, DTYPES)
+        check("detailed_info", detailed_info, bool, Limits())
+        self.reward_kind, self.detailed_info, self.dtype = reward_kind, detailed_info, dtype
+
+    def _open(self, task: Task, count: int) -> None:
         self.task = task
-        self.reward_kind = reward_kind
-        self.detailed_info = detailed_info
-        self.lanes = Lanes(task, count, paper_task(task) if reward_kind == "relative" else None)
+        self.lanes = Lanes(task, count, paper_task(task) if self.reward_kind == "relative" else None)
+        self.last_decision = self.lanes.decisions_per_episode
+
+    def _observation_space(self) -> gymnasium.spaces.Box:
+        return gymnasium.spaces.Box(
+            -numpy.inf, numpy.inf, (len(self.task.fields),), numpy.dtype(self.dtype).type
+        )
+
+    def _rounded(self, values: Array) -> Array:
+        """Numbers in the type that was asked for."""
+        if self.dtype == "float64":
+            return values
+        return self.task.xp.astype(values, self.task.xp.float32)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium made this from; its ``max_episode_steps`` is the length of an episode in decisions."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = None if spec is None else told(spec, self.last_decision)
 
     @property
     def backend(self) -> str:
@@ -131,37 +189,45 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
     Args:
         task: environment id.
         control: what the action steers; default: the first of the environment's controls.
-        scenario: name of a scenario, or a :class:`~filtergym.envs.trajectory.Trajectory`.
+        scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
+            the path of a file with one.
         reward: "cost" (default), "log-likelihood" or "relative"; see :mod:`.reward`.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.task_on`.
+        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
+            given out.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for an unknown name or a value out of its limits.
+        ValueError: for an unknown name or a value out of its limits; an unknown keyword is a TypeError too.
         ImportError: for the compiled backend without llvmlite.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # noqa: RUF012 (as in gymnasium.Env)
+    metadata = {  # noqa: RUF012 (as in gymnasium.Env)
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": FRAMES_PER_SECOND,
+    }
 
     def __init__(
         self,
         task: str,
         control: str | None = None,
-        scenario: str | Trajectory | None = None,
+        scenario: ScenarioChoice = None,
         reward: str = "cost",
         render_mode: str | None = None,
         detailed_info: bool = False,
         backend: str = "auto",
+        dtype: str = "float64",
         **keywords: Any,
     ) -> None:
+        self._check(task, reward, detailed_info, dtype, keywords)
         if backend == "torch":
             raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        self._open(task_on(backend, task, control, scenario, **keywords), reward, 1, detailed_info)
+        self._open(task_on(backend, task, control, scenario, **keywords), 1)
         self.render_mode = render_mode
         self.picture: EpisodePicture | None = None
         """What keeps and draws the episode; None without a render mode."""
@@ -169,22 +235,27 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             # Only here: matplotlib takes longer to import than an episode takes to run.
             from . import rendering
 
-            name = find_scenario(type(self.task), scenario).name
-            self.picture = rendering.EpisodePicture(self.task, name, render_mode, self.metadata["render_fps"])
-        self.observation_space = _observation_space(self.task)
+            name = find_scenario(type(self.task), scenario, keywords).name
+            self.picture = rendering.EpisodePicture(self.task, name, render_mode, FRAMES_PER_SECOND)
+        self.observation_space = self._observation_space()
         self.action_space = self.task.action_space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[numpy.ndarray, dict[str, Any]]:
-        """Start an episode and show its first measurement."""
-        super().reset(seed=seed)
+        """Start an episode and show its first measurement.
+
+        Raises:
+            ValueError: for a seed that is none, and for options, of which there are none.
+        """
+        _checked_options(options, self.reset_options)
+        super().reset(seed=_checked_seed(seed))
         self.lanes.seed(0, self.np_random)
         self.lanes.restart()
         if self.picture is not None:
             self.picture.begin(self.lanes.state)
             self._show()
-        return self.lanes.observe()[0], {}
+        return self._rounded(self.lanes.observe()[0]), {}
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
@@ -204,7 +275,8 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
-        return self.lanes.observe()[0], float(paid[0]), False, bool(self.lanes.finished[0]), info
+        shown_next, earned = self._rounded(self.lanes.observe()[0]), float(self._rounded(paid)[0])
+        return shown_next, earned, False, bool(self.lanes.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -247,8 +319,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
             seed, whatever the number.
         control: what the action steers.
-        scenario: name of a scenario, or a trajectory.
+        scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one.
         reward: "cost" (default), "log-likelihood" or "relative".
+        render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
             same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and
@@ -257,56 +330,90 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         device: where the torch backend computes, such as "cpu" (default) or "cuda".
         threads: how many share the sub-environments, of the compiled backend; the numbers stay the same.
         autoreset_mode: a :class:`gymnasium.vector.AutoresetMode` or its value.
-        max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on).
+        max_episode_steps: truncate earlier than the task's horizon (``make_vec`` passes it on); None or -1: do not.
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
+        dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
+            given out.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for an unknown name, a value out of its limits, or a device that is not there.
+        ValueError: for an unknown name, a value out of its limits, or a device that is not there; an unknown keyword is
+            a TypeError too.
         ImportError: for a backend whose library is not installed.
     """
+
+    metadata = {  # noqa: RUF012 (as in gymnasium.vector.VectorEnv)
+        "render_modes": ["rgb_array"],
+        "render_fps": FRAMES_PER_SECOND,
+    }
+    reset_options = ("reset_mask", "shortened_by")
+    pictures: "EpisodePictures | None" = None
+    """What keeps and draws the first few episodes; None without a render mode."""
 
     def __init__(
         self,
         task: str,
         num_envs: int = 1,
         control: str | None = None,
-        scenario: str | Trajectory | None = None,
+        scenario: ScenarioChoice = None,
         reward: str = "cost",
+        render_mode: str | None = None,
         backend: str = "auto",
         device: Any = None,
         threads: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         detailed_info: bool = False,
+        dtype: str = "float64",
         **keywords: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        self._check(task, reward, detailed_info, dtype, keywords)
+        num_envs, max_episode_steps = frozen(num_envs), frozen(max_episode_steps)
+        check("num_envs", num_envs, int, Limits(at_least=1))
+        if max_episode_steps not in (None, -1):
+            check("max_episode_steps", max_episode_steps, int, Limits(at_least=1))
+        modes = {mode.value: mode for mode in AutoresetMode}
+        if not isinstance(autoreset_mode, AutoresetMode):
+            if not isinstance(autoreset_mode, str) or autoreset_mode not in modes:
+                raise nearest("autoreset_mode", autoreset_mode, modes)
+            autoreset_mode = modes[autoreset_mode]
+        if render_mode == "human":
+            raise ValueError(
+                "render_mode 'human' is a window for one episode: use gymnasium.make, or render_mode='rgb_array'"
+            )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         made = task_on(backend, task, control, scenario, device=device, threads=threads, **keywords)
         self.device = made.device
-        self._open(made, reward, num_envs, detailed_info)
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"autoreset_mode": self.autoreset_mode}
+        self._open(made, num_envs)
+        self.autoreset_mode = autoreset_mode
+        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = num_envs
-        self.single_observation_space = _observation_space(self.task)
+        self.render_mode = render_mode
+        if render_mode is not None:
+            from . import rendering
+
+            name = find_scenario(type(self.task), scenario, keywords).name
+            self.pictures = rendering.EpisodePictures(self.task, name, num_envs, FRAMES_PER_SECOND)
+        self.single_observation_space = self._observation_space()
         self.single_action_space = self.task.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.last_decision = min(self.lanes.decisions_per_episode, max_episode_steps or 10**9)
+        if max_episode_steps not in (None, -1):
+            self.last_decision = min(self.last_decision, max_episode_steps)
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)
 
-    def _seed(self, seed: int | Sequence[int | None] | None, lanes: Sequence[int]) -> None:
-        if seed is None or isinstance(seed, int | numpy.integer):
-            seeds = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
-        else:
-            seeds = list(seed)
-            if len(seeds) != self.num_envs:
-                raise ValueError(
-                    f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seeds)}"
-                )
+    def _checked_seeds(self, seed: Any) -> list[int | None]:
+        if not isinstance(seed, Sequence | numpy.ndarray) or isinstance(seed, str):
+            first = _checked_seed(seed)
+            return [None if first is None else first + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seed)}")
+        return [_checked_seed(one) for one in seed]
+
+    def _seed(self, seeds: Sequence[int | None], lanes: Sequence[int]) -> None:
         unseeded = not self.lanes.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
@@ -319,19 +426,15 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         ``options["shortened_by"]``: integers ``(num_envs,)``, by how many decisions each of these episodes ends
         early (later ones are whole again), so that episodes of one horizon need not all end together.
+
+        Raises:
+            ValueError: for other options, and for seeds that are none.
+            gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
-        mask = (options or {}).get("reset_mask")
-        shortened = numpy.asarray((options or {}).get("shortened_by", numpy.zeros(self.num_envs, dtype=int)))
-        if (
-            shortened.shape != (self.num_envs,)
-            or shortened.dtype.kind not in "iu"
-            or (shortened < 0).any()
-            or (shortened >= self.last_decision).any()
-        ):
-            raise ValueError(
-                f"options['shortened_by'] must hold {self.num_envs} integers from 0 to "
-                f"{self.last_decision - 1}, got {shortened!r}"
-            )
+        wanted = _checked_options(options, self.reset_options)
+        seeds = self._checked_seeds(seed)
+        mask = wanted.get("reset_mask")
+        shortened = self._checked_shortening(wanted.get("shortened_by", [0] * self.num_envs))
         if mask is None:
             chosen: Sequence[int] = range(self.num_envs)
         else:
@@ -349,12 +452,34 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             if not self.lanes.begun and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
             chosen = numpy.flatnonzero(mask).tolist()
-        self._seed(seed, chosen)
-        self.lanes.restart(chosen)
+        self._seed(seeds, chosen)
+        self._restart(chosen)
         self.lanes.decisions[list(chosen)] = shortened[list(chosen)]
         self._finished = self._finished.copy()
         self._finished[list(chosen)] = False
-        return self.lanes.observe(), {}
+        return self._rounded(self.lanes.observe()), {}
+
+    def _checked_shortening(self, values: Any) -> numpy.ndarray:
+        try:
+            shortened = numpy.asarray(values)
+        except (ValueError, TypeError):  # rows of different lengths, a tensor on a device
+            shortened = numpy.empty(0)
+        if (
+            shortened.shape != (self.num_envs,)
+            or shortened.dtype.kind not in "iu"
+            or (shortened < 0).any()
+            or (shortened >= self.last_decision).any()
+        ):
+            raise ValueError(
+                f"options['shortened_by'] must hold {self.num_envs} integers from 0 to "
+                f"{self.last_decision - 1}, got {values!r}"
+            )
+        return shortened
+
+    def _restart(self, lanes: Sequence[int]) -> None:
+        self.lanes.restart(lanes)
+        if self.pictures is not None:
+            self.pictures.begin(self.lanes.state, lanes)
 
     def step(self, actions: Any) -> tuple[Array, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         """Apply the actions to the measurements just shown, then show the next ones."""
@@ -368,26 +493,58 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         array = self._actions(actions)
         info: dict[str, Any] = {}
-        paid = self._pay(array, info)
+        paid = self._pay(array, info, self._watch(array))
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
-            self.lanes.restart(numpy.flatnonzero(waiting).tolist())
+            self._restart(numpy.flatnonzero(waiting).tolist())
             paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
         finished = self.lanes.decisions >= self.last_decision
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
             info = self._masked(info, ~finished) | {
-                "final_obs": self._final_observations(self.lanes.observe(), done),
+                "final_obs": self._final_observations(self._rounded(self.lanes.observe()), done),
                 "_final_obs": self._mask(finished),
                 "final_info": self._masked(info, finished),
                 "_final_info": self._mask(finished),
             }
-            self.lanes.restart(done.tolist())
+            self._restart(done.tolist())
             self._finished = self._never
         else:
             info = self._masked(info, ~waiting)
             self._finished = finished
-        return self.lanes.observe(), paid, self._mask(self._never), self._mask(finished), info
+        shown, paid = self._rounded(self.lanes.observe()), self._rounded(paid)
+        return shown, paid, self._mask(self._never), self._mask(finished), info
+
+    def _watch(self, action: Array) -> Callable[[Any], None] | None:
+        """Return what keeps the states of this step for the pictures; None without a render mode."""
+        if self.pictures is None:
+            return None
+        pictures, actions, shown = self.pictures, host_array(action), host_array(self.lanes.observe())
+        return lambda state: pictures.keep(state, actions, shown)
+
+    def render(self) -> tuple[numpy.ndarray, ...] | None:
+        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.DRAWN`).
+
+        Returns:
+            A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
+            far longer than stepping. None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.pictures is None:
+            gymnasium.logger.warn(
+                'render was called without a render mode: use gymnasium.make_vec(..., render_mode="rgb_array")'
+            )
+            return None
+        if not self.lanes.begun:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        return self.pictures.frames(self.lanes.state)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Forget the figures."""
+        if self.pictures is not None:
+            self.pictures.close()
 
     def _masked(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
         """Gymnasium's form of what some sub-environments report: a mask beside every key."""

@@ -11,6 +11,7 @@ here is seen by an agent.
 This module imports matplotlib; the environment imports it only when a render mode is asked for.
 """
 
+import copy
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -25,6 +26,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ..compiler.functions import mapped
+from .backend import host_array
+from .lanes import LANE_MULTIPLE
 from .task import Task
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
@@ -43,6 +47,8 @@ DOTS_PER_INCH = 80.0
 """960 by 608 pixels: multiples of 16, as video encoders like them."""
 BAND_SIGMAS = 2.0
 """Half the width of the shaded band, reported standard deviations."""
+DRAWN = 4
+"""Sub-environments of a vector that are drawn."""
 MOST_COMPONENTS = 8
 """Error components that the general picture has room for."""
 LADDER = (1.0, 2.0, 5.0)
@@ -241,6 +247,12 @@ class _ObservationPanel:
         self.image.set_data(self.values)
 
 
+_NO_FIGURE: Mapping[str, Any] = {"_figure": None, "_ground": None, "_limits": (), "_fresh": True}
+"""Attributes of an episode's picture before its first drawing."""
+_FIGURE = (*_NO_FIGURE, "_title", "_panels", "_observation", "_shades")
+"""Those that belong to the figure."""
+
+
 class EpisodePicture:
     """History and picture of one episode.
 
@@ -264,12 +276,22 @@ class EpisodePicture:
         self.observations: list[numpy.ndarray] = []
         self.count = 0
         self._figure: Figure | None = None
-        self._limits: list[tuple[float, ...]] = []
+        self._limits: Sequence[tuple[float, ...]] = ()
         self._ground: Any = None
         self._fresh = True
         self._last_shown = 0.0
+        self._artists: set[str] = set()
+        """Attributes of the picture that are parts of the figure."""
         if mode == "human":
             _require_window()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the figure: a copy draws its own."""
+        picture = copy.copy(self.picture)
+        for name in self._artists & vars(picture).keys():
+            delattr(picture, name)
+        kept = {name: value for name, value in vars(self).items() if name not in _FIGURE}
+        return {**kept, "picture": picture, **_NO_FIGURE}
 
     # --- history
 
@@ -346,8 +368,7 @@ class EpisodePicture:
             from matplotlib import pyplot
 
             pyplot.close(self._figure)
-        self._figure, self._ground, self._limits = None, None, []
-        self._fresh = True
+        vars(self).update(_NO_FIGURE)
 
     def _drawn(self, state: Any) -> Figure:
         figure = self._figure if self._figure is not None else self._open()
@@ -379,7 +400,9 @@ class EpisodePicture:
             FigureCanvasAgg(figure)
         self._figure = figure
         self._title = figure.text(0.5, 0.975, "", ha="center", va="top", fontsize=12)
+        before = set(vars(self.picture))
         self.picture.open(figure)
+        self._artists |= set(vars(self.picture)) - before
         strips = self.picture.strips()
         with_observation = self.picture.shows_observation()
         cells = len(strips) + with_observation
@@ -416,6 +439,59 @@ class EpisodePicture:
             for first, last in self.picture.shaded():
                 self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
         self.picture.arrange()
+
+
+class EpisodePictures:
+    """Pictures of the first few episodes of many side by side.
+
+    Args:
+        task: whose episodes they are, of any backend.
+        scenario: its scenario's name.
+        count: number of episodes.
+        frames_per_second: how fast a video shows them.
+    """
+
+    def __init__(self, task: Task, scenario: str, count: int, frames_per_second: float) -> None:
+        self.count = count
+        if task.backend == "torch":
+            task = type(task)(task.parameters, task.control)
+        self.pictures = [
+            EpisodePicture(task, scenario, "rgb_array", frames_per_second) for _ in range(min(count, DRAWN))
+        ]
+        for i, picture in enumerate(self.pictures):
+            picture.caption = f"sub-environment {i}"
+
+    def begin(self, state: Any, lanes: Sequence[int]) -> None:
+        """Forget the last episodes in some lanes; ``state`` holds the new ones after their first measurement."""
+        for i, picture in enumerate(self.pictures):
+            if i in lanes:
+                picture.begin(_alone(state, i))
+
+    def keep(self, state: Any, actions: numpy.ndarray, observations: numpy.ndarray) -> None:
+        """Add a measurement that has been acted on.
+
+        Args:
+            state: of all episodes after the action.
+            actions: what was applied, ``(count, ...)``.
+            observations: what it answered, ``(count, len(task.fields))``.
+        """
+        for i, picture in enumerate(self.pictures):
+            picture.keep(_alone(state, i), actions[i], observations[i].copy())
+
+    def frames(self, state: Any) -> tuple[numpy.ndarray, ...]:
+        """Draw: a frame ``(height, width, 3)`` for each episode, the same blank one beyond the first few."""
+        drawn = [picture.frame(_alone(state, i)) for i, picture in enumerate(self.pictures)]
+        return (*drawn, *[numpy.full_like(drawn[0], 255)] * (self.count - len(drawn)))
+
+    def close(self) -> None:
+        """Forget the figures."""
+        for picture in self.pictures:
+            picture.close()
+
+
+def _alone(state: Any, lane: int) -> Any:
+    """Episode in one lane as a picture takes it: on the host, padded with itself."""
+    return mapped(lambda values: host_array(values)[..., [lane] * LANE_MULTIPLE], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:

@@ -1,8 +1,11 @@
 """A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
 
+import dataclasses
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy
 
@@ -103,6 +106,24 @@ class Trajectory:
         rate = curve(inside, 1)
         position = curve(inside) + rate * (wanted - inside)[:, None]
         return numpy.concatenate([position, rate], axis=1).T
+
+
+def trajectory_of(fields: Mapping[str, Any]) -> Trajectory:
+    """Return the trajectory whose fields a dictionary holds.
+
+    Raises:
+        ValueError: if a field is missing or there is another, or their values are no trajectory.
+    """
+    known = [field.name for field in dataclasses.fields(Trajectory)]
+    if not {"time", "position"} <= set(fields) <= set(known):
+        raise ValueError(
+            f"a trajectory as a dictionary has time, position and optionally velocity and name, got "
+            f"{', '.join(map(repr, fields)) or 'nothing'}"
+        )
+    try:
+        return Trajectory(**fields)
+    except (ValueError, TypeError) as error:  # rows of different lengths, words
+        raise ValueError(f"scenario as a dictionary: {error}") from error
 
 
 TRAJECTORY_SUFFIXES = (".csv", ".nc")

@@ -70,8 +70,11 @@ def test_equals_dummy_vec_env_over_hundreds_of_episodes(control):
     assert compare(one, other, 140, draw) == 11 * 20
     # A reset in the middle of episodes, without seeds: both go on drawing from their generators.
     compare(one, other, 3, draw)
-    one.set_options({"nothing": 1})
-    other.set_options({"nothing": 1})
+    for env in (one, other):
+        env.set_options({"nothing": 1})
+        with pytest.raises(ValueError, match="option"):
+            env.reset()
+        env.set_options({})
     np.testing.assert_array_equal(one.reset(), other.reset())
     assert compare(one, other, 14, draw) == 22
 

@@ -209,7 +209,7 @@ def test_backends_by_name(monkeypatch):
         gym.make("filtergym/UavAutopilot-v0", backend="compile")
     with pytest.raises(ValueError, match="make_vec"):
         gym.make("filtergym/UavAutopilot-v0", backend="torch")
-    with pytest.raises(ValueError, match="threads must be at least 1"):
+    with pytest.raises(ValueError, match="threads must be an integer of at least 1"):
         gym.make_vec("filtergym/UavAutopilot-v0", num_envs=2, threads=0)
     # Without llvmlite.
     monkeypatch.setattr("filtergym.envs.backend.AVAILABLE", False)

@@ -33,7 +33,7 @@ class TestNames:
             make(ID, scenario="papper")
 
     def test_parameter(self, make):
-        with pytest.raises(ValueError, match=r"unknown parameter 'range_sigmas': did you mean 'range_sigma'"):
+        with pytest.raises(ValueError, match=r"argument 'range_sigmas', .*: did you mean 'range_sigma'"):
             make(ID, range_sigmas=50.0)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy
 
-from ..parameters import check, declared
+from ..parameters import check, declared, frozen
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank
@@ -114,6 +114,7 @@ class ManeuveringTarget(Task):
     @classmethod
     def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
         """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
+        keywords = {name: frozen(value) for name, value in keywords.items()}
         for name in ("sampling_interval", "horizon"):
             if name in keywords:
                 check(name, keywords[name], *declared(ManeuveringTargetParameters)[name])

@@ -1,0 +1,474 @@
+"""What other libraries rely on beside reset and step: keywords they try, specs, videos, types, copies."""
+
+import concurrent.futures
+import copy
+import functools
+import multiprocessing
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from filtergym.envs import rendering
+from filtergym.envs.environment import TaskEnv, TaskVectorEnv
+from filtergym.envs.trajectory import Trajectory
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeAwareObservation, TimeLimit
+
+import filtergym  # noqa: F401  (registers the environments)
+
+ID = "filtergym/ManeuveringTarget-v0"
+make_three = functools.partial(gym.make_vec, num_envs=3)
+NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
+
+
+def actions_for(env, count, seed=0):
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(count)]
+
+
+def continued(env, actions):
+    """Everything that some steps return."""
+    return [np.asarray(part) for action in actions for part in env.step(action)[:4]]
+
+
+def assert_all_equal(some, others):
+    for one, other in zip(some, others, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+# --- keywords
+
+
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_a_client_may_try_whether_a_keyword_is_taken(env_id, make, short):
+    # TorchRL's GymEnv does, and takes the keyword back if this is what Python says.
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+        make(env_id, frameskip=1, **short)
+    with pytest.raises(ValueError, match=r"unexpected keyword argument 'horizons'.*did you mean 'horizon'"):
+        make(env_id, horizons=5)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"), [("contol", "control"), ("scenari", "scenario"), ("detail_info", "detailed_info")]
+)
+def test_keywords_of_the_environment_itself_are_hinted_at_too(name, meant):
+    with pytest.raises(ValueError, match=f"'{name}'.*did you mean '{meant}'"):
+        gym.make(ID, **{name: "x"})
+
+
+# --- the length of an episode
+
+
+def length(env):
+    """Decisions until the first truncation."""
+    env.reset(seed=0)
+    action, count, finished = env.action_space.sample(), 0, False
+    while not finished:
+        finished, count = np.all(env.step(action)[3]), count + 1
+    return count
+
+
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_spec_knows_how_long_an_episode_is(env_id, make, short):
+    env = make(env_id, **short, backend="numpy")
+    assert env.spec.max_episode_steps == length(env) == 5
+    assert make(env_id, **short, backend="numpy", max_episode_steps=3).spec.max_episode_steps == 3
+    assert length(make(env_id, **short, backend="numpy", max_episode_steps=3)) == 3
+    unlimited = make(env_id, **short, backend="numpy", max_episode_steps=-1)
+    assert unlimited.spec.max_episode_steps == length(unlimited) == 5
+    task = env.unwrapped.task
+    default = make(env_id, backend="numpy").spec.max_episode_steps
+    parameters = type(task).Parameters(**task.scenarios[task.default_scenario].parameters)
+    assert default == parameters.horizon // parameters.decision_interval
+
+
+def test_length_of_every_scenario(env_id):
+    task = TaskEnv(env_id, backend="numpy").task
+    for name, scenario in task.scenarios.items():
+        parameters = task.Parameters(**scenario.parameters)
+        expected = parameters.horizon // parameters.decision_interval
+        assert gym.make(env_id, scenario=name, backend="numpy").spec.max_episode_steps == expected
+
+
+def test_only_who_asks_is_limited(env_id, short):
+    def limited(env):
+        return isinstance(env, TimeLimit) or (isinstance(env, gym.Wrapper) and limited(env.env))
+
+    assert not limited(gym.make(env_id, **short, backend="numpy"))
+    assert limited(gym.make(env_id, **short, backend="numpy", max_episode_steps=3))
+
+
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_what_a_spec_makes_is_as_long(env_id, make, short):
+    again = EnvSpec.from_json(make(env_id, **short, backend="numpy").spec.to_json())
+    # A vector's spec holds the number of environments.
+    env = gym.make(again) if make is gym.make else gym.make_vec(again)
+    assert env.spec.max_episode_steps == length(env) == 5
+
+
+def test_time_aware_observation(env_id, short):
+    env = TimeAwareObservation(gym.make(env_id, **short, backend="numpy"), normalize_time=True)
+    shown, _ = env.reset(seed=0)
+    times, finished = [shown[-1]], False
+    while not finished:
+        shown, _, _, finished, _ = env.step(env.action_space.sample())
+        times.append(shown[-1])
+    np.testing.assert_allclose(times, np.arange(6) / 5, rtol=1e-6)
+
+
+# --- specs as text
+
+FLIGHT = Trajectory(
+    time=np.arange(0.0, 200.0, 7.3),
+    position=np.stack([2e4 + 100.3 * np.arange(28), 5e3 + 0.1 * np.arange(28) ** 2], axis=1),
+    name="mine",
+)
+
+
+@pytest.mark.parametrize("velocity", [False, True])
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_a_trajectory_survives_json(make, velocity):
+    moving = np.gradient(FLIGHT.position, FLIGHT.time, axis=0) if velocity else None
+    flight = Trajectory(FLIGHT.time, FLIGHT.position, moving, "mine")
+    env = make(ID, scenario=flight, gains=np.array([0.2, 0.8]), horizon=np.int64(20))
+    spec = EnvSpec.from_json(env.spec.to_json())
+    again = gym.make(spec) if make is gym.make else gym.make_vec(spec)
+    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
+    actions = actions_for(env, 5)
+    assert_all_equal(continued(env, actions), continued(again, actions))
+    assert again.unwrapped.task.parameters == env.unwrapped.task.parameters
+
+
+def test_a_mode_of_resets_survives_json():
+    env = gym.make_vec(ID, num_envs=2, autoreset_mode=AutoresetMode.SAME_STEP)
+    again = gym.make_vec(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.autoreset_mode is AutoresetMode.SAME_STEP
+
+
+def test_the_path_of_a_file_is_a_scenario(tmp_path):
+    path = tmp_path / "flight.csv"
+    rows = np.column_stack([FLIGHT.time, FLIGHT.position])
+    np.savetxt(path, rows, delimiter=",", header="time,x,y", comments="")
+    env = gym.make(ID, scenario=path)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    np.testing.assert_array_equal(env.reset(seed=0)[0], again.reset(seed=0)[0])
+
+
+# --- wrong arguments
+
+MAKING = {
+    "scenario=[]": ({"scenario": []}, "a scenario is a name, a Trajectory or the path.*got \\[\\].*paper"),
+    "scenario list": ({"scenario": ["paper", "atc"]}, "a scenario is a name.*got \\['paper', 'atc'\\]"),
+    "scenario number": ({"scenario": 3}, "a scenario is a name.*got 3"),
+    "scenario empty": ({"scenario": ""}, "unknown scenario ''"),
+    "scenario dictionary": ({"scenario": {"tme": [0, 1]}}, "a trajectory as a dictionary has time.*got 'tme'"),
+    "scenario half": ({"scenario": {"time": [0, 1], "position": [[0, 0], [1]]}}, "scenario as a dictionary: "),
+    "scenario words": ({"scenario": {"time": "ab", "position": [[0, 0]]}}, "scenario as a dictionary: "),
+    "control": ({"control": 0}, "unknown control 0: choose from gain"),
+    "control list": ({"control": ["gain"]}, "unknown control .*did you mean 'gain'"),
+    "reward": ({"reward": None}, "unknown reward None"),
+    "reward list": ({"reward": ["cost"]}, "unknown reward .*did you mean 'cost'"),
+    "backend": ({"backend": 1}, "unknown backend 1"),
+    "render_mode": ({"render_mode": "rgb"}, "unknown render_mode 'rgb'.*rgb_array"),
+    "detailed_info": ({"detailed_info": "no"}, "detailed_info must be True or False, got 'no'"),
+    "dtype": ({"dtype": "float16"}, "unknown dtype 'float16': did you mean 'float"),
+    "dtype class": ({"dtype": np.float32}, "unknown dtype .*choose from float64, float32"),
+    "dtype none": ({"dtype": None}, "unknown dtype None: choose from float64, float32"),
+    "task": ({"task": 5}, "an environment is named by its id.*got 5"),
+}  # fmt: skip
+MAKING_VECTORS = {
+    "num_envs word": ({"num_envs": "2"}, "num_envs must be an integer of at least 1, got '2'"),
+    "num_envs fraction": ({"num_envs": 2.0}, "num_envs must be an integer of at least 1, got 2.0"),
+    "num_envs zero": ({"num_envs": 0}, "num_envs must be an integer of at least 1, got 0"),
+    "num_envs boolean": ({"num_envs": True}, "num_envs must be an integer of at least 1, got True"),
+    "threads": ({"threads": "2"}, "threads must be an integer of at least 1, got '2'"),
+    "autoreset_mode": ({"autoreset_mode": "samestep"}, "unknown autoreset_mode 'samestep': did you mean 'SameStep'"),
+    "autoreset_mode number": ({"autoreset_mode": 1}, "unknown autoreset_mode 1: choose from NextStep"),
+    "max_episode_steps": ({"max_episode_steps": 0}, "max_episode_steps must be an integer of at least 1, got 0"),
+    "max_episode_steps word": ({"max_episode_steps": "9"}, "max_episode_steps must be an integer of at least 1"),
+    "device": ({"device": "cuda"}, "works on the CPU only, got device 'cuda'"),
+    "render_mode human": ({"render_mode": "human"}, "a window for one episode: use gymnasium.make"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("face", [TaskEnv, TaskVectorEnv])
+@pytest.mark.parametrize("case", MAKING)
+def test_wrong_arguments_of_both_faces(face, case):
+    keywords, message = MAKING[case]
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        face(**{"task": ID, **keywords})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("case", MAKING_VECTORS)
+def test_wrong_arguments_of_vectors(case):
+    keywords, message = MAKING_VECTORS[case]
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        TaskVectorEnv(**{"task": ID, **keywords})
+    assert "\n" not in str(caught.value)
+
+
+RESETS = {
+    "seed word": ({"seed": "1"}, "a seed is None or an integer of at least 0, got '1'"),
+    "seed fraction": ({"seed": 1.0}, "a seed is None or an integer of at least 0, got 1.0"),
+    "seed negative": ({"seed": -1}, "a seed is None or an integer of at least 0, got -1"),
+    "seed boolean": ({"seed": True}, "a seed is None or an integer of at least 0, got True"),
+    "options list": ({"options": [1]}, r"options of a reset are a dictionary or None, got \[1\]"),
+    "options word": ({"options": "reset_mask"}, "options of a reset are a dictionary or None"),
+}
+RESETS_OF_VECTORS = {
+    "seeds words": ({"seed": ["1", "2"]}, "a seed is None or an integer of at least 0, got '1'"),
+    "seeds few": ({"seed": [1]}, "expected 2 seeds, one for each sub-environment, got 1"),
+    "seeds negative": ({"seed": [1, -1]}, "a seed is None or an integer of at least 0, got -1"),
+    "unknown": ({"options": {"reset_masks": 1}}, "unknown option of a reset 'reset_masks': did you mean 'reset_mask'"),
+    "mask": ({"options": {"reset_mask": "all"}}, "'reset_mask'. must be a boolean array .*got 'all'"),
+    "shortened ragged": ({"options": {"shortened_by": [[1], [1, 2]]}}, "'shortened_by'. must hold 2 integers"),
+    "shortened fraction": ({"options": {"shortened_by": [0.5, 1.0]}}, "'shortened_by'. must hold 2 integers"),
+}  # fmt: skip
+
+
+def assert_refused_without_a_trace(env, untouched, keywords, message):
+    for one in (env, untouched):
+        one.reset(seed=4)
+    with pytest.raises((ValueError, TypeError), match=message):
+        env.reset(**keywords)
+    actions = actions_for(env, 3)
+    assert_all_equal(continued(env, actions), continued(untouched, actions))
+    np.testing.assert_array_equal(env.reset()[0], untouched.reset()[0])
+
+
+@pytest.mark.parametrize("case", RESETS)
+def test_wrong_arguments_of_every_reset(case):
+    assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), *RESETS[case])
+    assert_refused_without_a_trace(TaskVectorEnv(ID, 2), TaskVectorEnv(ID, 2), *RESETS[case])
+
+
+@pytest.mark.parametrize("case", RESETS_OF_VECTORS)
+def test_wrong_arguments_of_a_vectors_reset(case):
+    assert_refused_without_a_trace(TaskVectorEnv(ID, 2), TaskVectorEnv(ID, 2), *RESETS_OF_VECTORS[case])
+
+
+def test_options_of_a_single_environment():
+    message = "unknown option of a reset 'reset_mask': there are none"
+    assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), {"options": {"reset_mask": [True]}}, message)
+    TaskEnv(ID).reset(options={})
+
+
+def test_seeds_may_be_numpys():
+    single, vector = TaskEnv(ID), TaskVectorEnv(ID, 2)
+    expected = single.reset(seed=5)[0]
+    np.testing.assert_array_equal(single.reset(seed=np.int64(5))[0], expected)
+    for seed in (np.uint32(5), np.array([5, 9]), (5, None), [np.int64(5), 6]):
+        np.testing.assert_array_equal(vector.reset(seed=seed)[0][0], expected)
+
+
+# --- float32
+
+
+@pytest.mark.parametrize("backend", NEEDED)
+def test_float32_is_float64_rounded(env_id, short, backend):
+    pytest.importorskip(NEEDED[backend])
+    keywords = {"num_envs": 3, "backend": backend, "autoreset_mode": "SameStep", **short}
+    fine, rounded = (gym.make_vec(env_id, dtype=dtype, **keywords) for dtype in ("float64", "float32"))
+    assert rounded.single_observation_space.dtype == rounded.observation_space.dtype == np.float32
+    assert fine.single_observation_space.dtype == np.float64
+    pairs = [(fine.reset(seed=0)[0], rounded.reset(seed=0)[0])]
+    for action in actions_for(fine, 7):
+        one, other = fine.step(action), rounded.step(action)
+        pairs += zip(one[:2], other[:2], strict=True)
+        if one[3].any():
+            final = [info["final_obs"] for info in (one[4], other[4])]
+            pairs.append(tuple(np.stack([np.asarray(row) for row in rows]) for rows in final))
+    assert len(pairs) == 1 + 2 * 7 + 1
+    for exact, coarse in pairs:
+        assert np.asarray(coarse).dtype == np.float32
+        np.testing.assert_array_equal(np.asarray(exact).astype(np.float32), np.asarray(coarse))
+
+
+def test_float32_of_a_single_environment(env_id, short):
+    env, vector = gym.make(env_id, dtype="float32", **short), gym.make_vec(env_id, dtype="float32", **short)
+    shown = env.reset(seed=2)[0]
+    assert env.observation_space.dtype == shown.dtype == np.float32
+    np.testing.assert_array_equal(shown, vector.reset(seed=2)[0][0])
+    for action in actions_for(env, 5):
+        shown, paid, *_ = env.step(action)
+        many, all_paid, *_ = vector.step(np.asarray(action)[None])
+        assert env.observation_space.contains(shown)
+        np.testing.assert_array_equal(shown, many[0])
+        assert type(paid) is float
+        assert paid == all_paid[0]
+
+
+def test_gradients_flow_through_float32():
+    torch = pytest.importorskip("torch")
+    slopes = []
+    for dtype in ("float64", "float32"):
+        env = TaskVectorEnv(ID, 2, "gain", backend="torch", dtype=dtype, horizon=5)
+        env.reset(seed=0)
+        action = torch.zeros((2, 1), dtype=torch.float64, requires_grad=True)
+        env.step(action)
+        _, paid, *_ = env.step(action)
+        paid.sum().backward()
+        slopes.append(action.grad.numpy())
+    assert (slopes[0] != 0.0).all()
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-6)
+
+
+# --- pictures of vectors
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
+    monkeypatch.setattr(rendering, "DRAWN", 2)
+    count, keywords = 4, {"render_mode": "rgb_array", "horizon": 4, "control": "weights"}
+    vector = TaskVectorEnv(ID, count, autoreset_mode=mode, **keywords)
+    single = TaskEnv(ID, **keywords)
+    single.picture.caption = "sub-environment 1"
+    vector.reset(seed=3), single.reset(seed=4)
+    actions = actions_for(vector, 7)
+    for step, action in enumerate(actions):
+        if mode is AutoresetMode.DISABLED and step == 4:
+            vector.reset(), single.reset()
+        *_, finished, _ = vector.step(action)
+        if mode is AutoresetMode.NEXT_STEP and step == 4:
+            single.reset()
+        else:
+            single.step(action[1])
+        if mode is AutoresetMode.SAME_STEP and finished.all():
+            single.reset()
+    assert single.picture.count == {"NextStep": 2, "SameStep": 3, "Disabled": 3}[mode.value]
+    frames = vector.render()
+    assert isinstance(frames, tuple)
+    assert len(frames) == count
+    np.testing.assert_array_equal(frames[1], single.render())
+    assert [frame.min() < 255 for frame in frames] == [True, True, False, False]
+    assert {frame.shape for frame in frames} == {(608, 960, 3)}
+    assert (frames[0] != frames[1]).any()
+    vector.close()
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_drawing_leaves_the_episodes_of_every_environment_alone(env_id, short, backend, monkeypatch):
+    pytest.importorskip(NEEDED[backend])
+    monkeypatch.setattr(rendering, "DRAWN", 1)
+    plain, drawn = (
+        gym.make_vec(env_id, num_envs=2, backend=backend, render_mode=mode, **short)
+        for mode in (None, "rgb_array")
+    )
+    np.testing.assert_array_equal(plain.reset(seed=0)[0], drawn.reset(seed=0)[0])
+    actions = actions_for(plain, 7)
+    assert_all_equal(continued(plain, actions), continued(drawn, actions))
+    assert [(frame.shape, frame.dtype) for frame in drawn.render()] == [((608, 960, 3), np.uint8)] * 2
+
+
+def test_the_fast_loop_stays_closed_without_a_render_mode():
+    pytest.importorskip("llvmlite")
+    env = TaskVectorEnv(ID, 2, backend="compiled")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.lanes._moving, "episodes move in the memory of compiled code"
+    assert env.pictures is None
+
+
+def test_vectors_render_before_reset_and_without_a_mode():
+    with pytest.raises(gym.error.ResetNeeded, match="reset before the first render"):
+        TaskVectorEnv(ID, 2, render_mode="rgb_array").render()
+    env = TaskVectorEnv(ID, 2)
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert env.render() is None
+
+
+def test_video_of_a_vector(tmp_path):
+    pytest.importorskip("moviepy")
+    from moviepy import VideoFileClip
+
+    if not hasattr(gym.wrappers.vector, "RecordVideo"):
+        pytest.skip("this version of Gymnasium records no vectors")
+    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=3)
+    env = gym.wrappers.vector.RecordVideo(env, str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
+    env.reset(seed=0)
+    for action in actions_for(env, 4):
+        env.step(action)
+    env.close()
+    with VideoFileClip(str(tmp_path / "videos" / "rl-video-episode-0.mp4")) as clip:
+        assert tuple(clip.size) == (1920, 608)
+        # The reset's frame and one for each of three steps, at ten a second.
+        assert clip.duration == pytest.approx(0.4, abs=0.11)
+
+
+# --- copies
+
+WAYS = {"deepcopy": copy.deepcopy, "pickle": lambda env: pickle.loads(pickle.dumps(env))}
+
+
+def assert_drawn_alike(env, copied):
+    env.reset(seed=3)
+    actions = actions_for(env, 5)
+    continued(env, actions[:2])
+    env.render()
+    other = copied(env)
+    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
+    np.testing.assert_array_equal(env.render(), other.render())
+    # What was closed is drawn anew.
+    env.close()
+    again = copied(env)
+    np.testing.assert_array_equal(again.unwrapped.render(), other.render())
+    return again
+
+
+def test_copies_are_drawn_alike(env_id, short):
+    assert_drawn_alike(gym.make(env_id, render_mode="rgb_array", **short), WAYS["pickle"])
+
+
+def test_copies_of_vectors_are_drawn_alike(monkeypatch):
+    monkeypatch.setattr(rendering, "DRAWN", 1)
+    env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
+    again = assert_drawn_alike(env, WAYS["pickle"])
+    # Closed and drawn again, it can be copied as before.
+    again.close()
+    again.render()
+    np.testing.assert_array_equal(copy.deepcopy(again).render(), again.render())
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_copies_of_what_is_wrapped(way):
+    env = RecordEpisodeStatistics(gym.make(ID, max_episode_steps=4, horizon=9))
+    env.reset(seed=3)
+    actions = actions_for(env, 4)
+    continued(env, actions[:2])
+    other = WAYS[way](env)
+    assert other.spec == env.spec
+    assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
+
+
+@pytest.fixture(scope="module")
+def elsewhere():
+    """A process that starts afresh."""
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, mp_context=context) as pool:
+        yield pool
+
+
+@pytest.mark.parametrize("make", [gym.make, make_three])
+def test_episodes_go_on_in_another_process(env_id, short, make, elsewhere):
+    env = make(env_id, **short)
+    env.reset(seed=3)
+    actions = actions_for(env, 5)
+    continued(env, actions[:2])
+    there = elsewhere.submit(continued, env, actions[2:]).result(timeout=120)
+    assert_all_equal(continued(env, actions[2:]), there)
+
+
+def test_specs_are_enough_for_spawned_processes():
+    here = gym.make(ID, scenario=FLIGHT, dtype="float32", horizon=4)
+    make = functools.partial(gym.make, here.spec)
+    there = gym.vector.AsyncVectorEnv([make], context="spawn")
+    try:
+        together, _ = there.reset(seed=8)
+        assert together.dtype == np.float32
+        np.testing.assert_array_equal(together[0], here.reset(seed=8)[0])
+    finally:
+        there.close()
