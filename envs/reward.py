@@ -49,7 +49,10 @@ def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: A
         paper_state: its state on the same noise.
     """
     paid = OWN_PAY[kind](task, state)
-    return paid - OWN_PAY[kind](paper, paper_state) if kind == "relative" and paper is not None else paid
+    if kind == "relative":
+        assert paper is not None
+        return paid - OWN_PAY[kind](paper, paper_state)
+    return paid
 
 
 def paper_task(task: Task) -> Task:
