@@ -97,13 +97,8 @@ class Specialised:
         with namespace.tracing(graph):
             places = iter(range(len(self.inputs)))
             traced = [mapped(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
-            try:
-                answer = function(*traced)
-                made = [namespace.asarray(array) for array in leaves(answer)]
-            except namespace.NotTraceable:
-                raise
-            except Exception as error:  # a function may stumble over symbols in any way
-                raise namespace.NotTraceable(f"{type(error).__name__}: {error}") from error
+            answer = function(*traced)
+            made = [namespace.asarray(array) for array in leaves(answer)]
         if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
             raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
         count = iter(range(len(made)))
@@ -222,6 +217,11 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
+def padded_width(count: int) -> int:
+    """Lanes that so many take: the next multiple of ``LANES``."""
+    return -(-count // LANES) * LANES
+
+
 def empty_lanes(shape: tuple[int, ...], width: int) -> numpy.ndarray:
     """Memory for ``(*shape, width)`` float64 numbers whose rows begin on cache lines."""
     # An odd number of cache lines: rows a power of two apart would share the same few places of the cache.
@@ -280,7 +280,7 @@ class Function:
         count = max(array.shape[-1] for array in given)
         if any(array.shape[-1] not in (1, count) for array in given):
             raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
-        width = -(-count // LANES) * LANES
+        width = padded_width(count)
         outputs = special.called([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []
         for output, same, leaf in zip(outputs, special.same, special.outputs, strict=True):

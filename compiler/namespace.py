@@ -30,11 +30,19 @@ class NotTraceable(TypeError):  # noqa: N818  (no error of whoever wrote the fun
 
 @contextmanager
 def tracing(graph: Graph) -> Iterator[Graph]:
-    """Let the arithmetic inside make expressions of a graph; other threads wait with theirs."""
+    """Let the arithmetic inside make expressions of a graph; other threads wait with theirs.
+
+    Raises:
+        NotTraceable: in place of whatever is raised inside: a function may stumble over symbols in any way.
+    """
     with graph.lock:
         token = _OPEN.set(graph)
         try:
             yield graph
+        except NotTraceable:
+            raise
+        except Exception as error:
+            raise NotTraceable(f"{type(error).__name__}: {error}") from error
         finally:
             _OPEN.reset(token)
 

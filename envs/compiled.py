@@ -271,12 +271,7 @@ def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
 def _traced(cls: type[Task], parameters: Any, control: str) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        try:
-            programs = Programs(cls(parameters, control, namespace), graph)
-        except NotTraceable:
-            raise
-        except Exception as error:  # a task may stumble over symbols in any way
-            raise NotTraceable(f"{type(error).__name__}: {error}") from error
+        programs = Programs(cls(parameters, control, namespace), graph)
     _ = programs.later
     return programs
 

@@ -28,25 +28,19 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..compiler.functions import address_of, mapped
+from ..compiler.functions import address_of, mapped, padded_width
 from ..filters.ordered_sums import ordered_sum
 from .compiled import MANY, Report, Stepper, can_step
 from .observation import Array
 from .reward import OWN_PAY
 from .task import Episode, Task
 
-LANE_MULTIPLE = 8
 LONGEST_BLOCK = 256
 """Measurements of noise that an episode draws at once."""
 BLOCK = 64
 """Rows of a block where an episode is longer than that: 64 rows keep 4096 lanes in cache-friendly memory."""
 DRAWN = 64
 """Lanes whose noise is drawn before it is put into the ring: it is still in the cache then."""
-
-
-def padded_width(count: int) -> int:
-    """Lanes that so many episodes take: the next multiple of ``LANE_MULTIPLE``."""
-    return -(-count // LANE_MULTIPLE) * LANE_MULTIPLE
 
 
 def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
@@ -215,6 +209,8 @@ class Lanes:
         chosen: Sequence[int] = range(self.count) if lanes is None or everyone else list(lanes)
         uniforms, normals = self._draw_episode(chosen)
         index = numpy.asarray(chosen)
+        self._started[index] = self._clock
+        self.decisions[index] = 0
         # The padding lanes fly an average episode without noise.
         scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
         if everyone and self._moving and self._begun is None:
@@ -222,9 +218,6 @@ class Lanes:
                 self._show(numpy.empty_like(self._shown))
             for stepper in self._moving:
                 stepper.begin(scenario, start, self._row_address())
-            self._interval_mean = None
-            self._started[index] = self._clock
-            self.decisions[index] = 0
             return
         row = self._ring[self._clock % self._slots]
         first_row = row[:, index if xp is numpy else xp.asarray(chosen, device=task.device)]
@@ -253,8 +246,6 @@ class Lanes:
                 self._episodes[i] = _replace_lanes(self._episodes[i], new, lane_index)
             if self._interval_mean is not None:
                 self._interval_mean = _replace_lanes(self._interval_mean, task.observe(fresh[0]), lane_index)
-        self._started[index] = self._clock
-        self.decisions[index] = 0
 
     def step(self, update: Callable[[Any], Any], record: Callable[[Any, Any], None] | None = None) -> None:
         """Apply one decision to as many measurements as it holds for.

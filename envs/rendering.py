@@ -26,9 +26,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..compiler.functions import mapped
+from ..compiler.functions import mapped, padded_width
 from .backend import host_array
-from .lanes import LANE_MULTIPLE
 from .task import Task
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
@@ -491,7 +490,7 @@ class EpisodePictures:
 
 def _alone(state: Any, lane: int) -> Any:
     """Episode in one lane as a picture takes it: on the host, padded with itself."""
-    return mapped(lambda values: host_array(values)[..., [lane] * LANE_MULTIPLE], state)
+    return mapped(lambda values: host_array(values)[..., [lane] * padded_width(1)], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy
 
-from ..compiler.functions import mapped
+from ..compiler.functions import mapped, padded_width
 from ..envs.compiled import Report
-from ..envs.lanes import Lanes, padded_width
+from ..envs.lanes import Lanes
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
 from .stepping import SteppingPolicy

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ..compiler.functions import padded_width
 from ..envs.environment import checked_action
-from ..envs.lanes import padded_width
 from ..envs.task import Task
 from .competitors import Policy
 
