@@ -271,8 +271,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
                 picture.keep(state, array, shown)
 
         paid = self._pay(array[None], info, watch)
-        if self.picture is not None:
-            self._show()
+        self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
         shown_next, earned = self._rounded(self.lanes.observe()[0]), float(self._rounded(paid)[0])
@@ -559,10 +558,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         array = checked_action(self.single_action_space, actions, self.num_envs)
         if self.backend != "torch":
             return host_array(array)
-        tensor = tensor_on(array, self.device)
-        # As in NumPy, where clipping whole numbers to limits that are floats gives floats.
-        whole = isinstance(self.single_action_space, gymnasium.spaces.Box) and not tensor.is_floating_point()
-        return tensor.double() if whole else tensor
+        return tensor_on(array, self.device)
 
     def _mask(self, lanes: numpy.ndarray) -> Array:
         """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
