@@ -28,7 +28,7 @@ ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
 }
 OUTPUTS = ("clip", "tanh", "argmax")
 """How the last layer becomes an action: cut to the box, squashed into it, or the largest entry's index."""
-HEADER = ("environment", "control", "fields", "output", "activation", "run")
+HEADER = ("environment", "control", "interface", "fields", "output", "activation", "run")
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are cut here, as in VecNormalize."""
 
@@ -134,6 +134,7 @@ def write_arrays(
     header = {
         "environment": task_class(run.environment).id,
         "control": run.control,
+        "interface": str(task_class(run.environment).interface),
         "fields": json.dumps(fields),
         "output": output,
         "activation": activation,
@@ -218,6 +219,11 @@ class _Stored:
         self.control = self.header["control"]
 
     def __call__(self, task: Task) -> LearnedPolicy:
+        if self.header["interface"] != str(task.interface):
+            raise ValueError(
+                f"{self.path} was trained when fields or actions of {task.id} meant something else (its interface "
+                f"{self.header['interface']}, now {task.interface}): train it again"
+            )
         fields = [field.name for field in task.fields]
         if fields != self.header["fields"]:
             raise ValueError(

@@ -285,9 +285,9 @@ class Validation:
         self.paper = baselines_of(run.environment).score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_cost = self._costs(self.paper, self.paper) if self.paper else None
+        self.paper_cost = self._costs(self.paper, self.paper, None) if self.paper else None
 
-    def _costs(self, name: str, policy: Any) -> numpy.ndarray:
+    def _costs(self, name: str, policy: Any, control: str | None) -> numpy.ndarray:
         """Mean cost over the episodes and over every resample of them."""
         run = self.run
         dataset = evaluate(
@@ -296,13 +296,14 @@ class Validation:
             run.scenario,
             VALIDATION_EPISODES,
             split="validation",
+            control=control,
             backend="auto" if run.backend == "torch" else run.backend,
         )
         return self.bootstrap.means(dataset["cost"].sel(policy=name).values.mean(axis=1))
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
-        cost = self._costs("agent", policy)
+        cost = self._costs("agent", policy, self.run.control)
         entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry

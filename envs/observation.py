@@ -53,6 +53,25 @@ PLAIN = Compression("", None, None)
 SIGNED_LOG = Compression(
     "sign(x) log(1 + |x|) of ", signed_logarithm, lambda shown: signed_exponential(shown, numpy)
 )
+LIMIT = 8.0
+"""What a bounded logarithm stays below."""
+
+
+def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
+    """``y / (1 + |y| / 8)`` of the signed logarithm y: close to x near zero, below 8 for the largest of numbers."""
+    logarithm = signed_logarithm(value, xp)
+    return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
+
+
+def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
+    """Inverse of :func:`bounded_logarithm`."""
+    return signed_exponential(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
+
+
+BOUNDED_LOG = Compression(
+    "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of ", bounded_logarithm, bounded_exponential
+)
+"""For what a wrong hypothesis makes as large as one likes."""
 KEPT_AS_LOG1P = Compression("log(1 + x) of ", None, numpy.expm1)
 """The block's function returns log(1 + x) already, because the filters keep that; reading gives x."""
 LOG1P = Compression("log(1 + x) of ", lambda value, xp: xp.log1p(value), numpy.expm1)

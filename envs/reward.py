@@ -1,9 +1,14 @@
 """What an agent is paid for one measurement.
 
-``cost`` (default): minus the task's cost, linear beyond its Huber bound. ``log-likelihood``: the logarithm of
-the reported Gaussian's density at the truth, which pays for an honest covariance too. ``relative``: the
-``cost`` reward with the cost of the paper's algorithm on the same noise added back (a control variate):
-positive where the agent does better than the paper.
+``cost`` (default): minus what the world charges for the estimate, in units of what the paper's algorithm is charged
+on average, and compressed: with the charge ``x`` in that unit the agent is paid ``-30 log(1 + x / 30)``. That is about
+``-x`` while the estimator works, and falls by 30 log(2) with every doubling once the track is lost: it always pays to
+find it again, and one lost track does not drown all that can be learned elsewhere. ``log-likelihood``: the logarithm of
+the reported Gaussian's density at the truth, which pays for an honest covariance too. ``relative``: the ``cost`` reward
+with what the paper's algorithm is charged on the same noise added back (a control variate): positive where the agent
+does better than the paper.
+
+What an evaluation compares is the cost, neither compressed nor in another unit.
 """
 
 from collections.abc import Callable
@@ -11,17 +16,22 @@ from typing import Any
 
 from ..filters.gaussian import log_density
 from .observation import Array
-from .task import Task, huber
+from .task import Task
+
+COMPRESSED_BEYOND = 30.0
+"""Charge, in units of the paper's average one, from which on the reward falls slowly."""
 
 
-def capped_cost(task: Task, state: Any) -> Array:
-    """Cost of the estimate, linear beyond the task's Huber bound, ``(N,)``."""
-    return huber(task.cost(state), task.huber_bound, task.xp)
+def charge(task: Task, state: Any) -> Array:
+    """What the estimate is charged in the reward, in units of the paper's average charge, compressed, ``(N,)``."""
+    return COMPRESSED_BEYOND * task.xp.log1p(
+        task.charge(state) * (1.0 / (COMPRESSED_BEYOND * task.reward_unit))
+    )
 
 
 def cost_reward(task: Task, state: Any) -> Array:
-    """Minus the capped cost of the estimate, ``(N,)``."""
-    return -capped_cost(task, state)
+    """Minus the compressed charge of the estimate, ``(N,)``."""
+    return -charge(task, state)
 
 
 def log_likelihood_reward(task: Task, state: Any) -> Array:

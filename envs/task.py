@@ -176,6 +176,16 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
             mean: of the estimate, ``(C, N)``.
         """
 
+    def charge(self, truth: Truth, mean: Array) -> Array:
+        """What the reward charges for an estimate, not below zero, ``(N,)``: its cost, unless part of that is known to
+        be none of its doing.
+
+        Args:
+            truth: at the measurement that the estimate is for.
+            mean: of the estimate, ``(C, N)``.
+        """
+        return self.cost(truth, mean)
+
     def records(self, truth: Truth) -> dict[str, Array]:
         """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
         return {}
@@ -298,6 +308,9 @@ class Task(ABC):
 
     id: ClassVar[str]
     """Gymnasium id, with version."""
+    interface: ClassVar[int] = 1
+    """Raised whenever fields or actions come to mean something else under the same names: agents that were trained
+    before are then refused."""
     paper_source: ClassVar[str]
     """Reference of the paper."""
     Parameters: ClassVar[type]
@@ -319,8 +332,8 @@ class Task(ABC):
     """Names of the hypotheses of the bank; their probabilities are recorded when a bank reports them."""
     cost_description: ClassVar[str]
     """What the cost is and its unit, in words."""
-    huber_bound: float
-    """Root of the cost beyond which the reward is linear; see :func:`huber`."""
+    reward_unit: float = 1.0
+    """What the paper's algorithm is charged on average in the default scenario: one in the reward."""
     paper_policy: PaperPolicy
 
     parameters: Any
@@ -478,6 +491,10 @@ class Task(ABC):
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""
         return self.world.cost(episode.truth, self._estimating(episode).mean(episode.bank))
 
+    def charge(self, episode: Episode) -> Array:
+        """What the reward charges for the estimate, ``(N,)``; see :meth:`World.charge`."""
+        return self.world.charge(episode.truth, self._estimating(episode).mean(episode.bank))
+
     def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
         return self._estimating(episode).mean(episode.bank) - self.world.state(episode.truth)
@@ -515,14 +532,3 @@ def _named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
             yield from _named_arrays(value, f"{prefix}{name}_")
         elif value is not None:
             yield prefix + name, value
-
-
-def huber(cost: Array, bound: float, xp: ModuleType) -> Array:
-    """Cost that grows linearly with the error beyond ``bound``, and is never flat.
-
-    With ``d = sqrt(cost)``: ``d^2`` up to the bound, ``2 bound d - bound^2`` beyond it (Huber, 1964, scaled
-    by two), so that a lost track always pays to be found again without ruling the gradient.
-    """
-    # The maximum keeps the square root away from zero, where its derivative is infinite.
-    beyond = xp.sqrt(xp.clip(cost, bound**2, None))
-    return xp.where(cost <= bound**2, cost, 2.0 * bound * beyond - bound**2)

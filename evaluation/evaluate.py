@@ -12,7 +12,7 @@ import xarray
 
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, make_task, nearest, task_class
-from ..envs.reward import capped_cost
+from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .competitors import Kind, check_competitor, kind_of, made
@@ -31,7 +31,7 @@ def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
 
 
 def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
-    """Return the control that a run uses: the policy's own, or the one that fits a model's action space.
+    """Return the control that a run uses: the policy's own, or the one that fits a model's spaces.
 
     Args:
         maker: of the competitor, or the competitor itself.
@@ -51,6 +51,9 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
         fitting = [c for c in cls.controls if make_task(cls.id, c).action_space == space]
         if not fitting:
             raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
+        # Controls may share an action space; what they show then tells them apart.
+        shown = getattr(getattr(maker, "observation_space", None), "shape", None)
+        fitting = [c for c in fitting if shown == (len(make_task(cls.id, c).fields),)] or fitting
         own = control if control in fitting else fitting[0]
     if own is None:
         return control or cls.controls[0]
@@ -75,7 +78,7 @@ def _measured(task: Task, episode: Episode) -> dict[str, Any]:
     return {
         "error": error,
         "cost": task.cost(episode),
-        "capped_cost": capped_cost(task, episode),
+        "charge": charge(task, episode),
         "nees": log_density(error, task.covariance(episode))[1],
         **task.records(episode),
     }
@@ -159,7 +162,7 @@ def evaluate(
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
-        truth), ``cost``, ``capped_cost``, ``nees``, whatever the task records (``nis``,
+        truth), ``cost``, ``charge`` (minus the reward), ``nees``, whatever the task records (``nis``,
         ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
 
     Raises:
@@ -270,7 +273,6 @@ def _dataset(
             },
             "groups": dict(task.groups),
             "cost": task.cost_description,
-            "huber_bound": task.huber_bound,
         },
     )
     if "mode_probability" in dataset:

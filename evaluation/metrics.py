@@ -113,12 +113,10 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
                 value = bootstrap.estimate(probability[:, times].mean(axis=1))
                 yield Measure("mean_mode_probability", mode, window, value, "1")
     if not is_bound:
-        cost, capped = run["cost"].values, run["capped_cost"].values
+        cost = run["cost"].values
         for window, times in slices.items():
             yield Measure("cost", "", window, bootstrap.estimate(cost[:, times].mean(axis=1)), "1")
-        yield Measure("return", "", "all", bootstrap.estimate(-capped.sum(axis=1)), "1")
-        beyond = (cost > dataset.attrs["huber_bound"] ** 2).mean(axis=1)
-        yield Measure("beyond_huber_bound", "", "all", bootstrap.estimate(beyond), "1")
+        yield Measure("return", "", "all", bootstrap.estimate(-run["charge"].values.sum(axis=1)), "1")
 
 
 def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
@@ -215,7 +213,7 @@ def tidy_records(
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval); ``mean_mode_probability``; ``cost`` (uncapped mean),
-    ``return`` (of the capped reward), ``beyond_huber_bound`` (share of measurements where the cap binds).
+    ``return`` (sum of the rewards).
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is

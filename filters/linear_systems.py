@@ -271,8 +271,18 @@ def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
         )
 
 
-def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Matrix) -> Matrix:
-    """Feedback gain L of ``u = -L x`` that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
+class Regulator(NamedTuple):
+    """Optimal control of a linear plant by quadratic cost, all of its state known."""
+
+    feedback: Matrix
+    """L of ``u = -L x``, ``(r, n)``."""
+    regret: Matrix
+    """``R + B^T S B``, ``(r, r)``: a control that is d away from the optimal one costs ``d^T (R + B^T S B) d`` more in
+    all, by completing the square in Bellman's equation with the value ``x^T S x``."""
+
+
+def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Matrix) -> Regulator:
+    """Control that minimises the sum of ``x^T W x + u^T R u`` (discrete LQR).
 
     Args:
         F: ``(n, n)``.
@@ -287,7 +297,8 @@ def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Mat
 
     _check_regulator(F, B, weight, control_weight)
     S = solve_discrete_are(F, B, weight, control_weight)
-    return numpy.linalg.solve(control_weight + B.T @ S @ B, B.T @ S @ F)
+    regret = control_weight + B.T @ S @ B
+    return Regulator(numpy.linalg.solve(regret, B.T @ S @ F), regret)
 
 
 def stationary_covariance(F: Matrix, Q: Matrix) -> Matrix:

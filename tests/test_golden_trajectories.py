@@ -1,12 +1,13 @@
-"""Stored trajectories: a change of dynamics, observation or reward must bump the version of the id.
+"""Stored trajectories: a change of what is seen, done or paid raises ``interface``, later the version of the id.
 
 One file for each id and control, ``golden/<Name>-<control>.json``: seed, actions, and what they led to in the
 default scenario. A new environment or control gets its files by
 
     python tests/test_golden_trajectories.py
 
-which writes those that are missing and leaves the others alone. To accept a change, bump the version, delete
-the file and run it again.
+which writes those that are missing and leaves the others alone. To accept a change, raise the task's ``interface``, by
+which agents that were trained before are refused, delete the file and run it again. Once 0.1.0 is tagged, the version of
+the id goes up instead.
 """
 
 import json
@@ -37,7 +38,8 @@ def trajectory(env_id, control, actions, backend="numpy"):
         shown.append(observation.tolist())
         paid.append(reward)
     fields = [field.name for field in env.unwrapped.observation_fields]
-    return {"fields": fields, "observations": shown, "rewards": paid}
+    interface = env.unwrapped.task.interface
+    return {"interface": interface, "fields": fields, "observations": shown, "rewards": paid}
 
 
 @pytest.mark.parametrize("backend", ["numpy", "compiled"])
@@ -50,6 +52,7 @@ def test_trajectory_is_the_stored_one(env_id, control, backend):
     )
     stored = json.loads(path.read_text())
     now = trajectory(env_id, control, stored["actions"], backend)
+    assert now["interface"] == stored["interface"]
     assert now["fields"] == stored["fields"]
     # Processors differ below this.
     np.testing.assert_allclose(now["observations"], stored["observations"], rtol=1e-6, atol=1e-6)

@@ -91,7 +91,7 @@ def test_kalman_bucy_golden_numbers() -> None:
 def test_regulator_golden_numbers() -> None:
     A, B = numpy.array([[0.0, 1.0], [0.0, 0.0]]), numpy.array([[0.0], [1.0]])
     F, held = linear_systems.zero_order_hold(A, B, 0.25)
-    L = linear_systems.discrete_regulator(F, held, numpy.eye(2), numpy.eye(1))
+    L = linear_systems.discrete_regulator(F, held, numpy.eye(2), numpy.eye(1)).feedback
     numpy.testing.assert_allclose(L, [[0.80578, 1.50361]], atol=5e-6)  # five printed digits
     assert linear_systems.feedforward_gain(F, held, numpy.array([1.0, 0.0]), L) == pytest.approx(
         0.80578, abs=5e-6
@@ -107,7 +107,7 @@ def test_regulator_is_the_limit_of_backward_dynamic_programming(seed: int) -> No
     for _ in range(2000):
         L = numpy.linalg.solve(R + B.T @ S @ B, B.T @ S @ F)
         S = W + F.T @ S @ (F - B @ L)
-    numpy.testing.assert_allclose(linear_systems.discrete_regulator(F, B, W, R), L, rtol=1e-8, atol=1e-10)
+    numpy.testing.assert_allclose(linear_systems.discrete_regulator(F, B, W, R).feedback, L, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -135,7 +135,7 @@ def test_separation_holds_for_any_gain_and_the_lyapunov_equation_agrees_with_sim
     rng = numpy.random.default_rng(seed)
     F, B, H = rng.standard_normal((3, 3)) * 0.5, rng.standard_normal((3, 1)), rng.standard_normal((2, 3))
     Q, R = random_covariance(rng, 3), numpy.eye(2)
-    L = linear_systems.discrete_regulator(F, B, numpy.eye(3), numpy.eye(1))
+    L = linear_systems.discrete_regulator(F, B, numpy.eye(3), numpy.eye(1)).feedback
     K = linear_systems.steady_kalman(F, H, 4.0 * Q, R).gain  # not the gain for Q
     assert linear_systems.separation_defect(F, B, H, L, K) < 1e-10
     loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)

@@ -3,9 +3,8 @@
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
-import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy
 
@@ -22,7 +21,6 @@ from .estimators import (
 )
 from .metrics import metrics
 from .references import KnownNoiseBound, Matched, TrueState
-from .theory import OVER_SMOOTHED, WIDE_BAND
 
 
 class FixedScale(ConstantPolicy):
@@ -42,28 +40,33 @@ class Kalman(FixedScale):
     """The paper's filter, equations (10)-(12): the process noise is what the design says."""
 
 
-class OverSmoothed(FixedScale):
-    """A filter that trusts its model too much: process noise times 0.01."""
-
-    def __init__(self, task: UavAutopilot) -> None:
-        super().__init__(task, math.log10(OVER_SMOOTHED))
-
-
-class WideBand(FixedScale):
-    """A filter that trusts its sensors too much: process noise times 100."""
-
-    def __init__(self, task: UavAutopilot) -> None:
-        super().__init__(task, math.log10(WIDE_BAND))
-
-
-class RawSensors(Policy):
-    """No filter: the readings are fed back, the last valid one during a dropout."""
+class FixedMode(Policy):
+    """One mode, never changed."""
 
     control = "mode"
+    mode: ClassVar[str]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Name the mode."""
-        return numpy.full(len(observation), MODES.index("raw-sensors")), None
+        return numpy.full(len(observation), MODES.index(self.mode)), None
+
+
+class OverSmoothed(FixedMode):
+    """A filter that trusts its model too much: process noise times 0.01."""
+
+    mode = "over-smoothed"
+
+
+class WideBand(FixedMode):
+    """A filter that trusts its sensors too much: process noise times 100."""
+
+    mode = "wide-band"
+
+
+class RawSensors(FixedMode):
+    """No filter: the readings are fed back, the last valid one during a dropout."""
+
+    mode = "raw-sensors"
 
 
 class InnovationAdaptive(Policy):
@@ -138,7 +141,7 @@ _MEMORIES_START = {"memory": 100.0, "gust_memory": 100.0}
 TUNABLE = {
     "fixed-best": Tunable(
         "gain",
-        {"log10_scale": (-2.0, 2.0)},
+        {"log10_scale": (-1.0, 1.0)},
         {"log10_scale": 0.0},
         lambda values: ({}, lambda task: FixedScale(task, values["log10_scale"])),
     ),

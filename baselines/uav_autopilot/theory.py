@@ -1,15 +1,11 @@
 """The settled loop of UavAutopilot without command, by the Lyapunov equation."""
 
-import math
 from typing import NamedTuple
 
 import numpy
 
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...filters import linear_systems
-
-OVER_SMOOTHED, WIDE_BAND = 0.01, 100.0
-"""Factors on the process noise of the two badly tuned filters."""
 
 
 class Stationary(NamedTuple):
@@ -44,8 +40,8 @@ def stationary(task: UavAutopilot, name: str) -> Stationary | None:
         "kalman": 1.0,
         "matched": 1.0,
         "steady-kalman": 1.0,
-        "over-smoothed": OVER_SMOOTHED,
-        "wide-band": WIDE_BAND,
+        "over-smoothed": p.over_smoothed_scale,
+        "wide-band": p.wide_band_scale,
     }
     if name == "true-state":
         X = linear_systems.stationary_covariance(F - B @ L, Q)
@@ -57,7 +53,7 @@ def stationary(task: UavAutopilot, name: str) -> Stationary | None:
         X = linear_systems.stationary_covariance(*loop)
         raw = L @ H.T
         control = float((raw @ (H @ X @ H.T + R) @ raw.T)[0, 0])
-    elif name in scales and abs(math.log10(scales[name])) <= p.gain_decades:
+    elif name in scales:
         K = linear_systems.steady_kalman(F, H, scales[name] * Q, R).gain
         both = linear_systems.stationary_covariance(
             *linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)

@@ -207,7 +207,7 @@ class InvertedPendulum(Task):
     }
     components = (Component("angle", "rad"), Component("rate", "rad/s"))
     cost_description = "squared angle over the variance of the sensor"
-    huber_bound = 60.0
+    reward_unit = 1.0
     paper_policy = PaperPolicy("gain", (0.0,))
 
     def set_up(self) -> None:

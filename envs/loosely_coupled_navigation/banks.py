@@ -1,4 +1,5 @@
-"""The Kalman-Bucy schemes of LooselyCoupledNavigation that are steered: one filter by its gain, or three by weights.
+"""The Kalman-Bucy schemes of LooselyCoupledNavigation that are steered: one by its noises or its gain, or three by
+weights.
 
 Equations stand in ``filters/loosely_coupled.py``; (3) is ``Xh' = Xh + dX, nu = Z - Xh', Xh = Xh' + gain nu``.
 """
@@ -14,7 +15,7 @@ from ...filters import imm
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
-from ..observation import KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Compression, Quantity
+from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Compression, Quantity
 from ..task import Bank, Initial, Task
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .world import Measurement
@@ -53,6 +54,24 @@ class Steered(NamedTuple):
     """Last action, ``(A, N)``."""
     gain: Array
     """Gain in force, zero without a measurement, ``(A, N)``."""
+
+
+class Augmented(NamedTuple):
+    """The augmented filter with the noises of the action."""
+
+    position: Array
+    """Xh, predicted to the measurement or updated by it, m, ``(A, N)``."""
+    drift: Array
+    """Estimate of beta, ``(A, N)``, m/s."""
+    coloured: Array
+    """Of eta, likewise."""
+    covariance: ins_gnss.AugmentedCovariance
+    """After the last measurement that was acted on, the same for all axes, ``(N,)`` each."""
+    deviation: Array
+    """Standard deviation of the position predicted with the noises of the last action, m, ``(N,)``."""
+    seen: Innovations
+    action: Array
+    """Last action, ``(3, N)``."""
 
 
 class Schemes(NamedTuple):
@@ -105,6 +124,7 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
                 lambda f, measurement: measurement.available * f.seen.normalised,
                 "innovation over its predicted standard deviation",
                 each,
+                SIGNED_LOG,
                 over_interval="mean",
             ),
             Block(
@@ -118,8 +138,9 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
             Block(
                 "average_innovation",
                 lambda f, _: f.seen.average,
-                "short average of innovation_over_sigma",
+                "short average of the innovation over its predicted standard deviation",
                 each,
+                SIGNED_LOG,
             ),
             Block(
                 "average_square",
@@ -133,6 +154,7 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
                 lambda f, _: f.seen.average_product,
                 "short average of its product with the one before",
                 each,
+                SIGNED_LOG,
             ),
             Block(
                 "reported_noise",
@@ -202,6 +224,108 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
         )
 
 
+NOISES = ("receiver", "coloured", "white")
+"""What the action scales under ``noise``."""
+
+
+class NoiseBank(_KalmanBucyBank):
+    """Control ``noise``: the augmented filter, which takes the noises to be what the action says."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What every filter shows, and the deviation that this one predicts."""
+        nominal = math.sqrt(self.parameters.receiver_variance)
+        return (
+            *super().blocks,
+            Block(
+                "predicted_deviation",
+                lambda f, _: self.xp.log(f.deviation / nominal),
+                "the predicted standard deviation of the position over the nominal one of a measurement",
+                shown=KEPT_AS_LOG,
+            ),
+        )
+
+    def last_action(self) -> Block:
+        """Block of the action applied before."""
+        return Block("last_action", lambda f, _: f.action, "action applied before", NOISES)
+
+    def start(self, initial: Initial) -> Augmented:
+        """Start where INS and reference agree, with the modelled prior of the rate errors."""
+        zero = 0.0 * initial.mean
+        covariance = modelled_prior(self.parameters, zero[0])
+        return Augmented(
+            position=initial.mean,
+            drift=zero,
+            coloured=zero,
+            covariance=covariance,
+            deviation=zero[0],
+            seen=self.none_seen(zero),
+            action=self.xp.stack([zero[0]] * len(NOISES)),
+        )
+
+    def predicted_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
+        """Covariance predicted to the measurement with the noises of an action."""
+        p, xp = self.parameters, self.xp
+        coloured, white = xp.exp(math.log(p.process_scale) * action[1:])
+        growth, displacement = p.modelled_growth
+        residual = p.coloured**2 * p.sampling.residual
+        white_growth = coloured * residual + white * (displacement - residual)
+        return ins_gnss.predict_augmented(state.covariance, p.sampling, coloured * growth, white_growth)
+
+    def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
+        """Predict by the increment of the INS less the estimated rate errors; show it with the last action's noises."""
+        s = self.parameters.sampling
+        position = state.position + measurement.increment - (s.step * state.drift + s.drive * state.coloured)
+        variance = self.predicted_covariance(state, state.action).position
+        return state._replace(
+            position=position,
+            coloured=s.decay * state.coloured,
+            deviation=self.xp.sqrt(variance),
+            seen=self.compared(state.seen, measurement, position, variance),
+        )
+
+    def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
+        """Update by the Kalman gain that follows from the noises of the action."""
+        xp, p, innovation = self.xp, self.parameters, state.seen.innovation
+        action = xp.clip(action, -1.0, 1.0)
+        up, down = math.log(p.receiver_scale), math.log(p.receiver_reduction)
+        scale = xp.exp(xp.where(action[0] > 0.0, up * action[0], down * action[0]))
+        R = scale * measurement.reported_deviation * measurement.reported_deviation
+        predicted = self.predicted_covariance(state, action)
+        gain, P = ins_gnss.update_augmented(predicted, R, measurement.available)
+        return state._replace(
+            position=state.position + gain.position * innovation,
+            # The innovation of the position is minus that of the INS error delta.
+            drift=state.drift - gain.drift * innovation,
+            coloured=state.coloured - gain.coloured * innovation,
+            covariance=P,
+            action=action,
+        )
+
+    def mean(self, state: Augmented) -> Array:
+        """Position, ``(A, N)``, m."""
+        return state.position
+
+    def covariance(self, state: Augmented) -> Array:
+        """Covariance of the filter, ``(A, A, N)``, m^2."""
+        return self.eye * state.covariance.position
+
+    def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
+        """NIS (NaN without a measurement)."""
+        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
+        return {
+            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
+            "nis_degrees": self.parameters.axes * measurement.available,
+        }
+
+
+def modelled_prior(p: LooselyCoupledNavigationParameters, none: Array) -> ins_gnss.AugmentedCovariance:
+    """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
+    return ins_gnss.AugmentedCovariance(none, none, none, none + p.drift**2, none, none + p.coloured**2)
+
+
 class GainBank(_KalmanBucyBank):
     """Control ``gain``: the plain scheme, whose gain on every axis the action sets."""
 
@@ -209,6 +333,9 @@ class GainBank(_KalmanBucyBank):
         super().__init__(task)
         p = self.parameters
         self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
+        smallest = math.log(p.smallest_gain)
+        self.middle = min(max(math.log(p.settled_gains[1]), 0.9 * smallest), 0.1 * smallest)
+        """Logarithm of the gain at action 0: of the paper's, where that leaves room on both sides."""
 
     @property
     def action_space(self) -> gymnasium.Space:
@@ -233,9 +360,10 @@ class GainBank(_KalmanBucyBank):
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
-        """Gain that an action sets, logarithmic between the smallest one and 1, zero at the lower end."""
-        gain = self.xp.exp((0.5 * math.log(self.parameters.smallest_gain)) * (1.0 - action))
-        return self.xp.where(action <= -1.0, 0.0, gain)
+        """Gain that an action sets, logarithmic from the paper's at 0 to 1 at 1 and to the smallest; zero at -1."""
+        middle, smallest = self.middle, math.log(self.parameters.smallest_gain)
+        slope = self.xp.where(action > 0.0, -middle, middle - smallest)
+        return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + slope * action))
 
     def action_for_gain(self, gain: Any) -> Any:
         """Action that sets gains, NumPy: the inverse of :meth:`gain`; the smallest one and less count as zero.
@@ -246,9 +374,10 @@ class GainBank(_KalmanBucyBank):
         gain = numpy.asarray(gain)
         if not ((gain >= 0.0) & (gain <= 1.0)).all():
             raise ValueError(f"gain must lie in [0, 1], got {gain!r}")
-        smallest = self.parameters.smallest_gain
-        logarithm = numpy.log(numpy.maximum(gain, smallest)) / math.log(smallest)
-        return numpy.where(gain <= smallest, -1.0, 1.0 - 2.0 * logarithm)
+        smallest, middle = self.parameters.smallest_gain, self.middle
+        beyond = numpy.log(numpy.maximum(gain, smallest)) - middle
+        action = beyond / numpy.where(beyond > 0.0, -middle, middle - math.log(smallest))
+        return numpy.where(gain <= smallest, -1.0, action)
 
     def act(self, state: Steered, measurement: Measurement, action: Array) -> Steered:
         """Update by the gain of the action; without a measurement the gain is zero."""
@@ -310,15 +439,12 @@ class SchemeBank(_KalmanBucyBank):
         xp, p = self.xp, self.parameters
         zero = 0.0 * initial.mean
         each = xp.stack([zero] * 3)
-        none = zero[0]
         return Schemes(
             position=each + initial.mean,
             plain_variance=each[:2, :1],
             drift=zero,
             coloured=zero,
-            covariance=ins_gnss.AugmentedCovariance(
-                none, none, none, none + p.drift**2, none, none + p.coloured**2
-            ),
+            covariance=modelled_prior(p, zero[0]),
             seen=self.none_seen(each),
             weights=each[:, 0],
         )

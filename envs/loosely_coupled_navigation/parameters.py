@@ -90,6 +90,15 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     smallest_gain: float = parameter(1e-5, above=0.0, below=1.0)
     """Lowest gain but zero that an action can set; ours: K = 0.001 1/s."""
 
+    receiver_scale: float = parameter(100.0, above=1.0, at_most=1e6)
+    """Largest factor of the variance of a measurement under control ``noise``; ours: that of the jamming."""
+    receiver_reduction: float = parameter(10**0.5, above=1.0, at_most=1e6)
+    """Largest divisor of it; ours: the best receiver of ``random``. One that is trusted far more than it deserves for
+    a moment takes the filter with it."""
+    process_scale: float = parameter(10.0, above=1.0, at_most=1e6)
+    """Largest factor and divisor of the coloured and the white rate error's intensities under control ``noise``;
+    ours."""
+
     def __post_init__(self) -> None:
         """Turn the duration into a horizon, and check every field."""
         if self.duration is not None:

@@ -13,7 +13,7 @@ Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 an
 from typing import Any
 
 from ..task import Component, PaperPolicy, Task
-from .banks import SCHEMES, GainBank, SchemeBank
+from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import InsGnssWorld
@@ -82,6 +82,7 @@ class LooselyCoupledNavigation(Task):
     """
 
     id = "filtergym/LooselyCoupledNavigation-v0"
+    interface = 2
     paper_source = (
         "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
         "navigation complexes (in Russian)"
@@ -89,19 +90,21 @@ class LooselyCoupledNavigation(Task):
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
     actions = {
-        "gain": "gain of this sample, `1e-5^((1 - a) / 2)`: 1e-5 to 1 on a logarithmic scale; exactly 0 "
-        "(INS only) at -1, exactly 1 (GNSS only) at +1. In continuous time `K = gain / "
-        "sampling_interval`. Zero is `gain = 0.0032`, `K = 0.32 1/s`; the paper's reduced tuning "
-        "is about 0.45 (`K = 4.2 1/s`)",
+        "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
+        "`receiver_scale` to the power of a positive, `receiver_reduction` to that of a negative action for the "
+        "receiver, `process_scale` for the coloured and the white rate error; **0 is the paper's augmented filter**",
+        "gain": "gain of this sample, logarithmic from the settled gain of the paper's reduced tuning (0.042, "
+        "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
+        "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
         "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
-    banks = {"gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
+    banks = {"noise": NoiseBank, "gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
     scenarios = SCENARIOS
     modes = SCHEMES
     cost_description = "squared error of position over the nominal variance of a measurement"
-    huber_bound = 30.0
-    paper_policy = PaperPolicy("gain", (0.447,))
+    reward_unit = 0.07
+    paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: LooselyCoupledNavigationParameters
 

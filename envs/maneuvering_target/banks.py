@@ -75,6 +75,8 @@ class Filters(NamedTuple):
     """``(M, N)``."""
     average_log_squared: Array
     """``(M, N)``."""
+    alpha: Array
+    """Position gains used last, ``(M, N)``."""
 
 
 class _RadarBank(Bank[Task, Measurement, Any]):
@@ -360,6 +362,7 @@ class FilterBank(_RadarBank):
             average_innovation=zeros,
             log_squared=zeros[0],
             average_log_squared=zeros[0],
+            alpha=self.gain_alpha + zeros[0],
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
@@ -386,6 +389,7 @@ class FilterBank(_RadarBank):
             self.averaged(bank.average_innovation, normalised),
             log_squared,
             self.averaged(bank.average_log_squared, log_squared),
+            bank.alpha,
         )
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
@@ -398,14 +402,17 @@ class FilterBank(_RadarBank):
             self.parameters.evidence_scale,
             self.xp,
         )
-        alpha, beta = self.gain_alpha, self.gain_beta
+        return self._updated(state, measurement, self.gain_alpha, self.gain_beta)._replace(
+            probabilities=probabilities
+        )
+
+    def _updated(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
+        """Update every filter by its gains."""
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, self.T)
         covariance = alpha_beta.update_joint_covariance(
             state.covariance, measurement.variance[:, None], alpha, beta, self.T
         )
-        return state._replace(
-            mean=self.xp.concat(updated), covariance=covariance, probabilities=probabilities
-        )
+        return state._replace(mean=self.xp.concat(updated), covariance=covariance)
 
     def mean(self, state: Filters) -> Array:
         """Combination of the filters (15), ``(4, N)``."""
@@ -421,3 +428,33 @@ class FilterBank(_RadarBank):
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         nis = log_density(innovation, S)[1]
         return {"nis": nis, "nis_degrees": 2.0 + 0.0 * nis, "mode_probability": state.probabilities}
+
+
+class SteeredFilterBank(FilterBank):
+    """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """A number for each filter."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (self.count,), numpy.float32)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What every bank shows, and the gains."""
+        each = tuple(str(j + 1) for j in range(self.count))
+        return (*super().blocks, Block("last_alpha", lambda f, _: f.alpha, "position gain used last", each))
+
+    def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
+        """Update every filter with its gain, ``logit alpha = logit gain + gain_logits a``, and weigh by Bayes' rule."""
+        xp = self.xp
+        moved = self.logit + self.parameters.gain_logits * xp.clip(action, -1.0, 1.0)
+        alpha = 1.0 / (1.0 + xp.exp(-moved))
+        beta = alpha_beta.benedict_bordner_beta(alpha)
+        probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
+        return self._updated(state, measurement, alpha, beta)._replace(
+            probabilities=probabilities, alpha=alpha
+        )

@@ -33,6 +33,9 @@ class ManeuveringTargetParameters(TaskParameters):
     alpha_range: tuple[float, float] = parameter((0.05, 0.95), above=0.0, below=1.0, ascending=True)
     """Position gain at action -1 and +1 of control ``gain`` (ours: stable, and wide enough for the best
     schedule that knows the manoeuvre, which uses 0.07 to 0.88)."""
+    gain_logits: float = parameter(2.0, above=0.0, at_most=10.0)
+    """Logits by which an action of one moves a filter's position gain under control ``gains`` (ours: from 0.3 to 0.05
+    or 0.76, from 0.7 to 0.24 or 0.95, what the best schedule that knows the manoeuvre uses)."""
     evidence_scale: float = parameter(4.0, above=0.0)
     """Nats that an evidence of one adds to a mode's log-posterior (ours)."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)

@@ -13,7 +13,7 @@ import numpy
 from ..parameters import check, declared, frozen
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
-from .banks import FilterBank, GainBank
+from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
 from .scenarios import SCENARIOS
 from .world import RadarWorld
@@ -71,6 +71,7 @@ class ManeuveringTarget(Task):
     """
 
     id = "filtergym/ManeuveringTarget-v0"
+    interface = 2
     paper_source = (
         "P. A. Bakulev, M. I. Sychev, Nguyen Trong Luu, Tracking a manoeuvring target with an IMM algorithm "
         "over two alpha-beta filters (in Russian)"
@@ -78,13 +79,21 @@ class ManeuveringTarget(Task):
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
     actions = {
+        "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
+        "the beta that belongs to it; **0 is the paper's IMM**",
         "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
         "beta = alpha^2 / (2 - alpha)",
         "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
         "weights": "weights of the bank, normalised; all zero is uniform",
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
     }
-    banks = {"gain": GainBank, "mode": FilterBank, "weights": FilterBank, "evidence": FilterBank}
+    banks = {
+        "evidence": FilterBank,
+        "gains": SteeredFilterBank,
+        "gain": GainBank,
+        "mode": FilterBank,
+        "weights": FilterBank,
+    }
     scenarios = SCENARIOS
     components = (
         Component("position_x", "m"),
@@ -94,7 +103,7 @@ class ManeuveringTarget(Task):
     )
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
     cost_description = "squared position error over the squared range sigma"
-    huber_bound = 60.0
+    reward_unit = 5.2
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))
 
     parameters: ManeuveringTargetParameters

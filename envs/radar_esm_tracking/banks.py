@@ -14,7 +14,7 @@ import numpy
 from ...filters import class_fusion, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
-from ..observation import KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, scaled
+from ..observation import BOUNDED_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, scaled
 from ..task import Bank
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start
@@ -57,6 +57,9 @@ class Filters(NamedTuple):
     """Decisions for each type so far that the gate refused, ``(J, N)``."""
     probabilities: Array
     """Weights in force, ``(M, N)``."""
+    believed: Array
+    """Probabilities of the classes that the next scan starts from, ``(M, N)``: Bayes' own under ``evidence``, otherwise
+    the weights in force."""
 
 
 class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
@@ -121,7 +124,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             ),
             Block(
                 "accumulated_log_likelihood", lambda f, _: f.accumulated - xp.max(f.accumulated, axis=0),
-                "the sum of the log-likelihoods since the start minus the largest, nats", classes, SIGNED_LOG,
+                "the sum of the log-likelihoods since the start minus the largest, nats", classes, BOUNDED_LOG,
             ),
             Block(
                 "log_squared_innovation", lambda f, _: f.log_squared, "the normalised innovation squared",
@@ -167,6 +170,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         log_predicted = self.log_prior + zero
         no_counts = xp.stack([zero[0]] * self.task.types)
         used, used_counts, refused_counts = self._counted(no_counts, no_counts, initial.first)
+        probabilities = imm.mode_posterior(log_predicted, self._esm_log_likelihood(used, initial.first))
         return Filters(
             mean=mean,
             covariance=self.start_covariance + zero[0],
@@ -180,7 +184,8 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             used=used,
             used_counts=used_counts,
             refused_counts=refused_counts,
-            probabilities=imm.mode_posterior(log_predicted, self._esm_log_likelihood(used, initial.first)),
+            probabilities=probabilities,
+            believed=probabilities,
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
@@ -188,7 +193,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         xp, models, f = self.xp, self.task.models, state
         if self.mixes:
             mean, covariance, log_predicted, innovation, log_likelihood = class_fusion.advance(
-                f.probabilities, f.mean, f.covariance, measurement.radar, models, self.class_transition
+                f.believed, f.mean, f.covariance, measurement.radar, models, self.class_transition
             )
         else:
             channels, column = self.channels, xp.clip(measurement.scan, 0, self.last_scan)
@@ -202,7 +207,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
                 xp.take(channels.log_normaliser, column, axis=-1),
             )
             covariance = xp.take(channels.covariance, column, axis=-1)
-            log_predicted = imm.log_probabilities(f.probabilities) + log_likelihood
+            log_predicted = imm.log_probabilities(f.believed) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
         used, used_counts, refused_counts = self._counted(f.used_counts, f.refused_counts, measurement)
         return Filters(
@@ -219,6 +224,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             used_counts,
             refused_counts,
             f.probabilities,
+            f.believed,
         )
 
     def _averaged(self, old: Array, new: Array) -> Array:
@@ -241,16 +247,12 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         return self.xp.take(self.log_esm, usable, axis=1)
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
-        """Put the weights of the action in force."""
-        probabilities = bank_probabilities(
-            self.task.control,
-            action,
-            state.log_predicted,
-            self._esm_log_likelihood(state.used, measurement),
-            self.parameters.evidence_scale,
-            self.xp,
-        )
-        return state._replace(probabilities=probabilities)
+        """Put the weights of the action in force; evidence is added to this scan's weights only."""
+        log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
+        control, scale = self.task.control, self.parameters.evidence_scale
+        probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
+        believed = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
+        return state._replace(probabilities=probabilities, believed=believed)
 
     # --- what comes out
 

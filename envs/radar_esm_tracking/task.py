@@ -95,6 +95,7 @@ class RadarEsmTracking(Task):
     """
 
     id = "filtergym/RadarEsmTracking-v0"
+    interface = 2
     paper_source = (
         "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "
         "recognition of the target's class (in Russian)"
@@ -118,7 +119,7 @@ class RadarEsmTracking(Task):
         "mean of the squared errors of range, range rate and acceleration over range_scale, range_rate_scale "
         "and acceleration_scale"
     )
-    huber_bound = 10.0
+    reward_unit = 0.3
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: RadarEsmTrackingParameters

@@ -18,7 +18,7 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
-from ..observation import LOG1P, SIGNED_LOG, Array, Block, Quantity, scaled
+from ..observation import BOUNDED_LOG, SIGNED_LOG, Array, Block, Quantity
 from ..task import Bank, Initial, Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
@@ -98,7 +98,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             return Block(
                 f"{name}_innovation", lambda f, y: y.available[part] * f.range_innovation[part] / sigma,
                 f"the {name}'s innovation at the combined prediction over sigma; 0 where it is missing",
-                slots, SIGNED_LOG,
+                slots, BOUNDED_LOG,
             )  # fmt: skip
 
         def available(name: str, sensor: SensorGroup) -> Block:
@@ -111,15 +111,16 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             Block(
                 "nis", lambda f, y: f.nis / self._present(y),
                 "the normalised innovation squared per reading, of a group of sensors given those before it",
-                each, LOG1P, over_interval="mean",
+                each, BOUNDED_LOG, over_interval="mean",
             ),
             Block(
                 "average_nis", lambda f, y: f.average_nis,
-                f"the short average of the same, over {p.averaging_measurements:g} measurements", each, LOG1P,
+                f"the short average of the same, over {p.averaging_measurements:g} measurements", each,
+                BOUNDED_LOG,
             ),
             Block(
                 "log_likelihood", lambda f, y: f.log_likelihood - xp.max(f.log_likelihood, axis=0),
-                "the log-likelihood minus the largest one, nats", HYPOTHESES, SIGNED_LOG,
+                "the log-likelihood minus the largest one, nats", HYPOTHESES, BOUNDED_LOG,
             ),
             Block(
                 "log_predicted", lambda f, y: f.predicted.log_probabilities,
@@ -127,15 +128,10 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             ),
             Block(
                 "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
-                ("forward", "right", "down"), unit=f"{p.gravity:g} m/s^2",
+                ("forward", "right", "down"), SIGNED_LOG, unit=f"{p.gravity:g} m/s^2",
             ),
             innovation("pseudorange", ranges),
             innovation("rate", rates),
-            Block(
-                "elevation", lambda f, y: task.elevations_at(y.number) / (0.5 * math.pi), "elevation", slots,
-                unit="pi/2 rad",
-            ),
-            Block("cn0", lambda f, y: y.cn0, "C/N0 less 45 dB-Hz", slots, scaled(0.1, 45.0), "10 dB-Hz"),
             available("pseudorange", ranges),
             available("rate", rates),
             Block(

@@ -142,10 +142,14 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """That the accelerometers stick at their last reading for a while. Ours."""
     stick_duration: tuple[float, float] = parameter((0.3, 1.0), at_least=0.0, ascending=True)
     """s. Ours."""
-    rates_outage: float = parameter(0.0, at_least=0.0)
-    """How long all rates are lost, s. Ours."""
-    satellites_outage: float = parameter(0.0, at_least=0.0)
-    """How long two satellites drop out, s. Ours."""
+    rates_outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That all rates are lost for a while. Ours."""
+    rates_outage_duration: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
+    """s. Ours."""
+    satellites_outage_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That two satellites drop out for a while. Ours."""
+    satellites_outage_duration: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
+    """s. Ours."""
     urban: bool = False
     """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""
@@ -187,8 +191,8 @@ class TightlyCoupledNavigationParameters(TaskParameters):
         sized("initial_probabilities", self.initial_probabilities, len(HYPOTHESES))
         if not self.satellites or len(set(self.satellites)) != len(self.satellites):
             raise ValueError(f"satellites must be different slots, at least one, got {self.satellites!r}")
-        if self.satellites_outage > 0.0 and len(self.satellites) < 2:
-            raise ValueError(f"satellites_outage takes two satellites, got {self.satellites!r}")
+        if self.satellites_outage_probability > 0.0 and len(self.satellites) < 2:
+            raise ValueError(f"satellites_outage_probability takes two satellites, got {self.satellites!r}")
         times = self.epoch + self.sampling_interval * numpy.array([0.0, self.horizon + 1.0])
         local, _ = satellites.local_orbits(self.satellites, times, *self.site)
         lowest = satellites.look_angles(local)[1].min(axis=1) / DEGREE

@@ -50,22 +50,27 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 "random",
-                "Legs of rest, constant velocity and manoeuvre at random, with a noisy rate channel or stuck "
-                "accelerometers for a while: the training distribution.",
-                {},
+                "Legs of rest, constant velocity and manoeuvre at random; a noisy rate channel, stuck accelerometers, "
+                "lost rates or hidden satellites for a while: the training distribution.",
+                {
+                    "rates_outage_probability": 0.2,
+                    "rates_outage_duration": (0.1, 1.0),
+                    "satellites_outage_probability": 0.2,
+                    "satellites_outage_duration": (0.5, 3.0),
+                },
                 RANDOM_WINDOWS,
                 training=True,
             ),
             Scenario(
                 "rates-lost",
                 "As random without faults; all pseudorange rates are lost for 2 s.",
-                {**HEALTHY, "rates_outage": 2.0},
+                {**HEALTHY, "rates_outage_probability": 1.0},
                 RANDOM_WINDOWS,
             ),
             Scenario(
                 "two-satellites",
                 "As random without faults; two of the satellites drop out for 2 s.",
-                {**HEALTHY, "satellites_outage": 2.0},
+                {**HEALTHY, "satellites_outage_probability": 1.0},
                 RANDOM_WINDOWS,
             ),
             Scenario(

@@ -58,7 +58,7 @@ class TightlyCoupledNavigation(Task):
     normalised innovation squared by sensor group (now, and as a short average; given the groups before it in
     the order of the action `gain`), the log-likelihood relative to the largest, the predicted
     log-probability; the accelerometers; the innovations of pseudoranges and rates at the combined prediction;
-    elevation, C/N0 and availability of every satellite; the time; the last action.
+    availability of every satellite; the time; the last action.
 
     ## Rewards
 
@@ -87,6 +87,7 @@ class TightlyCoupledNavigation(Task):
     """
 
     id = "filtergym/TightlyCoupledNavigation-v0"
+    interface = 2
     paper_source = (
         "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "
         "inertial-satellite navigation system, Military Academy of the Republic of Belarus (in Russian)"
@@ -131,7 +132,7 @@ class TightlyCoupledNavigation(Task):
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix"
     )
-    huber_bound = 100.0
+    reward_unit = 1.0
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: TightlyCoupledNavigationParameters
@@ -154,7 +155,6 @@ class TightlyCoupledNavigation(Task):
         local, velocity = satellites.local_orbits(p.satellites, times, *p.site)
         self._satellite_position = constant(local)
         self._satellite_velocity = constant(velocity)
-        self._elevation = constant(satellites.look_angles(local)[1])
 
         self.common = gnss_ins.common_model(
             T,
@@ -185,10 +185,6 @@ class TightlyCoupledNavigation(Task):
             self.xp.take(self._satellite_position, row, axis=2),
             self.xp.take(self._satellite_velocity, row, axis=2),
         )
-
-    def elevations_at(self, number: Array) -> Array:
-        """Elevation of the satellites at a measurement, ``(S, N)``, rad."""
-        return self.xp.take(self._elevation, self._row(number), axis=1)
 
     def feedback(self, mean: Array, measurement: Any) -> Array | None:
         """State that tracking loops expect next, ``(17, N)``: the estimate, extrapolated as in a manoeuvre."""

@@ -228,14 +228,11 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             happens, start = draws.event(name, probability), draws.unit(f"{name}_start")
             return xp.where(happens, window(start, draws.uniform(f"{name}_duration", seconds)), -1.0)
 
-        def always(name: str, seconds: float) -> Array:
-            start = draws.unit(f"{name}_start")
-            return window(start, 0.0 * start + seconds)
-
         noisy = sometimes("noisy", p.rate_fault_probability, p.rate_fault_duration)
         noisy_satellite = draws.integer("noisy_satellite", (0, S - 1))
         stuck = sometimes("stuck", p.stick_probability, p.stick_duration)
-        no_rates, hidden = always("no_rates", p.rates_outage), always("hidden", p.satellites_outage)
+        no_rates = sometimes("no_rates", p.rates_outage_probability, p.rates_outage_duration)
+        hidden = sometimes("hidden", p.satellites_outage_probability, p.satellites_outage_duration)
         first = draws.integer("hidden_satellite", (0, S - 1))
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
         return Faults(noisy, noisy_satellite, stuck, no_rates, hidden, xp.stack([first, second]))

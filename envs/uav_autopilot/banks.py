@@ -17,9 +17,9 @@ from .world import Measurement, Start
 if TYPE_CHECKING:
     from .task import UavAutopilot
 
-MODES = ("nominal", "wide-band", "raw-sensors")
-FLOORED_LOG = Compression("log of ", lambda value, xp: xp.log(xp.clip(value, 1e-6, None)), numpy.exp)
-"""The logarithm of squares, which may be zero."""
+MODES = ("nominal", "wide-band", "raw-sensors", "over-smoothed")
+FLOORED_LOG = Compression("log of ", lambda value, xp: xp.log(xp.clip(value, 0.01, None)), numpy.exp)
+"""The logarithm of squares, which may be zero; less than a hundredth of their expectation says no more."""
 
 
 class Filter(NamedTuple):
@@ -302,11 +302,11 @@ class GainBank(_AutopilotFilter):
 
 
 class ModeBank(_AutopilotFilter):
-    """Control ``mode``: nominal, wide-band, or raw sensors, behind which the filter runs on."""
+    """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
     action_space = gymnasium.spaces.Discrete(len(MODES))
     shown_action = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
-    no_action = (1.0, 0.0, 0.0)
+    no_action = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(self, task: "UavAutopilot") -> None:
         super().__init__(task)
@@ -318,10 +318,11 @@ class ModeBank(_AutopilotFilter):
         self.raw_covariance = task.constant(packed_covariance.pack(raw)[:, None])
 
     def steered(self, action: Array) -> tuple[Array, Array]:
-        """Scale by ``wide_band_scale`` in mode "wide-band"."""
-        xp = self.xp
+        """Scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in "over-smoothed"."""
+        xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
-        return shown, 1.0 + (self.parameters.wide_band_scale - 1.0) * shown[1]
+        wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]
+        return shown, 1.0 + (wide + smooth)
 
     def believed(
         self, update: packed_covariance.Update, measurement: Measurement, shown: Array

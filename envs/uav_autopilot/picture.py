@@ -64,7 +64,7 @@ class UavAutopilotPicture(Picture):
             )
         else:
             legend = ", ".join(f"{i} {mode}" for i, mode in enumerate(MODES))
-            steered = Strip(f"action: mode ({legend})", {"mode": "mode"}, (-0.2, 2.2), steps=True)
+            steered = Strip(f"action: mode ({legend})", {"mode": "mode"}, (-0.2, 3.2), steps=True)
         return [
             Strip(
                 f"{output.name}, {output.unit}",

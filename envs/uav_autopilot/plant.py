@@ -88,6 +88,8 @@ class Design(NamedTuple):
     """The nominal filter once settled."""
     state_covariance: numpy.ndarray
     """Of the state in the nominal loop without command, ``(n, n)``."""
+    optimal: linear_systems.Regulator | None
+    """Control of the true plant if its state were known; None where the weights determine none."""
 
 
 def design(parameters: UavAutopilotParameters) -> Design:
@@ -112,7 +114,9 @@ def design(parameters: UavAutopilotParameters) -> Design:
     weight = numpy.diag(parameters.value("state_weights"))
     control_weight = parameters.value("control_weight")
     if parameters.feedback is None:
-        L = linear_systems.discrete_regulator(model.F, model.B, weight, numpy.array([[control_weight]]))
+        L = linear_systems.discrete_regulator(
+            model.F, model.B, weight, numpy.array([[control_weight]])
+        ).feedback
     else:
         L = numpy.array([parameters.feedback])
     for plant, word in ((model, "the plant"), (true_model, "the plant with the true actuator")):
@@ -129,4 +133,10 @@ def design(parameters: UavAutopilotParameters) -> Design:
     X = linear_systems.stationary_covariance(*loop)[:n, :n]
     output = numpy.eye(n)[names.index(OUTPUT[parameters.plant])]
     N = linear_systems.feedforward_gain(model.F, model.B, output, L)
-    return Design(model, true_model, H, R, L, N, weight, control_weight, steady, X)
+    try:
+        optimal = linear_systems.discrete_regulator(
+            true_model.F, true_model.B, weight, numpy.array([[control_weight]])
+        )
+    except ValueError:  # the weights ignore what does not decay, which a feedback of one's own may still hold
+        optimal = None
+    return Design(model, true_model, H, R, L, N, weight, control_weight, steady, X, optimal)

@@ -91,6 +91,7 @@ class UavAutopilot(Task):
     """
 
     id = "filtergym/UavAutopilot-v0"
+    interface = 2
     paper_source = (
         "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
         "unmanned aircraft using optimal Kalman filter"
@@ -98,10 +99,10 @@ class UavAutopilot(Task):
     Parameters = UavAutopilotParameters
     World = AircraftWorld
     actions = {
-        "gain": "the process noise Q of the filter is scaled by 10^(2a) (`gain_decades` = 2) in the "
+        "gain": "the process noise Q of the filter is scaled by 10^a (`gain_decades` = 1) in the "
         "update by the measurement that was just shown; **0 is the paper's filter**",
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
-        "during dropouts), zero for coordinates without a sensor; the filter runs on behind",
+        "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
     }
     banks = {"gain": GainBank, "mode": ModeBank}
     scenarios = SCENARIOS
@@ -110,7 +111,7 @@ class UavAutopilot(Task):
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"
     )
-    huber_bound = 30.0
+    reward_unit = 1.0
     paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: UavAutopilotParameters

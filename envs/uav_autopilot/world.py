@@ -123,6 +123,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         )
         self.weights = [(i, w) for i, w in enumerate(task.design.weight.diagonal().tolist()) if w]
         """Coordinate and weight of every square in the cost."""
+        self.optimal = task.design.optimal
         self.manoeuvres = -(-p.horizon // p.command_period) if p.command_amplitude[1] else 0
         self.dropouts = -(-p.horizon // p.dropout_period) if p.dropout_period else 0
 
@@ -246,6 +247,22 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             deviation = truth.state[i] - truth.command if i == task.output else truth.state[i]
             total = total + weight * deviation * deviation
         return total * (1.0 / task.cost_unit)
+
+    def charge(self, truth: Truth, mean: Array) -> Array:
+        """What the control that follows from an estimate loses against the optimal one for the true state.
+
+        ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation. Summed over the episode it is the cost
+        but for a part that noise and command decide and no action can change (see :class:`.Regulator`); without that
+        part one sees what an action was worth.
+        """
+        if self.optimal is None:
+            return self.cost(truth, mean)
+        task = self.task
+        lost = task.autopilot(mean, truth.command)
+        for i, gain in enumerate(self.optimal.feedback[0].tolist()):
+            deviation = truth.state[i] - truth.command if i == task.output else truth.state[i]
+            lost = lost + gain * deviation
+        return (float(self.optimal.regret[0, 0]) / task.cost_unit) * lost * lost
 
     def records(self, truth: Truth) -> dict[str, Array]:
         """Output and command, in the unit of the output."""

@@ -1,0 +1,116 @@
+"""What somebody gets who tries reinforcement learning for ten minutes: PPO of Stable-Baselines3 with its defaults.
+
+    python benchmarks/plain_ppo.py --out plain_ppo.json
+
+One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 where one holds for ten
+measurements), five training seeds; then the deterministic policy and the paper's algorithm meet the same episodes of the test
+split. Runs that a file holds are not repeated.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy
+from rich.console import Console
+from rich.table import Table
+
+import filtergym
+from filtergym.baselines.catalogue import baselines_of
+
+LONG = {"filtergym/TightlyCoupledNavigation-v0"}
+"""Where a decision holds for ten measurements of three filters: fewer of them, and fewer episodes."""
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--environment", action="append", help="id; default: all")
+    parser.add_argument("--seeds", type=int, default=5, help="training runs of each")
+    parser.add_argument("--steps", type=int, default=200_000, help="decisions; a quarter in TightlyCoupledNavigation")
+    parser.add_argument("--episodes", type=int, default=2000, help="of the test; a tenth in TightlyCoupledNavigation")
+    parser.add_argument("--out", type=Path, default=Path("plain_ppo.json"))
+    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
+    return parser.parse_args()
+
+
+def run(id: str, seed: int, steps: int, episodes: int) -> dict:
+    """Train once and compare with the paper's algorithm."""
+    import torch
+    from stable_baselines3 import PPO
+
+    torch.set_num_threads(1)
+    env = gymnasium.make(id)
+    begun = time.perf_counter()
+    model = PPO("MlpPolicy", env, seed=seed, device="cpu").learn(steps)
+    seconds = time.perf_counter() - begun
+    paper = baselines_of(id).score_paper
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
+        results = filtergym.evaluate(id, {"ppo": model, paper: paper}, episodes=episodes, seed=0)
+    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("ppo", paper)}
+    return {
+        "environment": id,
+        "seed": seed,
+        "steps": steps,
+        "seconds": round(seconds, 1),
+        "control": str(results["control"].sel(policy="ppo").values),
+        "difference": float(cost["ppo"].mean() / cost[paper].mean() - 1.0),
+        "median_difference": float(numpy.median(cost["ppo"] / cost[paper]) - 1.0),
+        "standard_deviation": model.policy.log_std.exp().tolist(),
+    }
+
+
+def table(runs: list[dict]) -> Table:
+    """Mean over the seeds with Student's interval for a new one, and every seed."""
+    from scipy.stats import t
+
+    shown = Table(title="SB3's PPO, its defaults and ours: cost against the paper, %")
+    for head in ("environment", "control", "decisions", "mean", "95 %", "median episode", "seeds", "decisions/s"):
+        shown.add_column(head, no_wrap=True)
+    for id in sorted({found["environment"] for found in runs}):
+        own = sorted((found for found in runs if found["environment"] == id), key=lambda found: found["seed"])
+        each = 100.0 * numpy.array([found["difference"] for found in own])
+        half = t.ppf(0.975, max(len(own) - 1, 1)) * each.std(ddof=len(own) > 1) / len(own) ** 0.5
+        median = 100.0 * numpy.median([found["median_difference"] for found in own])
+        rate = numpy.median([found["steps"] / found["seconds"] for found in own])
+        shown.add_row(
+            id.removeprefix("filtergym/").removesuffix("-v0"),
+            own[0]["control"],
+            f"{own[0]['steps']:,}",
+            f"{each.mean():+.1f}",
+            f"[{each.mean() - half:+.1f}, {each.mean() + half:+.1f}]",
+            f"{median:+.1f}",
+            ", ".join(f"{value:+.1f}" for value in each),
+            f"{rate:,.0f}",
+        )
+    return shown
+
+
+def main() -> None:
+    chosen = arguments()
+    runs = json.loads(chosen.out.read_text()) if chosen.out.exists() else []
+    console = Console()
+    ids = chosen.environment or sorted(i for i in gymnasium.registry if i.startswith("filtergym/"))
+    for seed in range(chosen.seeds):
+        for id in ids:
+            part, tenth = (4, 10) if id in LONG else (1, 1)
+            if any((found["environment"], found["seed"]) == (id, seed) for found in runs):
+                continue
+            runs.append(run(id, seed, chosen.steps // part, chosen.episodes // tenth))
+            chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
+            console.print(f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s")
+    if chosen.markdown:
+        from rich.box import MARKDOWN
+
+        shown = table(runs)
+        shown.box, shown.title = MARKDOWN, None
+        Console(width=160).print(shown)
+    else:
+        console.print(table(runs))
+
+
+if __name__ == "__main__":
+    main()
