@@ -94,7 +94,8 @@ class TaskVecEnv(VecEnv):
         known = ("scenario", "parameters")
         if any(own != options for own in self._options) or not options.keys() <= set(known):
             raise ValueError(
-                f"options of a reset are the same for all environments here, {' and '.join(known)}, got {self._options!r}"
+                f"options of a reset, {' and '.join(known)}, are the same for all environments here, got "
+                f"{self._options!r}"
             )
         count = self.num_envs
         if self.staggered:

@@ -205,8 +205,8 @@ def find_scenario(
     check_names(cls, keywords or ())
     if find_mixture(cls, scenario) is not None:
         raise ValueError(
-            f"a mixture of scenarios is flown by gymnasium.make, gymnasium.make_vec and training only, got {scenario!r}: "
-            "name one scenario"
+            "a mixture of scenarios is flown by gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
+            f"got {scenario!r}"
         )
     if isinstance(scenario, str | Path) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
         scenario = read_trajectory(Path(scenario))

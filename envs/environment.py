@@ -190,8 +190,8 @@ class _Face:
             check_alike(first, task, name)
             if self.privileged and context_shapes(task) != context_shapes(first):
                 raise ValueError(
-                    f"scenario {name!r} has a context of another shape than this environment shows its critics: leave it "
-                    "out, or make the environment without observation='asymmetric'"
+                    f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
+                    "it out, or make the environment without observation='asymmetric'"
                 )
         weights = (1.0,) if mixture is None else tuple(mixture.values())
         return Course(scenario, dict(parameters), tasks, names, weights)
@@ -402,8 +402,8 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         task: environment id.
         control: what the action steers; default: the first of the environment's controls.
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
-            the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one
-            scenario, drawn by these weights from the episode's generator.
+            the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
+            one scenario, drawn by these weights from the episode's generator.
         reward: "cost" (default), "log-likelihood" or "relative"; see :mod:`.reward`.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
@@ -413,9 +413,9 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             given out.
         context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
             (:meth:`.Task.context`), at resets and steps.
-        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation" and
-            of what is "privileged", the context and the error after the last action in units of its reported standard
-            deviation (zero at a reset). No policy may be shown that where it is judged.
+        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
+            and of what is "privileged", the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may be shown that where it is judged.
         **keywords: parameters of the task.
 
     Raises:
@@ -470,12 +470,12 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         """Start an episode and show its first measurement.
 
         ``options["scenario"]``: what ``scenario`` of the environment takes; None is the environment's own again.
-        ``options["parameters"]``: parameters that go before those of the environment; ``{}`` for none. Each holds until a
-        reset names another.
+        ``options["parameters"]``: parameters that go before those of the environment; ``{}`` for none. Each holds until
+        a reset names another.
 
         Raises:
-            ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them, and
-                for a scenario or parameters that would change the spaces.
+            ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them,
+                and for a scenario or parameters that would change the spaces.
         """
         wanted, seed = _checked_options(options, self.reset_options), _checked_seed(seed)
         self._send(wanted, [0])
@@ -585,9 +585,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             given out.
         context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
             (:meth:`.Task.context`), at resets and steps.
-        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation" and
-            of what is "privileged", the context and the error after the last action in units of its reported standard
-            deviation (zero at a reset). No policy may be shown that where it is judged.
+        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
+            and of what is "privileged", the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may be shown that where it is judged.
         **keywords: parameters of the task.
 
     Raises:
@@ -684,12 +684,12 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         ``options["shortened_by"]``: integers ``(num_envs,)``, by how many decisions each of these episodes ends
         early (later ones are whole again), so that episodes of one horizon need not all end together.
 
-        ``options["scenario"]`` and ``options["parameters"]``: as of the single environment, of the sub-environments that
-        are reset; each holds for their coming episodes, also after an autoreset, until a reset names another.
+        ``options["scenario"]`` and ``options["parameters"]``: as of the single environment, of the sub-environments
+        that are reset; each holds for their coming episodes, also after an autoreset, until a reset names another.
 
         Raises:
-            ValueError: for other options, an unknown name or a value out of its limits in them, a scenario or parameters
-                that would change the spaces, and for seeds that are none.
+            ValueError: for other options, an unknown name or a value out of its limits in them, a scenario or
+                parameters that would change the spaces, and for seeds that are none.
             gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
         wanted = _checked_options(options, self.reset_options)

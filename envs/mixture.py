@@ -1,12 +1,12 @@
 """Episodes of several tasks side by side: a lane flies now one, then another.
 
-A task has one set of parameters. Where scenarios are mixed, or a reset names another scenario or other parameters, every
-distinct set has a task and :class:`~.lanes.Lanes` of its own. A lane's next episode gets a free place in the lanes of the
-task that is drawn for it; lanes grow by eight places when none is free. A place that nobody has is stepped all the same and
-never looked at, so that a step costs what as many environments of each task cost as ever flew it at once.
+A task has one set of parameters. Where scenarios are mixed, or a reset names another scenario or other parameters,
+every distinct set has a task and :class:`~.lanes.Lanes` of its own. A lane's next episode gets a free place in the
+lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody has is stepped
+all the same and never looked at: a step costs what as many environments of each task cost as ever flew it at once.
 
-What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the episode as in
-:mod:`.lanes`. So sub-environment i of N equals the single environment with the same seed, here too.
+What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the episode as
+in :mod:`.lanes`. So sub-environment i of N equals the single environment with the same seed, here too.
 """
 
 import copy

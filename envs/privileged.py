@@ -1,7 +1,7 @@
 """What no policy can know, for critics in training: the episode's context, and how wrong the estimate is.
 
-A critic may be told more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is needed in
-training only. The environment keeps the two apart and says in its metadata that it is privileged.
+A critic may be told more than the policy that it judges (asymmetric actor and critic; Pinto et al., 2018): it is needed
+in training only. The environment keeps the two apart and says in its metadata that it is privileged.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ REPORTS = {kind: _report(pay) for kind, pay in OWN_PAY.items()}
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:
-    """Errors of the first lanes in units of their reported standard deviations, ``(count, C)``; zero where that is zero.
+    """Errors of the first lanes in units of their reported standard deviations, zero where that is, ``(count, C)``.
 
     Args:
         error: ``(C, N)``.

@@ -284,8 +284,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Manoeuvres: scans of each, first and last (or the beginnings of legs, s, and their turn rates, rad/s); whether
-        one is flown now. Empty where the flight is a table.
+        """Manoeuvres: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each, or where legs begin (s) and
+        their turn rates (rad/s); whether one is flown now. Empty where the flight is a table.
         """
         xp, m = self.xp, truth.maneuvers
         if isinstance(m, Legs):

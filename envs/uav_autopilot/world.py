@@ -252,7 +252,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         return {"output": truth.state[self.task.output], "command": truth.command}
 
     def context(self, truth: Truth) -> dict[str, Array]:
-        """Levels of the disturbance and of each sensor's noise, manoeuvres commanded and dropouts, with the numbers of the
+        """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
         measurements at which they step, and the levels now.
         """
         return {
