@@ -205,7 +205,7 @@ def find_scenario(
     check_names(cls, keywords or ())
     if find_mixture(cls, scenario) is not None:
         raise ValueError(
-            "a mixture of scenarios is flown by gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
+            "a mixture of scenarios is for gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
             f"got {scenario!r}"
         )
     if isinstance(scenario, str | Path) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:

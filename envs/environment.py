@@ -495,8 +495,9 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
 
     def _shown_alone(self) -> Any:
         """Observation of the one episode."""
-        shown = self._observed()
-        return {name: values[0] for name, values in shown.items()} if self.privileged else shown[0]
+        if not self.privileged:
+            return self._rounded(self.lanes.observe()[0])
+        return {name: values[0] for name, values in self._observed().items()}
 
     def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
         if self.tells_context:
