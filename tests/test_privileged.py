@@ -188,7 +188,7 @@ def test_privileged_vectors_are_those_of_single_environments(backend, scenario):
     for lane in range(4):
         env = gymnasium.make(LOOSE, backend="numpy", **keywords)
         own = env.reset(seed=lane)[0]
-        for step, (now, paid, _, over, info) in enumerate(steps):
+        for step, (_, paid, _, over, info) in enumerate(steps):
             before = (shown + [s[0] for s in steps])[step]
             for name in own:
                 np.testing.assert_allclose(np.asarray(before[name])[lane], own[name], rtol=1e-9, atol=1e-9)
@@ -225,7 +225,7 @@ def test_policies_are_not_shown_what_is_privileged():
         observation_space = gymnasium.make(ID, observation="asymmetric").observation_space
         predict = None
 
-    with pytest.raises(ValueError, match="privileged observations.*no evaluation shows"):
+    with pytest.raises(ValueError, match=r"privileged observations.*no evaluation shows"):
         evaluate(ID, {"cheat": Cheat()}, episodes=2)
 
 
