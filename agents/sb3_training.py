@@ -7,6 +7,7 @@ lie its plain arrays, which take none.
 """
 
 import contextlib
+import copy
 import io
 import pickle
 import random
@@ -195,7 +196,8 @@ def train_sb3(
     if resume and run.finished:
         return run
     check_algorithm(run)
-    values = dict(run.hyperparameters)
+    # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
+    values = copy.deepcopy(run.hyperparameters)
     for name in ("learning_rate", "clip_range"):
         if name in values:
             values[name] = schedule(name, values[name])

@@ -200,6 +200,15 @@ def test_settings_reach_environment_and_algorithm():
     assert (env.reward_kind, env.dtype) == ("log-likelihood", "float32")
 
 
+def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
+    """Stable-Baselines3's SAC writes into policy_kwargs."""
+    small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    asked = functools.partial(new_run, ID, "sac", "gain", 20, 2, overrides=small)
+    trained(opened_run(tmp_path, asked(), False), tmp_path)
+    opened_run(tmp_path, asked(), True)
+    assert load_run(tmp_path).hyperparameters == asked().hyperparameters
+
+
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm, tmp_path):
     keywords = {"range_sigma": 60.0, "horizon": 40, "reward": "log-likelihood"}
