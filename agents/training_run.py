@@ -319,12 +319,12 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
             raise ValueError(f"cannot read the checkpoint in {checkpoint}: {error}") from error
         raise
     for name in ("environment", "control", "scenario", "algorithm", "seed", "envs", "hyperparameters"):
-        own, other = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
-        while isinstance(own, dict) and isinstance(other, dict) and own != other:
-            inside = next(n for n in {**own, **other} if own.get(n) != other.get(n))
-            name, own, other = f"{name}.{inside}", own.get(inside), other.get(inside)
-        if own != other:
-            raise ValueError(f"{folder} holds a run with {name} {own!r}, not {other!r}")
+        has, wanted = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
+        while isinstance(has, dict) and isinstance(wanted, dict) and has != wanted:
+            inside = next(n for n in {**has, **wanted} if has.get(n) != wanted.get(n))
+            name, has, wanted = f"{name}.{inside}", has.get(inside), wanted.get(inside)
+        if has != wanted:
+            raise ValueError(f"{folder} holds a run with {name} {has!r}, not {wanted!r}")
     if not checkpoint.is_dir():
         raise ValueError(f"{folder} has no checkpoint to resume from")
     if not (folder / "run.json").exists() or load_run(folder) != run:

@@ -354,7 +354,8 @@ class _Face:
         if not self.detailed_info and watch is None:
             answers = lanes.decide(action, REPORTS[self.reward_kind])
             paid = mean_of([own[0] if paper is None else own[0] - paper[0] for own, paper in answers])
-            return paid[: lanes.count], in_sigmas(*answers[-1][0][1:], lanes.count, lanes.task.xp)
+            _, error, covariance = answers[-1][0]
+            return paid[: lanes.count], in_sigmas(error, covariance, lanes.count, lanes.task.xp)
         task = lanes.task
         rewards: list[Array] = []
         wrong: Array = None

@@ -10,7 +10,7 @@ in :mod:`.lanes`. So sub-environment i of N equals the single environment with t
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -58,14 +58,14 @@ def check_alike(task: Task, other: Task, name: str) -> None:
         other: that is to be flown too.
         name: of its scenario, in errors.
     """
-    differences = {
-        "the fields of the observation": [[(f.name, f.unit, f.over_interval) for f in t.fields] for t in (task, other)],
-        "the action space": [task.action_space, other.action_space],
-        "decision_interval": [task.decision_interval, other.decision_interval],
-        "what is estimated": [task.components, other.components],
-    }  # fmt: skip
-    for what, (own, its) in differences.items():
-        if own != its:
+    said: dict[str, Callable[[Task], Any]] = {
+        "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
+        "the action space": lambda t: t.action_space,
+        "decision_interval": lambda t: t.decision_interval,
+        "what is estimated": lambda t: t.components,
+    }
+    for what, of in said.items():
+        if of(task) != of(other):
             raise ValueError(
                 f"scenario {name!r} with these parameters would change {what} of this environment, which stays as it "
                 "is made: make another environment"
