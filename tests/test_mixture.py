@@ -89,6 +89,20 @@ def test_copies_in_the_middle_of_an_episode_go_on_identically(way, backend):
     same([np.asarray(env.unwrapped.lanes.observe())], after)
 
 
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("keywords", [{"scenario": MIXTURE}, {"observation": "asymmetric"}])
+def test_copies_of_single_environments_keep_what_a_reset_named(way, keywords):
+    env = gymnasium.make(ID, **SHORT, **keywords)
+    env.reset(seed=1, options={"parameters": {"range_sigma": 44.0}})
+    action = np.full(1, 0.1)
+    env.step(action)
+    other = WAYS[way](env)
+    for _ in range(3):
+        np.testing.assert_equal(env.step(action), other.step(action))
+    np.testing.assert_equal(env.reset(), other.reset())
+    assert other.unwrapped.task.parameters.range_sigma == 44.0
+
+
 def test_restored_lanes_go_on_as_they_did():
     env = gymnasium.make_vec(ID, num_envs=10, scenario=MIXTURE, horizon=300, control="gain").unwrapped
     env.reset(seed=3)

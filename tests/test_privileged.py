@@ -149,6 +149,21 @@ def test_context_of_a_vector_is_that_of_single_environments(backend, mode):
     assert finals == (6 if mode == "SameStep" else 0)
 
 
+def test_context_of_a_vector_has_gymnasiums_form():
+    keywords = {"num_envs": 2, "context": True, "horizon": 3}
+    own = gymnasium.make_vec(LOOSE, **keywords)
+    synced = gymnasium.make_vec(LOOSE, vectorization_mode="sync", **keywords)
+    infos = [(own.reset(seed=0)[1], synced.reset(seed=0)[1])]
+    action = np.zeros(own.action_space.shape)
+    infos += [(own.step(action)[4], synced.step(action)[4]) for _ in range(6)]
+    for one, other in infos:
+        assert one["context"].keys() == other["context"].keys()
+        np.testing.assert_array_equal(one["_context"], other["_context"])
+        for name, values in one["context"].items():
+            np.testing.assert_array_equal(values, other["context"][name])
+            assert values.dtype == other["context"][name].dtype
+
+
 # --- privileged observations
 
 
@@ -240,6 +255,30 @@ def test_policies_are_not_shown_what_is_privileged():
 def test_wrong_keywords_are_told(keywords, message):
     with pytest.raises(ValueError, match=message):
         gymnasium.make(ID, **keywords)
+
+
+def test_a_policy_that_is_corrected_sees_the_observation_only():
+    pytest.importorskip("torch")
+    pytest.importorskip("sb3_contrib")
+    from filtergym.agents import ResidualActions, to_sb3
+    from filtergym.baselines.names import own_competitor
+
+    task = make_task(ID, "weights")
+    policy = own_competitor(ID, "imm")(task)
+    keywords = {"control": "weights", "horizon": 4}
+    paid = []
+    for observation in ("measured", "asymmetric"):
+        env = ResidualActions(gymnasium.make(ID, observation=observation, **keywords), policy)
+        env.reset(seed=0)
+        many = gymnasium.make_vec(
+            ID, num_envs=1, autoreset_mode="SameStep", observation=observation, **keywords
+        )
+        vector = to_sb3(many, residual_to=policy)
+        vector.seed(0)
+        vector.reset()
+        zero = np.zeros(task.action_space.shape)
+        paid.append([(env.step(zero)[1], vector.step(zero[None])[1][0]) for _ in range(4)])
+    assert paid[0] == paid[1]
 
 
 def test_snippet_of_an_asymmetric_critic(capsys):
