@@ -44,11 +44,11 @@ def few_validation_episodes(monkeypatch):
 
 
 @pytest.fixture
-def two_training_scenarios(monkeypatch):
-    """As if the paper's flight were one to train on."""
+def all_training_scenarios(monkeypatch):
+    """As if every scenario were one to train on."""
     cls = task_class(ID)
-    trained = dataclasses.replace(cls.scenarios["paper"], training=True)
-    monkeypatch.setattr(cls, "scenarios", {**cls.scenarios, "paper": trained})
+    every = {name: dataclasses.replace(s, training=True) for name, s in cls.scenarios.items()}
+    monkeypatch.setattr(cls, "scenarios", every)
 
 
 def trained(run, folder, **keywords):
@@ -295,28 +295,32 @@ def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
-@pytest.mark.usefixtures("two_training_scenarios")
+@pytest.mark.usefixtures("all_training_scenarios")
 def test_training_on_a_mixture(algorithm, tmp_path):
-    mixture = {"random": 0.75, "paper": 0.25}
+    mixture = {"random": 0.75, "cruise": 0.25}
     asked = functools.partial(
-        new_run, ID, algorithm, "gain", envs=4, scenario="random:3,paper:1", overrides=SMALL[algorithm]
-    )
-    run = trained(opened_run(tmp_path, asked(steps=800), False), tmp_path)
-    assert load_run(tmp_path).scenario == "random:0.75,paper:0.25"
+        new_run, ID, algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm],
+        keywords={"horizon": 20},
+    )  # fmt: skip
+    run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
+    assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
     costs = [
-        weight * evaluate(ID, ["imm"], name, episodes=8, split="validation")["cost"].mean().item()
+        weight * evaluate(ID, ["imm"], name, episodes=8, split="validation", horizon=20)["cost"].mean().item()
         for name, weight in mixture.items()
     ]
     assert run.validation[0]["paper_cost"] == pytest.approx(sum(costs), rel=1e-12)
-    resumed = opened_run(tmp_path, asked(steps=1600), True)
-    assert trained(resumed, tmp_path, resume=True).steps_done >= 1600
+    resumed = opened_run(tmp_path, asked(steps=400), True)
+    assert trained(resumed, tmp_path, resume=True).steps_done >= 400
     assert export_run(tmp_path, tmp_path / "agent.safetensors").scenario == run.scenario
 
 
-@pytest.mark.usefixtures("two_training_scenarios")
+@pytest.mark.usefixtures("all_training_scenarios")
 def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
     run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,paper:1", backend="compiled")
     with pytest.raises(ValueError, match="on torch only"):
+        train_bptt(run, tmp_path)
+    run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,cruise:1")
+    with pytest.raises(ValueError, match="episodes of one length, not from random:0.5,cruise:0.5: set"):
         train_bptt(run, tmp_path)
 
 
