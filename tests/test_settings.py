@@ -320,7 +320,7 @@ def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
     with pytest.raises(ValueError, match="on torch only"):
         train_bptt(run, tmp_path)
     run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,cruise:1")
-    with pytest.raises(ValueError, match="episodes of one length, not from random:0.5,cruise:0.5: set"):
+    with pytest.raises(ValueError, match="episodes of one length, not from random:"):
         train_bptt(run, tmp_path)
 
 
