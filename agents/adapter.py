@@ -55,6 +55,11 @@ def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) ->
         raise ValueError(
             "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
         )
+    if vector_env.tells_context:
+        raise ValueError(
+            "to_sb3 keeps no context for each environment: leave it out, or show it to critics with "
+            "observation='asymmetric'"
+        )
     if residual_to is not None:
         check_residual(vector_env.task, residual_to)
     return TaskVecEnv(vector_env, staggered, residual_to)
@@ -79,17 +84,22 @@ class TaskVecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self.metadata = env.metadata
 
-    def reset(self) -> numpy.ndarray:
-        """Start new episodes with the seeds given to :meth:`seed`.
+    def reset(self) -> Any:
+        """Start new episodes with the seeds given to :meth:`seed` and the options given to :meth:`set_options`.
 
         Raises:
-            ValueError: for options, of which the environments have none.
+            ValueError: for options that differ between environments, and others than "scenario" and "parameters".
         """
-        if any(self._options):
-            raise ValueError(f"environments have no options of a reset here, got {self._options!r}")
+        options: dict[str, Any] = dict(self._options[0])
+        known = ("scenario", "parameters")
+        if any(own != options for own in self._options) or not options.keys() <= set(known):
+            raise ValueError(
+                f"options of a reset, {' and '.join(known)}, are the same for all environments here, got "
+                f"{self._options!r}"
+            )
         count = self.num_envs
-        cut = numpy.arange(count) * self.env.last_decision // count
-        options = {"shortened_by": cut} if self.staggered else None
+        if self.staggered:
+            options["shortened_by"] = numpy.arange(count) * self.env.last_decision // count
         observation, _ = self.env.reset(seed=self._seeds, options=options)
         self.returns[:] = 0.0
         self.lengths[:] = 0
@@ -105,13 +115,14 @@ class TaskVecEnv(VecEnv):
     def step_async(self, actions: numpy.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
         if self.residual_to is not None:
+            shown = self._shown["observation"] if self.env.privileged else self._shown
             own, self._policy_memory = self.residual_to.predict(
-                self._shown, self._policy_memory, self._start, deterministic=True
+                shown, self._policy_memory, self._start, deterministic=True
             )
             actions = own + actions
         self._actions = actions
 
-    def step_wait(self) -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
         """Step every environment."""
         observation, reward, _, finished, info = self.env.step(self._actions)
         self.returns += reward

@@ -10,7 +10,6 @@ times as fast; a task that cannot be compiled runs on torch tensors.
 """
 
 import functools
-import importlib.util
 import io
 import json
 from collections.abc import Callable
@@ -19,13 +18,20 @@ from pathlib import Path
 import gymnasium
 import numpy
 import torch
-from stable_baselines3.common.logger import Logger, make_output_format
 
-from ..envs.catalogue import make_task
+from ..envs.catalogue import find_mixture, make_task, task_class
 from ..envs.environment import TaskVectorEnv
 from ..evaluation.seeds import episode_seeds
 from .learned_policy import LearnedPolicy, write_arrays
-from .training_run import Bookkeeping, TrainingRun, interruption, learning_rate_schedule
+from .training_run import (
+    Bookkeeping,
+    TrainingRun,
+    curves_beside,
+    interruption,
+    logger_in,
+    schedule,
+    task_keywords,
+)
 from .unrolled import Unrolled
 
 
@@ -128,13 +134,32 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
         run.envs,
         control=run.control,
         scenario=run.scenario,
+        reward=_descended(run),
         autoreset_mode="Disabled",
+        **task_keywords(run),
     )
-    if run.backend in ("auto", "compiled"):
+    mixture = find_mixture(task_class(run.environment), run.scenario)
+    if mixture is not None:
+        if run.backend == "compiled":
+            raise ValueError(
+                "algorithm 'bptt' learns mixtures of scenarios on torch only: leave out the backend"
+            )
+        tasks = [make_task(run.environment, run.control, name, **task_keywords(run)) for name in mixture]
+        if len({task.horizon for task in tasks}) > 1:
+            raise ValueError(
+                f"algorithm 'bptt' learns from episodes of one length, not from {run.scenario}: set env.horizon"
+            )
+    elif run.backend in ("auto", "compiled"):
         env = make(backend=run.backend)
         if env.backend == "compiled":
             return env
     return make(backend="torch")
+
+
+def _descended(run: TrainingRun) -> str:
+    """Reward whose gradient is followed; that of the difference to the paper's algorithm is the cost's own."""
+    kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
+    return "cost" if kind == "relative" else kind
 
 
 def _saved_generators(env: TaskVectorEnv) -> str:
@@ -172,8 +197,7 @@ def train_bptt(
     """
     if resume and run.finished:
         return run
-    task = make_task(run.environment, run.control, run.scenario)
-    space = task.action_space
+    space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, gymnasium.spaces.Box):
         raise ValueError(
             f"algorithm 'bptt' needs the gradient of continuous actions, but control {run.control!r} has "
@@ -184,8 +208,8 @@ def train_bptt(
     env = _environment(run)
     run.backend = env.backend
     env.reset(seed=episode_seeds("train", run.seed, run.envs))
-    policy = RecurrentPolicy(len(task.fields), space, values["hidden_size"])
-    learning_rate = learning_rate_schedule(values["learning_rate"])
+    policy = RecurrentPolicy(len(env.task.fields), space, values["hidden_size"])
+    learning_rate = schedule("learning_rate", values["learning_rate"])
     optimiser = torch.optim.Adam(policy.parameters(), lr=learning_rate(1.0))
     steps_done = 0
     if resume:
@@ -194,7 +218,7 @@ def train_bptt(
         measure_normalisation(env, policy)
 
     if env.backend == "compiled":
-        fly = Unrolled(env, policy, values["truncation"]).descend_episodes
+        fly = Unrolled(env, policy, values["truncation"], _descended(run)).descend_episodes
     else:
         fly = functools.partial(descend_episodes, env, policy, values["truncation"])
 
@@ -219,9 +243,7 @@ def train_bptt(
     def save_agent(place: Path) -> None:
         write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
 
-    log = folder / "log"
-    formats = ["csv"] + (["tensorboard"] if importlib.util.find_spec("tensorboard") else [])
-    logger = Logger(str(log), [make_output_format(f, str(log), f"_{steps_done}") for f in formats])
+    logger = logger_in(folder / "log", steps_done)
     per_iteration = run.envs * env.last_decision
     with interruption() as stop:
         books = Bookkeeping(
@@ -233,6 +255,7 @@ def train_bptt(
             lambda task: LearnedPolicy(task, policy.arrays(), "tanh"),
             stop,
             report,
+            curves_beside(logger),
         )
         stopping = False
         while steps_done < run.steps and not stopping:

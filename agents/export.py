@@ -3,11 +3,10 @@
 import shutil
 from pathlib import Path
 
-from ..evaluation.evaluate import evaluate
 from ..evaluation.files import whole_files, writable_file
 from .learned_policy import stored_policy, write_arrays
 from .named_policies import learned_policy
-from .training_run import TrainingRun, best_agent, load_run, save_run
+from .training_run import TrainingRun, best_agent, load_run, save_run, training_costs
 
 CHECK_EPISODES = 32
 
@@ -40,13 +39,7 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
 
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
-        dataset = evaluate(
-            run.environment,
-            {"exported": stored_policy(run.environment, file)},
-            run.scenario,
-            CHECK_EPISODES,
-            split="validation",
-        )
-        run.exported = {"episodes": CHECK_EPISODES, "cost": float(dataset["cost"].mean())}
+        costs = training_costs(run, stored_policy(run.environment, file), CHECK_EPISODES)
+        run.exported = {"episodes": CHECK_EPISODES, "cost": float(costs.mean())}
         save_run(run, file.with_suffix(".json"))
     return run

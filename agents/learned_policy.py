@@ -20,6 +20,7 @@ from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
+from .training_run import task_keywords
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
@@ -130,7 +131,7 @@ def write_arrays(
     """Write a learned policy and the record of the run that it comes from."""
     from safetensors.numpy import save
 
-    fields = [field.name for field in make_task(run.environment, run.control).fields]
+    fields = [field.name for field in make_task(run.environment, run.control, **task_keywords(run)).fields]
     header = {
         "environment": task_class(run.environment).id,
         "control": run.control,

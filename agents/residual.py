@@ -50,19 +50,19 @@ class ResidualActions(gymnasium.Wrapper):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and the policy's memory with it."""
         self._shown, info = self.env.reset(seed=seed, options=options)
         self._memory, self._start = None, numpy.ones(1, dtype=bool)
         return self._shown, info
 
-    def step(self, action: Any) -> tuple[numpy.ndarray, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Add the policy's action and step."""
         if self._shown is None:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        own, self._memory = self.policy.predict(
-            self._shown[None], self._memory, self._start, deterministic=True
-        )
+        inner: Any = self.env.unwrapped
+        shown = self._shown["observation"] if inner.privileged else self._shown
+        own, self._memory = self.policy.predict(shown[None], self._memory, self._start, deterministic=True)
         self._start = numpy.zeros(1, dtype=bool)
         self._shown, reward, terminated, truncated, info = self.env.step(own[0] + numpy.asarray(action))
         return self._shown, reward, terminated, truncated, info

@@ -7,7 +7,7 @@ lie its plain arrays, which take none.
 """
 
 import contextlib
-import importlib.util
+import copy
 import io
 import pickle
 import random
@@ -22,7 +22,6 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3 import DQN, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger, make_output_format
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
@@ -32,7 +31,16 @@ from .adapter import TaskVecEnv, to_sb3
 from .learned_policy import write_arrays
 from .network_arrays import network_arrays
 from .sb3_policy import Sb3Policy
-from .training_run import Bookkeeping, TrainingRun, check_trust, interruption, learning_rate_schedule
+from .training_run import (
+    Bookkeeping,
+    TrainingRun,
+    check_trust,
+    curves_beside,
+    interruption,
+    logger_in,
+    schedule,
+    task_keywords,
+)
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "recurrent-ppo": RecurrentPPO, "sac": SAC, "dqn": DQN,
@@ -151,7 +159,7 @@ def load_checkpoint(
 
 def check_algorithm(run: TrainingRun) -> None:
     """Raise ValueError if the algorithm does not fit the control's action space."""
-    space = make_task(run.environment, run.control).action_space
+    space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, SPACES[run.algorithm]):
         fitting = [name for name, kinds in SPACES.items() if isinstance(space, kinds)]
         raise ValueError(
@@ -188,8 +196,11 @@ def train_sb3(
     if resume and run.finished:
         return run
     check_algorithm(run)
-    values = dict(run.hyperparameters)
-    values["learning_rate"] = learning_rate_schedule(values["learning_rate"])
+    # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
+    values = copy.deepcopy(run.hyperparameters)
+    for name in ("learning_rate", "clip_range"):
+        if name in values:
+            values[name] = schedule(name, values[name])
     values.pop("env_kwargs", None)
     normalize = values.pop("normalize", False)
     normalisation: VecNormalize | None = None
@@ -203,12 +214,8 @@ def train_sb3(
             env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
         model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
         adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
-    log = folder / "log"
-    formats = ["csv"]
-    if importlib.util.find_spec("tensorboard") is not None:
-        formats.append("tensorboard")
-    suffix = f"_{model.num_timesteps}"
-    model.set_logger(Logger(str(log), [make_output_format(f, str(log), suffix) for f in formats]))
+    logger = logger_in(folder / "log", model.num_timesteps)
+    model.set_logger(logger)
     policy = Sb3Policy(model, normalisation, run.control)
     with interruption() as stop:
         books = Bookkeeping(
@@ -220,6 +227,7 @@ def train_sb3(
             policy,
             stop,
             report,
+            curves_beside(logger),
         )
         trainer = _Trainer(books, progress)
         remaining = run.steps - model.num_timesteps

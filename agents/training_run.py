@@ -6,7 +6,9 @@ validation cost) and the log.
 """
 
 import importlib.metadata
+import importlib.util
 import json
+import shlex
 import signal
 import sys
 import time
@@ -21,10 +23,22 @@ import numpy
 
 from ..baselines.catalogue import baselines_of
 from ..baselines.names import evaluate
-from ..envs.catalogue import find_scenario, importable_name, nearest, task_class
+from ..envs.catalogue import (
+    find_mixture,
+    find_scenario,
+    importable_name,
+    make_task,
+    nearest,
+    parameter_names,
+    task_class,
+)
+from ..envs.environment import DTYPES
+from ..envs.reward import REWARDS
+from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.stored import read_json, restored
+from .settings import OPTIONS, check_hyperparameters, check_keywords, merged, read_config
 
 FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
@@ -50,12 +64,14 @@ class TrainingRun:
     environment: str
     control: str
     scenario: str
+    """A name, or a mixture in words, ``random:0.8,paper:0.2``."""
     algorithm: str
     seed: int
     envs: int
     steps: int
     """Environment steps asked for."""
     hyperparameters: dict[str, Any]
+    """With keywords of the environment in ``env_kwargs``, as in rl-zoo3's form."""
     backend: str = "auto"
     """What computes the steps of the environments: as asked for, and once they are made what does."""
     command: str = ""
@@ -85,27 +101,55 @@ def new_run(
     steps: int | None = None,
     envs: int | None = None,
     seed: int = 0,
-    scenario: str | None = None,
+    scenario: Any = None,
     overrides: Mapping[str, Any] | None = None,
     backend: str = "auto",
+    keywords: Mapping[str, Any] | None = None,
+    config: Path | None = None,
 ) -> TrainingRun:
     """Describe a run; what is not given comes from the algorithm's hyperparameters.
 
+    Args:
+        environment: id.
+        algorithm: one of ``FILES``.
+        control: what the agent steers; default: that of the settings, or the environment's first.
+        steps: environment steps in all.
+        envs: environments side by side.
+        seed: of the episodes and the network.
+        scenario: a training scenario, or a mixture of such.
+        overrides: hyperparameters that go before those of the files.
+        backend: what computes the steps.
+        keywords: of the environment, parameters, ``reward`` or ``dtype``, likewise.
+        config: file of settings, see :func:`.settings.read_config`; it goes before the file that is shipped.
+
     Raises:
-        ValueError: for an unknown name, or a scenario that is held out.
+        ValueError: for an unknown name, a value out of its limits, or a scenario that is held out.
     """
     cls = task_class(environment)
     if algorithm not in FILES:
         raise nearest("algorithm", algorithm, FILES)
+    shipped = stored_hyperparameters(cls.id, algorithm)
+    own_keywords, own_values = ({}, {}) if config is None else read_config(config, cls.id)
+    own_keywords, own_values = merged(own_keywords, keywords or {}), merged(own_values, overrides or {})
+    values = merged(shipped, own_values)
+    check_keywords(cls.id, algorithm, own_keywords)
+    if own_values:
+        check_hyperparameters(algorithm, values, shipped)
+    of_environment = merged(values.get("env_kwargs", {}), own_keywords)
+    named = {name: of_environment.pop(name, None) for name in OPTIONS}
+    control = control or named["control"]
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
-    chosen = find_scenario(cls, scenario)
-    if not chosen.training:
-        allowed = [s.name for s in cls.scenarios.values() if s.training]
-        raise ValueError(
-            f"scenario {chosen.name!r} is held out: train on a training scenario ({', '.join(allowed)})"
-        )
-    values = {**stored_hyperparameters(cls.id, algorithm), **(overrides or {})}
+    backend = backend if backend != "auto" or named["backend"] is None else named["backend"]
+    flown = training_scenarios(cls, named["scenario"] if scenario is None else scenario)
+    parameters = {name: value for name, value in of_environment.items() if name in parameter_names(cls)}
+    for name in flown:
+        make_task(cls.id, control, name, **parameters)  # says what is wrong with a value
+    for name, known in (("reward", REWARDS), ("dtype", DTYPES)):
+        if name in of_environment and of_environment[name] not in known:
+            raise nearest(name, of_environment[name], known)
+    if of_environment or "env_kwargs" in values:
+        values["env_kwargs"] = of_environment
     default_envs, default_steps = values.pop("n_envs"), values.pop("n_timesteps")
     envs, steps = envs or int(default_envs), steps or int(default_steps)
     if envs < 1 or steps < 1:
@@ -115,7 +159,7 @@ def new_run(
     return TrainingRun(
         importable_name(cls),
         control or cls.controls[0],
-        chosen.name,
+        in_words(flown),
         algorithm,
         seed,
         envs,
@@ -123,6 +167,36 @@ def new_run(
         values,
         backend,
     )
+
+
+def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
+    """Return the scenarios that a run flies, with their weights.
+
+    Raises:
+        ValueError: for an unknown scenario, or one that is held out, alone or in a mixture.
+    """
+    mixture = find_mixture(cls, scenario)
+    weights = {find_scenario(cls, scenario).name: 1.0} if mixture is None else mixture
+    for name in weights:
+        if name not in cls.scenarios or not cls.scenarios[name].training:
+            allowed = [s.name for s in cls.scenarios.values() if s.training]
+            raise ValueError(
+                f"scenario {name!r} is held out: train on a training scenario ({', '.join(allowed)})"
+            )
+    return weights
+
+
+def in_words(weights: Mapping[str, float]) -> str:
+    """Name a scenario, or a mixture, as an option and ``gymnasium.make`` take it."""
+    if len(weights) == 1:
+        return next(iter(weights))
+    return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
+
+
+def task_keywords(run: TrainingRun) -> dict[str, Any]:
+    """Parameters of the task that a run trains with, without what concerns training only, such as the reward."""
+    known = parameter_names(task_class(run.environment))
+    return {n: value for n, value in run.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
 
 def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
@@ -134,22 +208,23 @@ def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
     return dict(table.get(id, table["default"]))
 
 
-def learning_rate_schedule(rate: float | str) -> Callable[[float], float]:
-    """Return the learning rate over the share of the run that is left, 1 to 0.
+def schedule(name: str, value: float | str) -> Callable[[float], float]:
+    """Return a hyperparameter over the share of the run that is left, 1 to 0.
 
     Args:
-        rate: a constant, or in rl-zoo3's form "lin_0.001": from there linearly to zero.
+        name: of it, such as ``learning_rate``.
+        value: a constant, or in rl-zoo3's form "lin_0.001": from there linearly to zero.
 
     Raises:
         ValueError: for another form.
     """
     from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
-    text = str(rate)
+    text = str(value)
     try:
         start = float(text.removeprefix("lin_"))
     except ValueError as error:
-        raise ValueError(f"learning_rate must be a number or lin_ and a number, got {rate!r}") from error
+        raise ValueError(f"{name} must be a number or lin_ and a number, got {value!r}") from error
     return LinearSchedule(start, 0.0, 1.0) if text.startswith("lin_") else ConstantSchedule(start)
 
 
@@ -221,8 +296,13 @@ def best_agent(folder: Path) -> Path:
     raise ValueError(f"{folder} has no best agent yet: train it up to its first validation")
 
 
-def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
+def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> TrainingRun:
     """Read the run of a folder to go on with it, up to the steps asked for; what a crash left is put in order.
+
+    Args:
+        folder: of the run.
+        asked: what the user says that it is.
+        same: with the run's own hyperparameters, of which the user says nothing.
 
     Raises:
         ValueError: if it is a run of something else.
@@ -239,10 +319,12 @@ def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
             raise ValueError(f"cannot read the checkpoint in {checkpoint}: {error}") from error
         raise
     for name in ("environment", "control", "scenario", "algorithm", "seed", "envs", "hyperparameters"):
-        if getattr(run, name) != getattr(asked, name):
-            raise ValueError(
-                f"{folder} holds a run with {name} {getattr(run, name)!r}, not {getattr(asked, name)!r}"
-            )
+        has, wanted = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
+        while isinstance(has, dict) and isinstance(wanted, dict) and has != wanted:
+            inside = next(n for n in {**has, **wanted} if has.get(n) != wanted.get(n))
+            name, has, wanted = f"{name}.{inside}", has.get(inside), wanted.get(inside)
+        if has != wanted:
+            raise ValueError(f"{folder} holds a run with {name} {has!r}, not {wanted!r}")
     if not checkpoint.is_dir():
         raise ValueError(f"{folder} has no checkpoint to resume from")
     if not (folder / "run.json").exists() or load_run(folder) != run:
@@ -253,8 +335,14 @@ def resumed_run(folder: Path, asked: TrainingRun) -> TrainingRun:
     return run
 
 
-def opened_run(folder: Path, asked: TrainingRun, resume: bool) -> TrainingRun:
+def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
     """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
+
+    Args:
+        folder: of the run.
+        asked: what the user says that it is.
+        resume: go on with it.
+        same: as of :func:`resumed_run`.
 
     Raises:
         ValueError: if the folder cannot be written to, holds a run already, or holds another one.
@@ -263,14 +351,67 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool) -> TrainingRun:
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
-    run = resumed_run(folder, asked) if resume else asked
+    run = resumed_run(folder, asked, same) if resume else asked
     writable_folder(folder)
-    run.command = (
-        f"filtergym train {run.environment} --algo {run.algorithm} --control {run.control} "
-        f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}"
+    run.command = " ".join(
+        [
+            f"filtergym train {run.environment} --algo {run.algorithm} --control {run.control} "
+            f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}",
+            *_settings_in_words(run),
+        ]
     )
     run.versions = installed_versions()
     return run
+
+
+def _settings_in_words(run: TrainingRun) -> Iterator[str]:
+    """What differs from the hyperparameters that are shipped, as options."""
+
+    def differing(path: str, own: Any, shipped: Any) -> Iterator[str]:
+        if isinstance(own, dict):
+            for name, value in own.items():
+                yield from differing(
+                    f"{path}.{name}", value, shipped.get(name) if isinstance(shipped, dict) else None
+                )
+        elif own != shipped:
+            yield "--set " + shlex.quote(f"{path}={json.dumps(own)}")
+
+    shipped = stored_hyperparameters(task_class(run.environment).id, run.algorithm)
+    values = dict(run.hyperparameters)
+    yield from differing("env", values.pop("env_kwargs", {}), shipped.pop("env_kwargs", {}))
+    yield from differing("algo", values, shipped)
+
+
+def training_costs(
+    run: TrainingRun, policy: Any, episodes: int, control: str | None = None, backend: str = "auto"
+) -> numpy.ndarray:
+    """Mean cost of every episode of the validation split under what a run trains on, ``(episodes,)``.
+
+    Of a mixture, every scenario flies all episodes, and their costs are weighted as they are: the same expectation with
+    less variance than drawing.
+
+    Args:
+        run: gives environment, scenario, and parameters of the task.
+        policy: to be scored.
+        episodes: number of episodes.
+        control: in which it acts; default: its own.
+        backend: what computes the steps.
+    """
+    cls = task_class(run.environment)
+    total: Any = 0.0
+    for name, weight in (find_mixture(cls, run.scenario) or {run.scenario: 1.0}).items():
+        dataset = evaluate(
+            run.environment,
+            {"agent": policy},
+            name,
+            episodes,
+            split="validation",
+            control=control,
+            backend=backend,
+            **task_keywords(run),
+        )
+        total = total + weight * dataset["cost"].sel(policy="agent").values.mean(axis=1)
+    return total
 
 
 class Validation:
@@ -285,25 +426,16 @@ class Validation:
         self.paper = baselines_of(run.environment).score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_cost = self._costs(self.paper, self.paper, None) if self.paper else None
+        self.paper_cost = self._costs(self.paper, None) if self.paper else None
 
-    def _costs(self, name: str, policy: Any, control: str | None) -> numpy.ndarray:
+    def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
         """Mean cost over the episodes and over every resample of them."""
-        run = self.run
-        dataset = evaluate(
-            run.environment,
-            {name: policy},
-            run.scenario,
-            VALIDATION_EPISODES,
-            split="validation",
-            control=control,
-            backend="auto" if run.backend == "torch" else run.backend,
-        )
-        return self.bootstrap.means(dataset["cost"].sel(policy=name).values.mean(axis=1))
+        backend = "auto" if self.run.backend == "torch" else self.run.backend
+        return self.bootstrap.means(training_costs(self.run, policy, VALIDATION_EPISODES, control, backend))
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
-        cost = self._costs("agent", policy, self.run.control)
+        cost = self._costs(policy, self.run.control)
         entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry
@@ -313,6 +445,44 @@ class Validation:
             "paper_cost": float(self.paper_cost[0]),
             "relative_cost_difference": list(self.bootstrap.interval(cost / self.paper_cost - 1.0)),
         }
+
+
+def _curve(entry: Validated) -> dict[str, float]:
+    """Numbers of a validation, as a log shows them over environment steps."""
+    curve = {"validation/cost": entry["cost"]}
+    if "paper_cost" in entry:
+        curve["validation/paper_cost"] = entry["paper_cost"]
+        curve["validation/cost_vs_paper"] = entry["relative_cost_difference"][0]
+    return curve
+
+
+def logger_in(folder: Path, steps_done: int) -> Any:
+    """Return a logger of Stable-Baselines3 that writes CSV and, where it is installed, TensorBoard.
+
+    Args:
+        folder: for the files.
+        steps_done: before; a resumed run writes files of its own.
+    """
+    from stable_baselines3.common.logger import Logger, make_output_format
+
+    formats = ["csv"] + (["tensorboard"] if importlib.util.find_spec("tensorboard") else [])
+    suffix = f"_{steps_done}"
+    return Logger(str(folder), [make_output_format(name, str(folder), suffix) for name in formats])
+
+
+def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
+    """Return what writes numbers at once where a logger writes, and leaves alone what that one has gathered."""
+    from stable_baselines3.common.logger import Logger
+
+    own = Logger(None, logger.output_formats)
+
+    def write(steps: int, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            own.record(name, value)
+        own.record("time/total_timesteps", steps, exclude="tensorboard")
+        own.dump(steps)
+
+    return write
 
 
 @contextmanager
@@ -349,6 +519,8 @@ class Bookkeeping:
         save_agent: writes the agent alone into an empty folder.
         policy: the agent as a policy for an evaluation.
         stop: whether somebody wishes to stop.
+        report: told of every validation.
+        log: writes numbers by name at so many environment steps.
     """
 
     def __init__(
@@ -361,7 +533,9 @@ class Bookkeeping:
         policy: Any,
         stop: Callable[[], bool],
         report: Callable[[str], None],
+        log: Callable[[int, Mapping[str, float]], None] = lambda steps, values: None,
     ) -> None:
+        self.log = log
         self.run, self.folder, self.interval, self.policy, self.stop = run, folder, interval, policy, stop
         self.save_checkpoint, self.save_agent, self.report = save_checkpoint, save_agent, report
         self.validation = Validation(run)
@@ -379,6 +553,7 @@ class Bookkeeping:
         entry = self.validation.score(self.policy)
         is_best = run.best is None or entry["cost"] < run.best["cost"]
         run.validation.append(entry)
+        self.log(steps_done, _curve(entry))
         run.seconds = self.seconds_before + time.monotonic() - self.began
         if is_best:
             with whole_folder(self.folder / "best") as best:

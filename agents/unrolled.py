@@ -158,12 +158,14 @@ class Unrolled:
             noise.
         policy: a :class:`~.bptt.RecurrentPolicy`.
         truncation: most decisions of a window.
+        reward: that is ascended, "cost" or "log-likelihood".
     """
 
-    def __init__(self, env: TaskVectorEnv, policy: Any, truncation: int) -> None:
-        self._env, self._lanes, self._interval = env, env.lanes, env.task.decision_interval
+    def __init__(self, env: TaskVectorEnv, policy: Any, truncation: int, reward: str = "cost") -> None:
+        lanes: Any = env.lanes  # of one task
+        self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation = min(truncation, env.last_decision)
-        self._rollout = Rollout(env.task, "cost", env.lanes.width, self._truncation * self._interval)
+        self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
         fields = env.task.fields
         self._mean = [i for i, field in enumerate(fields) if field.over_interval == "mean"]

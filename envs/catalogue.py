@@ -8,7 +8,9 @@ import dataclasses
 import difflib
 import functools
 import importlib
+import math
 import pkgutil
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -26,6 +28,9 @@ ADDED: dict[str, type[Task]] = {}
 
 ScenarioChoice = str | Path | Trajectory | Mapping[str, Any] | None
 """What names a scenario: a name, the path of a file, a trajectory or its fields, or None for the environment's own."""
+
+MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
+"""A mixture in words: ``random:0.8,paper:0.2``."""
 
 
 def catalogue() -> dict[str, type[Task]]:
@@ -134,6 +139,53 @@ def check_names(cls: type[Task], keywords: Iterable[str], others: Iterable[str] 
             raise UnknownKeyword(f"unexpected keyword argument {name!r}, no parameter of {cls.id}: {hint}")
 
 
+def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
+    """Return the weights of a mixture of scenarios, which sum to one; None for a choice that is no mixture.
+
+    Args:
+        cls: the environment.
+        scenario: a mixture maps names of scenarios to weights, ``{"random": 0.8, "paper": 0.2}``, or says so in words,
+            ``"random:0.8,paper:0.2"``. A weight of zero leaves a scenario out.
+
+    Raises:
+        ValueError: for an unknown scenario, and for weights that are none.
+    """
+    if isinstance(scenario, Mapping):
+        given = dict(scenario)
+        if not given or not all(isinstance(weight, int | float | numpy.number) for weight in given.values()):
+            return None
+    elif isinstance(scenario, str) and MIXTURE.fullmatch(scenario) and scenario not in cls.scenarios:
+        pairs = [part.split(":") for part in scenario.split(",")]
+        if Path(pairs[-1][1]).suffix in TRAJECTORY_SUFFIXES:  # of a file on a drive with a letter
+            return None
+        given = {}
+        for name, weight in pairs:
+            if name.strip() in given:
+                raise ValueError(f"a mixture names each scenario once, got {scenario!r}")
+            try:
+                given[name.strip()] = float(weight)
+            except ValueError:
+                raise ValueError(
+                    f"a mixture in words is scenario:weight,scenario:weight, got {scenario!r}"
+                ) from None
+    else:
+        return None
+    for name in given:
+        if name not in cls.scenarios:
+            raise nearest("scenario", name, cls.scenarios)
+    weights = {name: float(weight) for name, weight in given.items()}
+    total = sum(weights.values())
+    if (
+        any(isinstance(w, bool) for w in given.values())
+        or min(weights.values()) < 0.0
+        or not 0.0 < total < math.inf
+    ):
+        raise ValueError(
+            f"weights of a mixture are numbers of at least 0, and one is above, got {scenario!r}"
+        )
+    return {name: weight / total for name, weight in weights.items() if weight > 0.0}
+
+
 def find_scenario(
     cls: type[Task],
     scenario: ScenarioChoice,
@@ -151,6 +203,11 @@ def find_scenario(
         ValueError: for an unknown scenario or parameter, or a file that holds no trajectory.
     """
     check_names(cls, keywords or ())
+    if find_mixture(cls, scenario) is not None:
+        raise ValueError(
+            "a mixture of scenarios is for gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
+            f"got {scenario!r}"
+        )
     if isinstance(scenario, str | Path) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
         scenario = read_trajectory(Path(scenario))
     elif isinstance(scenario, Mapping):

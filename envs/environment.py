@@ -1,5 +1,6 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
+import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -12,10 +13,12 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from .backend import host_array, is_tensor, task_on, tensor_on
-from .catalogue import ScenarioChoice, check_names, find_scenario, nearest, task_class
+from .catalogue import ScenarioChoice, check_names, find_mixture, find_scenario, nearest, task_class
 from .lanes import Lanes, mean_of
+from .mixture import Course, MixedLanes, check_alike
 from .observation import Array, Field
 from .parameters import Limits, check, frozen
+from .privileged import REPORTS, context_shapes, in_sigmas
 from .reward import REWARDS, paper_task, reward
 from .specification import told
 from .task import Task
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
 FRAMES_PER_SECOND = 10
 DTYPES = ("float64", "float32")
 """Types of observations and rewards; inside everything is float64."""
+OBSERVATIONS = ("measured", "asymmetric")
+"""What an observation holds: what can be known; or beside it, for critics in training, what cannot."""
 
 
 def _checked_seed(seed: Any) -> int | None:
@@ -92,19 +97,31 @@ class _Face:
     """What both faces share: a task, its spaces, and the reward."""
 
     task: Task
-    lanes: Lanes
+    """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
+    lanes: Lanes | MixedLanes
     reward_kind: str
     detailed_info: bool
     dtype: str
     """Of observations and rewards: "float64" or "float32"."""
+    tells_context: bool
+    """Whether ``info`` holds the episode's context."""
+    privileged: bool
+    """Whether observations hold what no policy can know."""
     last_decision: int
-    """Actions after which an episode is truncated."""
-    reset_options: ClassVar[tuple[str, ...]] = ()
+    """Actions after which an episode is truncated, where scenarios differ in length the longest one."""
+    reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
     """Names that ``options`` of a reset may have."""
     _spec: EnvSpec | None = None
 
     def _check(
-        self, task: str, reward_kind: str, detailed_info: bool, dtype: str, names: Iterable[str]
+        self,
+        task: str,
+        reward_kind: str,
+        detailed_info: bool,
+        dtype: str,
+        context: bool,
+        observation: str,
+        names: Iterable[str],
     ) -> None:
         """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
         check_names(task_class(task), names, inspect.signature(type(self)).parameters)
@@ -112,17 +129,124 @@ class _Face:
             raise nearest("reward", reward_kind, REWARDS)
         if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
             raise nearest("dtype", dtype, DTYPES)
+        if observation not in OBSERVATIONS:
+            raise nearest("observation", observation, OBSERVATIONS)
         check("detailed_info", detailed_info, bool, Limits())
+        check("context", context, bool, Limits())
         self.reward_kind, self.detailed_info, self.dtype = reward_kind, detailed_info, dtype
+        self.tells_context, self.privileged = context, observation == "asymmetric"
+        self._only_pays = not (detailed_info or self.privileged)
+        if self.privileged:
+            self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
 
-    def _open(self, task: Task, count: int) -> None:
-        self.task = task
-        self.lanes = Lanes(task, count, paper_task(task) if self.reward_kind == "relative" else None)
+    def _open(
+        self,
+        make: Callable[..., Task],
+        scenario: Any,
+        keywords: Mapping[str, Any],
+        count: int,
+        longest: int | None,
+    ) -> None:
+        """Make the lanes.
+
+        Args:
+            make: makes a task of a scenario and parameters.
+            scenario: as the user has named it.
+            keywords: parameters of the task.
+            count: number of lanes.
+            longest: decisions after which an episode ends at the latest.
+        """
+        self._make, self._keywords, self._longest = make, dict(keywords), longest
+        course = self._course(scenario, {})
+        self.task, self._first_course, beside_paper = course.tasks[0], course, self.reward_kind == "relative"
+        if len(course.tasks) > 1:
+            self.lanes = MixedLanes(count, course, beside_paper, longest)
+        else:
+            self.lanes = Lanes(
+                self.task, count, paper_task(self.task) if beside_paper else None, longest=longest
+            )
         self.last_decision = self.lanes.decisions_per_episode
+        self._wrong: Array = None
+        """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
+        if self.privileged:
+            self._wrong = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
-    def _observation_space(self) -> gymnasium.spaces.Box:
-        return gymnasium.spaces.Box(
-            -numpy.inf, numpy.inf, (len(self.task.fields),), numpy.dtype(self.dtype).type
+    # --- scenarios
+
+    def _course(self, scenario: Any, parameters: Mapping[str, Any]) -> Course:
+        """Make the tasks of a scenario or a mixture, with parameters beside those of the environment.
+
+        Raises:
+            ValueError: for an unknown name, a value out of its limits, or what would change the spaces.
+        """
+        keywords = {**self._keywords, **parameters}
+        cls = task_class(self._make.args[1])  # type: ignore[attr-defined]
+        mixture = find_mixture(cls, scenario)
+        choices = [scenario] if mixture is None else list(mixture)
+        tasks = tuple(self._make(choice, **keywords) for choice in choices)
+        names = tuple(find_scenario(cls, choice, keywords).name for choice in choices)
+        first = getattr(self, "task", tasks[0])
+        for task, name in zip(tasks, names, strict=True):
+            check_alike(first, task, name)
+            if self.privileged and context_shapes(task) != context_shapes(first):
+                raise ValueError(
+                    f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
+                    "it out, or make the environment without observation='asymmetric'"
+                )
+        weights = (1.0,) if mixture is None else tuple(mixture.values())
+        return Course(scenario, dict(parameters), tasks, names, weights)
+
+    def _send(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
+        """Let the coming episodes of some lanes be of what the options of a reset name."""
+        if not {"scenario", "parameters"} & wanted.keys():
+            return
+        parameters = wanted.get("parameters")
+        if parameters is not None and not (
+            isinstance(parameters, Mapping) and all(isinstance(name, str) for name in parameters)
+        ):
+            raise ValueError(f"options['parameters'] maps names of parameters to values, got {parameters!r}")
+        mixed = self.lanes if isinstance(self.lanes, MixedLanes) else None
+        known: list[Course] = [self._first_course]
+        if mixed is not None:
+            known += {id(c): c for c in map(mixed.course_of, range(mixed.count))}.values()
+        courses = []
+        for lane in chosen:
+            now = self._first_course if mixed is None else mixed.course_of(lane)
+            asked = now.scenario, now.parameters
+            if "scenario" in wanted:
+                scenario = wanted["scenario"]
+                asked = (self._first_course.scenario if scenario is None else scenario), asked[1]
+            if "parameters" in wanted:
+                asked = asked[0], dict(parameters or {})
+            found = next((course for course in known if course.is_of(*asked)), None)
+            if found is None:
+                found = self._course(*asked)
+                known.append(found)
+            courses.append(found)
+        if mixed is None:
+            if all(course is self._first_course for course in courses):
+                return
+            mixed = MixedLanes(
+                self.lanes.count, self._first_course, self.reward_kind == "relative", self._longest
+            )
+            mixed.adopt(self.lanes)  # type: ignore[arg-type]
+            self.lanes = mixed
+        for lane, course in zip(chosen, courses, strict=True):
+            mixed.send(lane, course)
+        self.last_decision = mixed.decisions_per_episode
+
+    # --- what is shown
+
+    def _observation_space(self) -> gymnasium.Space:
+        def box(size: int) -> gymnasium.spaces.Box:
+            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.dtype).type)
+
+        measured = box(len(self.task.fields))
+        if not self.privileged:
+            return measured
+        context = sum(math.prod(shape) for shape in context_shapes(self.task).values())
+        return gymnasium.spaces.Dict(
+            {"observation": measured, "privileged": box(context + len(self.task.components))}
         )
 
     def _rounded(self, values: Array) -> Array:
@@ -130,6 +254,58 @@ class _Face:
         if self.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
+
+    def _observed(self) -> Any:
+        """Observations of all lanes, batch first."""
+        shown = self._rounded(self.lanes.observe())
+        if not self.privileged:
+            return shown
+        xp, count = self.task.xp, self.lanes.count
+        flat = [xp.reshape(values, (count, -1)) for values in self._context()[0].values()]
+        return {"observation": shown, "privileged": self._rounded(xp.concat([*flat, self._wrong], axis=1))}
+
+    def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
+        """Context of all lanes, batch first, and which of them has each part of it."""
+        found = []
+        parts = self.lanes.parts() if isinstance(self.lanes, MixedLanes) else [(self.lanes,)]
+        for (part,) in parts:
+            context, xp = part.task.context(part.state), part.task.xp
+            found.append({name: xp.moveaxis(v[..., : part.count], -1, 0) for name, v in context.items()})
+        if not isinstance(self.lanes, MixedLanes):
+            present = numpy.ones(self.lanes.count, dtype=bool)
+            # A copy: some of these arrays are the state's own, and the caller may overwrite them.
+            return {k: self.task.xp.asarray(v, copy=True) for k, v in found[0].items()}, dict.fromkeys(
+                found[0], present
+            )
+        return self._joined(found, self.lanes)
+
+    def _joined(
+        self, found: Sequence[Mapping[str, Array]], mixed: MixedLanes
+    ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
+        """Put together what the lanes of several tasks report, and say who reports each part of it.
+
+        Where one reports more numbers than another, and where one reports nothing, NaN stands for what is missing.
+        """
+        xp, values, present = self.task.xp, {}, {}
+        counts = [part.count for (part,) in mixed.parts()]
+        for name in dict.fromkeys(name for one in found for name in one):
+            shapes = [tuple(one[name].shape[1:]) for one in found if name in one]
+            largest = tuple(map(max, zip(*shapes, strict=True)))
+            padded = []
+            for one, count in zip(found, counts, strict=True):
+                full = self.task.constant(numpy.full((count, *largest), numpy.nan))
+                if name in one:
+                    if tuple(one[name].shape[1:]) == largest:
+                        full = one[name]
+                    else:
+                        full[tuple(slice(size) for size in one[name].shape)] = xp.astype(
+                            one[name], xp.float64
+                        )
+                padded.append(full)
+            values[name] = mixed.joined(padded)
+            has = [numpy.full(count, name in one) for one, count in zip(found, counts, strict=True)]
+            present[name] = mixed.joined(has)
+        return values, present
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -145,6 +321,8 @@ class _Face:
         """What computes the steps: "compiled", "numpy" or "torch"."""
         return self.task.backend
 
+    # --- a step
+
     def _pay(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
@@ -152,14 +330,42 @@ class _Face:
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
+        if isinstance(self.lanes, Lanes):
+            if self._only_pays and watch is None:
+                return self.lanes.pay(action, self.reward_kind)
+            paid, self._wrong = self._pay_part(self.lanes, action, info, watch)
+            return paid
+        infos: list[dict[str, Array]] = []
+        answers = []
+        for part, own in self.lanes.parts(action):
+            infos.append({})
+            answers.append(self._pay_part(part, own, infos[-1], watch))
+        if self.privileged:
+            self._wrong = self.lanes.joined([wrong for _, wrong in answers])
+        info.update(self._joined(infos, self.lanes)[0])
+        return self.lanes.joined([paid for paid, _ in answers])
+
+    def _pay_part(
+        self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
+    ) -> tuple[Array, Array]:
+        """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
+        if self._only_pays and watch is None:
+            return lanes.pay(action, self.reward_kind), None
         if not self.detailed_info and watch is None:
-            return self.lanes.pay(action, self.reward_kind)
-        task = self.task
+            answers = lanes.decide(action, REPORTS[self.reward_kind])
+            paid = mean_of([own[0] if paper is None else own[0] - paper[0] for own, paper in answers])
+            _, error, covariance = answers[-1][0]
+            return paid[: lanes.count], in_sigmas(error, covariance, lanes.count, lanes.task.xp)
+        task = lanes.task
         rewards: list[Array] = []
-        widened = self.lanes.widened(action)
+        wrong: Array = None
+        widened = lanes.widened(action)
 
         def record(state: Any, paper_state: Any) -> None:
-            rewards.append(reward(self.reward_kind, task, state, self.lanes.paper, paper_state))
+            nonlocal wrong
+            rewards.append(reward(self.reward_kind, task, state, lanes.paper, paper_state))
+            if self.privileged:
+                wrong = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
             if self.detailed_info:
                 batch_last = {
                     "error": task.error(state),
@@ -169,13 +375,20 @@ class _Face:
                 }
                 # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 for name, values in batch_last.items():
-                    moved = task.xp.moveaxis(values[..., : self.lanes.count], -1, 0)
+                    moved = task.xp.moveaxis(values[..., : lanes.count], -1, 0)
                     info[name] = task.xp.asarray(moved, copy=True)
             if watch is not None:
                 watch(state)
 
-        self.lanes.step(lambda state: task.act(state, widened), record)
-        return mean_of(rewards)[: self.lanes.count]
+        lanes.step(lambda state: task.act(state, widened), record)
+        return mean_of(rewards)[: lanes.count], wrong
+
+    def _forget_errors(self, lanes: Sequence[int]) -> None:
+        """Episodes that begin have no estimate yet that could be wrong."""
+        if self.privileged:
+            keep = numpy.ones((self.lanes.count, 1))
+            keep[list(lanes)] = 0.0
+            self._wrong = self.task.xp.where(self.task.constant(keep) > 0.0, self._wrong, 0.0)
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
@@ -183,14 +396,15 @@ class _Face:
         return self.task.fields
 
 
-class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
+class TaskEnv(_Face, gymnasium.Env[Any, Any]):
     """One episode of a task at a time.
 
     Args:
         task: environment id.
         control: what the action steers; default: the first of the environment's controls.
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
-            the path of a file with one.
+            the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
+            one scenario, drawn by these weights from the episode's generator.
         reward: "cost" (default), "log-likelihood" or "relative"; see :mod:`.reward`.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
@@ -198,6 +412,11 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.task_on`.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
+        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+            (:meth:`.Task.context`), at resets and steps.
+        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
+            and of what is "privileged", the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may be shown that where it is judged.
         **keywords: parameters of the task.
 
     Raises:
@@ -220,44 +439,73 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         detailed_info: bool = False,
         backend: str = "auto",
         dtype: str = "float64",
+        context: bool = False,
+        observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, keywords)
+        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
         if backend == "torch":
             raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        self._open(task_on(backend, task, control, scenario, **keywords), 1)
+        self._open(functools.partial(task_on, backend, task, control), scenario, keywords, 1, None)
         self.render_mode = render_mode
         self.picture: EpisodePicture | None = None
         """What keeps and draws the episode; None without a render mode."""
         if render_mode is not None:
-            # Only here: matplotlib takes longer to import than an episode takes to run.
-            from . import rendering
-
-            name = find_scenario(type(self.task), scenario, keywords).name
-            self.picture = rendering.EpisodePicture(self.task, name, render_mode, FRAMES_PER_SECOND)
+            self._picture_of(self._first_course.names[0])
         self.observation_space = self._observation_space()
         self.action_space = self.task.action_space
 
+    def _picture_of(self, scenario: str) -> None:
+        """Draw episodes of the present task, of a scenario of this name."""
+        # Only here: matplotlib takes longer to import than an episode takes to run.
+        from . import rendering
+
+        assert self.render_mode is not None
+        self.picture = rendering.EpisodePicture(self.task, scenario, self.render_mode, FRAMES_PER_SECOND)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[numpy.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode and show its first measurement.
 
+        ``options["scenario"]``: what ``scenario`` of the environment takes; None is the environment's own again.
+        ``options["parameters"]``: parameters that go before those of the environment; ``{}`` for none. Each holds until
+        a reset names another.
+
         Raises:
-            ValueError: for a seed that is none, and for options, of which there are none.
+            ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them,
+                and for a scenario or parameters that would change the spaces.
         """
-        _checked_options(options, self.reset_options)
-        super().reset(seed=_checked_seed(seed))
+        wanted, seed = _checked_options(options, self.reset_options), _checked_seed(seed)
+        self._send(wanted, [0])
+        super().reset(seed=seed)
         self.lanes.seed(0, self.np_random)
         self.lanes.restart()
+        self._forget_errors([0])
+        if isinstance(self.lanes, MixedLanes):
+            self.task = self.lanes.task_of(0)
+            if self.picture is not None and self.picture.task is not self.task:
+                self.picture.close()
+                self._picture_of(self.lanes.scenario_of(0))
         if self.picture is not None:
             self.picture.begin(self.lanes.state)
             self._show()
-        return self._rounded(self.lanes.observe()[0]), {}
+        return self._shown_alone(), self._with_context({})
 
-    def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
+    def _shown_alone(self) -> Any:
+        """Observation of the one episode."""
+        if not self.privileged:
+            return self._rounded(self.lanes.observe()[0])
+        return {name: values[0] for name, values in self._observed().items()}
+
+    def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
+        if self.tells_context:
+            info["context"] = {name: values[0] for name, values in self._context()[0].items()}
+        return info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
         if not self.lanes.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -274,8 +522,10 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
-        shown_next, earned = self._rounded(self.lanes.observe()[0]), float(self._rounded(paid)[0])
-        return shown_next, earned, False, bool(self.lanes.finished[0]), info
+        if self.tells_context:
+            self._with_context(info)
+        earned = float(self._rounded(paid)[0])
+        return self._shown_alone(), earned, False, bool(self.lanes.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -318,7 +568,8 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         num_envs: number of sub-environments; sub-environment i equals the single environment with the same
             seed, whatever the number.
         control: what the action steers.
-        scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one.
+        scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
+            mixture, ``{"random": 0.8, "paper": 0.2}``.
         reward: "cost" (default), "log-likelihood" or "relative".
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
@@ -334,6 +585,11 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             cost and what else an evaluation records.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
+        context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
+            (:meth:`.Task.context`), at resets and steps.
+        observation: "measured" (default), or "asymmetric", for critics in training: a dictionary of the "observation"
+            and of what is "privileged", the context and the error after the last action in units of its reported
+            standard deviation (zero at a reset). No policy may be shown that where it is judged.
         **keywords: parameters of the task.
 
     Raises:
@@ -346,7 +602,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         "render_modes": ["rgb_array"],
         "render_fps": FRAMES_PER_SECOND,
     }
-    reset_options = ("reset_mask", "shortened_by")
+    reset_options = ("reset_mask", "shortened_by", "scenario", "parameters")
     pictures: "EpisodePictures | None" = None
     """What keeps and draws the first few episodes; None without a render mode."""
 
@@ -365,9 +621,11 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         max_episode_steps: int | None = None,
         detailed_info: bool = False,
         dtype: str = "float64",
+        context: bool = False,
+        observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, keywords)
+        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
         num_envs, max_episode_steps = frozen(num_envs), frozen(max_episode_steps)
         check("num_envs", num_envs, int, Limits(at_least=1))
         if max_episode_steps not in (None, -1):
@@ -383,9 +641,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        made = task_on(backend, task, control, scenario, device=device, threads=threads, **keywords)
-        self.device = made.device
-        self._open(made, num_envs)
+        make = functools.partial(task_on, backend, task, control, device=device, threads=threads)
+        self._open(make, scenario, keywords, num_envs, None if max_episode_steps == -1 else max_episode_steps)
+        self.device = self.task.device
         self.autoreset_mode = autoreset_mode
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = num_envs
@@ -393,14 +651,16 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if render_mode is not None:
             from . import rendering
 
-            name = find_scenario(type(self.task), scenario, keywords).name
+            if isinstance(self.lanes, MixedLanes):
+                raise ValueError(
+                    "a vector of environments that mix scenarios cannot be drawn: use gymnasium.make, or one scenario"
+                )
+            name = self._first_course.names[0]
             self.pictures = rendering.EpisodePictures(self.task, name, num_envs, FRAMES_PER_SECOND)
         self.single_observation_space = self._observation_space()
         self.single_action_space = self.task.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        if max_episode_steps not in (None, -1):
-            self.last_decision = min(self.last_decision, max_episode_steps)
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)
 
@@ -420,20 +680,28 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start new episodes everywhere, or where ``options["reset_mask"]`` is true.
 
         ``options["shortened_by"]``: integers ``(num_envs,)``, by how many decisions each of these episodes ends
         early (later ones are whole again), so that episodes of one horizon need not all end together.
 
+        ``options["scenario"]`` and ``options["parameters"]``: as of the single environment, of the sub-environments
+        that are reset; each holds for their coming episodes, also after an autoreset, until a reset names another.
+
         Raises:
-            ValueError: for other options, and for seeds that are none.
+            ValueError: for other options, an unknown name or a value out of its limits in them, a scenario or
+                parameters that would change the spaces, and for seeds that are none.
             gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
         wanted = _checked_options(options, self.reset_options)
         seeds = self._checked_seeds(seed)
         mask = wanted.get("reset_mask")
-        shortened = self._checked_shortening(wanted.get("shortened_by", [0] * self.num_envs))
+        if self.pictures is not None and {"scenario", "parameters"} & wanted.keys():
+            raise ValueError(
+                "a vector of environments that is drawn flies one scenario: leave out render_mode, or scenario and "
+                "parameters in the options of a reset"
+            )
         if mask is None:
             chosen: Sequence[int] = range(self.num_envs)
         else:
@@ -451,12 +719,28 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             if not self.lanes.begun and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
             chosen = numpy.flatnonzero(mask).tolist()
+        shortened = wanted.get("shortened_by")
+        if shortened is not None:
+            shortened = self._checked_shortening(shortened)
+        self._send(wanted, chosen)
         self._seed(seeds, chosen)
         self._restart(chosen)
-        self.lanes.decisions[list(chosen)] = shortened[list(chosen)]
+        if shortened is not None:
+            self.lanes.shorten(chosen, shortened[list(chosen)])
         self._finished = self._finished.copy()
         self._finished[list(chosen)] = False
-        return self._rounded(self.lanes.observe()), {}
+        begun = numpy.isin(numpy.arange(self.num_envs), chosen)
+        return self._observed(), self._with_context({}, begun)
+
+    def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
+        """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
+        if self.tells_context and lanes.any():
+            values, present = self._context()
+            told = {}
+            for name, array in values.items():
+                told[name], told[f"_{name}"] = array, self._mask(present[name] & lanes)
+            info["context"], info["_context"] = told, self._mask(lanes)
+        return info
 
     def _checked_shortening(self, values: Any) -> numpy.ndarray:
         try:
@@ -477,10 +761,11 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _restart(self, lanes: Sequence[int]) -> None:
         self.lanes.restart(lanes)
+        self._forget_errors(lanes)
         if self.pictures is not None:
             self.pictures.begin(self.lanes.state, lanes)
 
-    def step(self, actions: Any) -> tuple[Array, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         """Apply the actions to the measurements just shown, then show the next ones."""
         if not self.lanes.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
@@ -497,13 +782,13 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self._restart(numpy.flatnonzero(waiting).tolist())
             paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
-        finished = self.lanes.decisions >= self.last_decision
+        finished = self.lanes.finished
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
             info = self._masked(info, ~finished) | {
-                "final_obs": self._final_observations(self._rounded(self.lanes.observe()), done),
+                "final_obs": self._final_observations(self._observed(), done),
                 "_final_obs": self._mask(finished),
-                "final_info": self._masked(info, finished),
+                "final_info": self._with_context(self._masked(info, finished), finished),
                 "_final_info": self._mask(finished),
             }
             self._restart(done.tolist())
@@ -511,7 +796,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             info = self._masked(info, ~waiting)
             self._finished = finished
-        shown, paid = self._rounded(self.lanes.observe()), self._rounded(paid)
+        if self.tells_context:
+            self._with_context(info, ~self._never)
+        shown, paid = self._observed(), self._rounded(paid)
         return shown, paid, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
@@ -564,7 +851,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return booleans of the lanes for the caller to keep: a copy, on the device of the backend."""
         return lanes.copy() if self.backend != "torch" else tensor_on(lanes, self.device)
 
-    def _final_observations(self, last: Array, done: numpy.ndarray) -> Array:
+    def _final_observations(self, last: Any, done: numpy.ndarray) -> Array:
         """Gymnasium's form: an object for each finished sub-environment, None elsewhere.
 
         With the torch backend one tensor, the last observation of every lane: taking it apart would cost a
@@ -574,5 +861,5 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             return last
         final = numpy.full(self.num_envs, None, dtype=object)
         for lane in done:
-            final[lane] = last[lane]
+            final[lane] = {name: v[lane] for name, v in last.items()} if self.privileged else last[lane]
         return final

@@ -75,6 +75,7 @@ class Lanes:
         count: number of lanes.
         paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
         begun: told of new episodes at the start of the track, before their first measurement.
+        longest: decisions after which an episode ends at the latest; default: the task's horizon.
 
     Attributes:
         state: the episodes after the last measurement, lanes padded to a multiple of eight.
@@ -88,6 +89,7 @@ class Lanes:
         count: int,
         paper: Task | None = None,
         begun: Callable[[Episode], None] | None = None,
+        longest: int | None = None,
     ) -> None:
         self.task = task
         self.count = count
@@ -107,7 +109,8 @@ class Lanes:
         """Whether somebody else has that array."""
         self.generators: list[numpy.random.Generator] = []
         self.decisions = numpy.zeros(count, dtype=numpy.int64)
-        self.decisions_per_episode = task.horizon // task.decision_interval
+        horizon = task.horizon // task.decision_interval
+        self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
         rows = task.horizon + 1
         self._row_width = task.noise.normals + task.noise.row_uniforms
         self._in_blocks = rows > LONGEST_BLOCK
@@ -407,6 +410,31 @@ class Lanes:
         self._settle()
         return {**self.__dict__, "_steppers": {}}
 
+    def grow(self, count: int) -> None:
+        """Make room for more lanes; the new ones fly some episode until they are restarted.
+
+        Args:
+            count: a multiple of eight.
+        """
+        self._settle()
+        beyond = numpy.zeros(count - self.width, dtype=numpy.int64)
+        index = self.task.xp.asarray(numpy.append(numpy.arange(self.width), beyond), device=self.task.device)
+        states, self._interval_mean, self._ring = mapped(
+            lambda values: self.task.xp.take(values, index, axis=-1),
+            (tuple(self._episodes), self._interval_mean, self._ring),
+        )
+        self._episodes = list(states)
+        added = count - self.count
+        self.decisions = numpy.append(self.decisions, numpy.zeros(added, dtype=numpy.int64))
+        self._started = numpy.append(self._started, numpy.repeat(self._started[:1], added))
+        # None that belongs to another lane: long episodes draw from theirs as they go.
+        self.generators += [numpy.random.default_rng(0) for _ in range(added)]
+        self._children += [child and numpy.random.default_rng(0) for child in self._children[:1] * added]
+        self.count = self.width = count
+        self._steppers = {}
+        if self.paper is not None:
+            self._paper_action = self._constant_action(self.paper)
+
     # --- for whoever steps them in an unusual way
 
     def detach(self) -> None:
@@ -434,6 +462,10 @@ class Lanes:
             setattr(self, name, copy.deepcopy(snapshot[name]))
         for name in _REPLACED:
             setattr(self, name, snapshot[name])
+
+    def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
+        """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
+        self.decisions[list(lanes)] = numpy.minimum(decisions, self.decisions_per_episode - 1)
 
     @property
     def finished(self) -> numpy.ndarray:

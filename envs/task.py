@@ -190,6 +190,12 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
         return {}
 
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Report what was drawn for the episode, and what of it holds now: finite arrays ``(..., N)`` of one shape
+        throughout; -1 where a time is one of what does not happen.
+        """
+        return {}
+
 
 class Bank(ABC, Generic[TaskT, Measurement, State]):
     """What is steered: the filters under one control.
@@ -486,6 +492,11 @@ class Task(ABC):
         This and what follows also take an episode that somebody else estimates, see :class:`Outside`.
         """
         return self._estimating(episode).mean(episode.bank)
+
+    def context(self, episode: Episode) -> dict[str, Array]:
+        """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
+        context = self.world.context(episode.truth)
+        return {name: self.xp.astype(values, self.xp.float64) for name, values in context.items()}
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""

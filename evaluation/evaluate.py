@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any
 
+import gymnasium
 import numpy
 import xarray
 
@@ -63,8 +64,14 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
 
 
 def check_shown(task: Task, policy: Any, name: str) -> None:
-    """Raise ValueError if a model takes observations of another shape than the task shows."""
-    shown = getattr(getattr(policy, "observation_space", None), "shape", None)
+    """Raise ValueError if a model takes observations of another shape than the task shows, or privileged ones."""
+    space = getattr(policy, "observation_space", None)
+    if isinstance(space, gymnasium.spaces.Dict):
+        raise ValueError(
+            f"policy {name!r} takes privileged observations ({', '.join(space)}), which no evaluation shows: let its "
+            "actor answer observations alone, in an object with a method predict"
+        )
+    shown = getattr(space, "shape", None)
     if shown is not None and shown != (len(task.fields),):
         raise ValueError(
             f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "

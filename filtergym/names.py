@@ -11,6 +11,7 @@ from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
 from .envs.catalogue import imported, make_task, nearest, task_class
 from .envs.environment import TaskEnv, TaskVectorEnv
+from .envs.mixture import MixedLanes
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
 from .evaluation.evaluate import check_shown, control_of
@@ -164,6 +165,15 @@ def _task_of(env: Any) -> Any:
         raise ValueError(
             "make_policy takes the id of an environment, or one of filtergym made by gymnasium.make or make_vec, got "
             f"{type(inner).__name__}"
+        )
+    if inner.privileged:
+        raise ValueError(
+            "this environment shows what no policy may know: make it without observation='asymmetric', or show "
+            "a policy of your own observation['observation']"
+        )
+    if isinstance(inner.lanes, MixedLanes):
+        raise ValueError(
+            "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
         )
     if inner.backend == "torch":
         raise ValueError("policies answer in NumPy arrays: make the environment with another backend")

@@ -111,6 +111,26 @@ def test_regulator_is_the_limit_of_backward_dynamic_programming(seed: int) -> No
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+def test_regret_of_controls_is_what_they_cost_more(seed: int) -> None:
+    """Whatever the controls: the cost of a run is x0^T S x0 - xN^T S xN and the regrets of its controls."""
+    rng = numpy.random.default_rng(seed)
+    F, B = rng.standard_normal((3, 3)) * 0.6, rng.standard_normal((3, 2))
+    W, R = random_covariance(rng, 3), random_covariance(rng, 2)
+    L, regret = linear_systems.discrete_regulator(F, B, W, R)
+    S = numpy.zeros((3, 3))
+    for _ in range(2000):
+        S = W + F.T @ S @ F - F.T @ S @ B @ numpy.linalg.solve(R + B.T @ S @ B, B.T @ S @ F)
+    x, paid, lost = rng.standard_normal(3), 0.0, 0.0
+    first = x @ S @ x
+    for _ in range(20):
+        u = rng.standard_normal(2)
+        paid += x @ W @ x + u @ R @ u
+        lost += (u + L @ x) @ regret @ (u + L @ x)
+        x = F @ x + B @ u
+    assert paid == pytest.approx(first - x @ S @ x + lost, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_stationary_covariances_solve_their_equations(seed: int) -> None:
     rng = numpy.random.default_rng(seed)
     A, W = random_stable(rng, 4), random_covariance(rng, 4)

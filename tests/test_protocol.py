@@ -251,7 +251,7 @@ def test_wrong_arguments_of_a_vectors_reset(case):
 
 
 def test_options_of_a_single_environment():
-    message = "unknown option of a reset 'reset_mask': there are none"
+    message = "unknown option of a reset 'reset_mask': choose from scenario, parameters"
     assert_refused_without_a_trace(TaskEnv(ID), TaskEnv(ID), {"options": {"reset_mask": [True]}}, message)
     TaskEnv(ID).reset(options={})
 

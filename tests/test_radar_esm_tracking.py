@@ -378,15 +378,6 @@ def test_silent_targets_radiate_in_bursts():
     assert heard == pytest.approx(0.08 / 0.48, abs=0.015)
 
 
-def test_cost_never_reaches_the_huber_bound():
-    for scenario in SCENARIOS:
-        task = make(scenario)
-        beyond = [
-            (task.cost(state) > task.huber_bound**2).mean() for *_, state in roll(task, draw(task, 400, 14))
-        ]
-        assert numpy.mean(beyond) < 1e-3
-
-
 @pytest.mark.parametrize(
     ("keywords", "reason"),
     [

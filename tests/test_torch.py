@@ -8,7 +8,7 @@ import numpy
 import pytest
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.environment import TaskVectorEnv
-from filtergym.envs.task import huber
+from filtergym.envs.reward import charge
 
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
@@ -164,7 +164,7 @@ def test_actions_may_be_arrays_lists_or_whole_numbers(id):
 
 @pytest.mark.parametrize(("id", "control"), CONTINUOUS)
 def test_gradient_of_an_episode_equals_finite_differences(id, control):
-    """Loss: mean Huber cost of a short episode on fixed noise, through bank, mixing and update.
+    """Loss: mean charge of a short episode on fixed noise, through bank, mixing and update.
 
     Central differences with step h have an error of h^2 times the third derivative plus rounding over h:
     1e-5 balances them near 1e-10 of the loss, and 1e-5 of the largest gradient leaves room for curvature.
@@ -198,7 +198,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
         total = 0.0
         for k in range(horizon):
             state = task.act(state, actions[k])
-            total = total + huber(task.cost(state), task.huber_bound, xp)
+            total = total + charge(task, state)
             state = task.measure(state, rows[k + 1])
         return total.mean()
 

@@ -470,6 +470,48 @@ def test_torch_gives_the_same_roll_out(torch: Any, plant: str, control: str) -> 
         )
 
 
+@BOTH
+def test_charge_is_what_the_error_of_the_estimate_loses(plant: str) -> None:
+    """With the command known, the control is off by L times the error; a command moves both alike."""
+    task = make(plant)
+    assert task.design.optimal is not None
+    L, regret = task.design.optimal
+    noise = Noise(task, 8, 3, 31)
+    episode = begin(task, noise)
+    for k in range(30):
+        episode = task.act(task.measure(episode, noise.rows[k + 1]) if k else episode, numpy.zeros((1, 8)))
+        lost = (L @ task.error(episode))[0]
+        expected = regret[0, 0] / task.cost_unit * lost**2
+        numpy.testing.assert_allclose(task.charge(episode), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_charges_differ_by_the_whole_cost_of_what_was_done() -> None:
+    """Two filters, the same noise: episode means of cost and charge differ alike, up to what noise does to both."""
+    ends = {}
+    for name, value in (("kalman", 0.0), ("steered", 1.0)):
+        task = make("U", "paper-noise")
+        noise = Noise(task, 256, 5, 601)
+        state = begin(task, noise)
+        cost, charge = numpy.zeros((2, 256))
+        for k in range(600):
+            state = task.act(state, numpy.full((1, 256), value))
+            cost, charge = cost + task.cost(state) / 600, charge + task.charge(state) / 600
+            state = task.measure(state, noise.rows[k + 1])
+        ends[name] = cost, charge
+    cost, charge = (ends["steered"][i] - ends["kalman"][i] for i in (0, 1))
+    error = (cost - charge).std() / 16.0
+    assert charge.mean() > 10.0 * error
+    assert abs(cost.mean() - charge.mean()) < 4.0 * error
+    assert charge.std() < 0.7 * cost.std()  # which is what it is for
+
+
+def test_charge_is_the_cost_where_the_weights_leave_the_best_control_open() -> None:
+    task = make("P", state_weights=(0.0, 1.0), feedback=(0.8, 1.5))
+    assert task.design.optimal is None
+    episode = task.act(begin(task, Noise(task, 8, 3, 1)), numpy.zeros((1, 8)))
+    numpy.testing.assert_array_equal(task.charge(episode), task.cost(episode))
+
+
 def test_gradient_of_the_cost_through_the_closed_loop(torch: Any) -> None:
     task = make("U", xp=torch)
     noise = Noise(task, 8, 4, 7)

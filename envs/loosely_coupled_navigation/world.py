@@ -200,6 +200,32 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             "reported_deviation": truth.reported_deviation,
         }
 
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Noise levels of INS and receiver, their changes and disturbances as numbers of measurements (the first in a
+        window and the first one after it), and what the receiver is like now.
+        """
+        xp = self.xp
+        windows = {
+            name: xp.where(numbers < NEVER, numbers, -1.0)
+            for name, numbers in (
+                ("change", truth.change),
+                ("outage", truth.outage),
+                ("jamming", truth.jamming),
+                ("spoofing", truth.spoofing),
+            )
+        }
+        return {
+            "drift_deviation": truth.drift_deviation,
+            "coloured_step": truth.coloured_step,
+            "white_step": truth.white_step,
+            "receiver_levels": truth.receiver_levels,
+            "reported_levels": truth.reported_levels,
+            **windows,
+            "drift": truth.drift,
+            "receiver_deviation": truth.deviation,
+            "available": truth.available,
+        }
+
 
 def within(number: Array, window: Array) -> Array:
     """Whether a measurement stands in a window, ``(N,)``."""

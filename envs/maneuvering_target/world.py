@@ -282,3 +282,27 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Squared position error over the squared range sigma."""
         scaled = (mean[:2] - truth.position) * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
+
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Manoeuvres: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each, or where legs begin (s) and
+        their turn rates (rad/s); whether one is flown now. Empty where the flight is a table.
+        """
+        xp, m = self.xp, truth.maneuvers
+        if isinstance(m, Legs):
+            now = self.parameters.sampling_interval * truth.scan
+            turn = m.turn[0]
+            for i in range(1, int(m.time.shape[0])):
+                turn = xp.where(now >= m.time[i], m.turn[i], turn)
+            return {"leg_time": m.time, "leg_turn_rate": m.turn, "maneuvering": turn != 0.0}
+        if m is None or not self.slots:
+            return {}
+        # A manoeuvre that is not flown lies beyond the end.
+        flown = m.first <= self.parameters.horizon + 1
+        active = (truth.scan >= m.first) & (truth.scan <= m.last)
+        return {
+            "maneuver_first": xp.where(flown, m.first, -1.0),
+            "maneuver_last": xp.where(flown, m.last, -1.0),
+            "maneuver_acceleration": xp.where(flown, m.acceleration, 0.0),
+            "maneuver_turn": xp.where(flown, xp.atan2(m.velocity_across, 1.0 + m.velocity_along), 0.0),
+            "maneuvering": xp.any(active, axis=0),
+        }

@@ -235,6 +235,25 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             "seconds": xp.astype(truth.scan, xp.float64) * self.parameters.sampling_interval,
         }
 
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Class and type of the target now, when they change (scan) and to what, the second emitter, and whether the
+        target is silent now.
+        """
+        changes = self.parameters.class_change is not None
+        xp = self.xp
+        never = 0 * truth.change_scan - 1
+        return {
+            "target_class": truth.target_class,
+            "emitter_type": truth.emitter_type,
+            "change_scan": truth.change_scan if changes else never,
+            "next_class": truth.next_class if changes else never,
+            "next_type": truth.next_type if changes else never,
+            "other_class": truth.other_class,
+            "other_type": truth.other_type,
+            "separation": truth.separation,
+            "radiating": xp.astype(truth.radiating, xp.float64),
+        }
+
 
 def _thresholds(rows: object) -> numpy.ndarray:
     """Cumulative probabilities that a uniform number is compared with, ``(columns - 1, rows)``."""

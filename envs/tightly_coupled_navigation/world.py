@@ -385,3 +385,28 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """Time and true hypothesis."""
         seconds = self.parameters.sampling_interval * self.xp.astype(truth.step, truth.state.dtype)
         return {"seconds": seconds, "true_mode": truth.mode}
+
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Legs and faults with the steps of each (first and last, -1 where there is none), and what holds now: the true
+        hypothesis, the noise of every reading over the nominal one, stuck accelerometers, and multipath.
+        """
+        legs, faults = truth.legs, truth.faults
+
+        def window(steps: Array) -> Array:
+            return self.xp.where(steps[1] >= steps[0], steps, -1.0)
+
+        return {
+            "leg_start": legs.start,
+            "leg_kind": legs.kind,
+            "leg_acceleration": legs.acceleration,
+            "noisy": window(faults.noisy),
+            "noisy_satellite": faults.noisy_satellite,
+            "stuck": window(faults.stuck),
+            "no_rates": window(faults.no_rates),
+            "hidden": window(faults.hidden),
+            "hidden_satellites": faults.hidden_satellites,
+            "mode": truth.mode,
+            "noise_factor": truth.noise_factor,
+            "stuck_now": truth.stuck,
+            "multipath": truth.multipath,
+        }

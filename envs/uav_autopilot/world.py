@@ -267,3 +267,20 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     def records(self, truth: Truth) -> dict[str, Array]:
         """Output and command, in the unit of the output."""
         return {"output": truth.state[self.task.output], "command": truth.command}
+
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Levels of the disturbance and of each sensor's noise, commands and dropouts, with the numbers of the
+        measurements at which they step, and the levels now.
+        """
+        return {
+            "levels": truth.levels.values,
+            "level_times": truth.levels.times,
+            "sensor_levels": truth.sensor_levels.values,
+            "sensor_level_times": truth.sensor_levels.times,
+            "commands": truth.commands.values,
+            "command_times": truth.commands.times,
+            "dropout_starts": truth.dropout_starts,
+            "dropout_stops": truth.dropout_stops,
+            "level": truth.level,
+            "sensor_level": truth.sensor_level,
+        }

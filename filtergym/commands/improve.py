@@ -69,18 +69,37 @@ def train(
     ] = None,
     trust: Trust = False,
     backend: Backend = "auto",
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="env.NAME=VALUE, keyword of the environment, or algo.NAME=VALUE, hyperparameter; may be repeated.",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file of settings, in rl-zoo3's form or with keys env and algo.")
+    ] = None,
+    reward: Annotated[str | None, typer.Option(help="cost, log-likelihood or relative.")] = None,
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one also takes --trust. One of bptt
     cannot.
 
+    Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
+    settings of the run, and refuses others.
+
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo ppo --steps 1000000 --out runs/ppo
+
+    Example: filtergym train filtergym/ManeuveringTarget-v0 --set env.range_sigma=50 --set algo.learning_rate=3e-4 \
+    --out runs/precise
     """
     try:
         import torch
 
         from ..agents import training_run
+        from ..agents.settings import parsed_settings
 
         trainer: Any
         if algo == "bptt":
@@ -94,8 +113,13 @@ def train(
             f"training needs more packages: pip install 'filtergym[agents]' ({error})"
         ) from error
     torch.set_num_threads(1)  # networks this small run slower on more
-    run = training_run.new_run(environment, algo, control, steps, envs, seed, scenario, backend=backend)
-    run = training_run.opened_run(out, run, resume)
+    keywords, hyperparameters = parsed_settings(set_ or [])
+    if reward is not None:
+        keywords["reward"] = reward
+    run = training_run.new_run(
+        environment, algo, control, steps, envs, seed, scenario, hyperparameters, backend, keywords, config
+    )
+    run = training_run.opened_run(out, run, resume, same=not (keywords or hyperparameters or config))
     with progress_bar() as bar:
         line = bar.add_task(f"training {algo}", total=run.steps)
         trainer(

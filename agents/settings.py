@@ -1,0 +1,157 @@
+"""What a user changes of a training run: settings of the environment and of the algorithm, in words or in a file.
+
+Values are read as YAML reads them. Later sources go before earlier ones: the file of hyperparameters that is shipped, a
+file of one's own, single settings. Mappings are merged key by key.
+"""
+
+import inspect
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..envs.catalogue import nearest, parameter_names, task_class
+
+SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
+"""Numbers such as 1e-3, which YAML 1.1 takes for words."""
+OPTIONS = ("control", "scenario", "backend")
+"""Keywords of an environment that a run has options for."""
+SETTABLE = (*OPTIONS, "reward", "dtype")
+"""Keywords of an environment, beside its parameters, that training takes."""
+OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+"""Arguments of an algorithm that a run gives itself."""
+
+
+def with_numbers(value: Any) -> Any:
+    """Return what YAML has read, with numbers in scientific notation as numbers."""
+    if isinstance(value, str) and SCIENTIFIC.fullmatch(value):
+        return float(value)
+    if isinstance(value, list):
+        return [with_numbers(item) for item in value]
+    if isinstance(value, dict):
+        return {name: with_numbers(item) for name, item in value.items()}
+    return value
+
+
+def merged(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
+    """Return two mappings as one; the second goes before the first, within mappings too."""
+    both = dict(first)
+    for name, value in then.items():
+        own = both.get(name)
+        both[name] = merged(own, value) if isinstance(own, Mapping) and isinstance(value, Mapping) else value
+    return both
+
+
+def parsed_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for what is inside a mapping.
+
+    Returns:
+        Keywords of the environment, and hyperparameters.
+
+    Raises:
+        ValueError: for another form.
+    """
+    import yaml
+
+    found: dict[str, dict[str, Any]] = {"env": {}, "algo": {}}
+    for word in words:
+        path, equals, text = word.partition("=")
+        kind, *names = path.strip().split(".")
+        if not equals or kind not in found or not names or not all(names):
+            raise ValueError(
+                f"--set needs env.NAME=VALUE or algo.NAME=VALUE, such as --set algo.learning_rate=0.001, got {word!r}"
+            )
+        try:
+            value = with_numbers(yaml.safe_load(text))
+        except yaml.YAMLError as error:
+            raise ValueError(f"--set {path}: cannot read the value {text!r} as YAML") from error
+        for name in reversed(names):
+            value = {name: value}
+        found[kind] = merged(found[kind], value)
+    return found["env"], found["algo"]
+
+
+def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a file of settings.
+
+    Args:
+        path: of a YAML file: hyperparameters in sections by environment id or ``default``, as rl-zoo3 has them, with
+            keywords of the environment in ``env_kwargs``; or with the keys ``env`` and ``algo``.
+        id: environment id.
+
+    Returns:
+        Keywords of the environment, and hyperparameters.
+
+    Raises:
+        ValueError: if the file cannot be read, is of another form, or has no section for the environment.
+    """
+    import yaml
+
+    try:
+        table = with_numbers(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"cannot read settings from {path}: {reason}") from error
+    if not isinstance(table, dict) or not table:
+        raise ValueError(f"{path} needs sections by environment id or default, or the keys env and algo")
+    if table.keys() <= {"env", "algo"}:
+        env, algo = table.get("env") or {}, table.get("algo") or {}
+    else:
+        section = table.get(id, table.get("default"))
+        if section is None:
+            raise ValueError(
+                f"{path} has no section {id} and none called default: it has {', '.join(map(str, table))}"
+            )
+        algo = dict(section) if isinstance(section, dict) else section
+        env = (algo.pop("env_kwargs", None) or {}) if isinstance(algo, dict) else {}
+    for what, part in (("environment", env), ("algorithm", algo)):
+        if not isinstance(part, dict) or not all(isinstance(name, str) for name in part):
+            raise ValueError(f"{path}: settings of the {what} map names to values, got {part!r}")
+    return env, algo
+
+
+def check_keywords(id: str, algorithm: str, keywords: Mapping[str, Any]) -> None:
+    """Raise ValueError for a keyword of the environment that there is not, or that training cannot take."""
+    known = [*parameter_names(task_class(id)), *SETTABLE]
+    for name in keywords:
+        if name not in known:
+            raise nearest("setting", f"env.{name}", [f"env.{other}" for other in known])
+    if algorithm == "bptt" and keywords.get("dtype", "float64") != "float64":
+        raise ValueError("algorithm 'bptt' is shown float64: leave out env.dtype")
+
+
+def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
+    """Raise ValueError for a hyperparameter that the algorithm does not have.
+
+    Args:
+        algorithm: name.
+        values: to be checked.
+        shipped: those of the file that is shipped.
+    """
+    known = {"n_envs", "n_timesteps", *shipped}
+    if algorithm != "bptt":
+        from .sb3_training import ALGORITHMS
+
+        cls = ALGORITHMS[algorithm]
+        known |= {"normalize", *inspect.signature(cls).parameters} - OF_THE_RUN
+        policy = cls.policy_aliases.get(str(values.get("policy")))
+        own = values.get("policy_kwargs") or {}
+        if not isinstance(own, Mapping):
+            raise ValueError(f"policy_kwargs maps names to values, got {own!r}")
+        if policy is not None:
+            parameters = set(inspect.signature(policy).parameters) - {
+                "observation_space",
+                "action_space",
+                "lr_schedule",
+            }
+            for name in own:
+                if name not in parameters:
+                    inside = "algo.policy_kwargs."
+                    raise nearest("setting", inside + name, [inside + other for other in sorted(parameters)])
+        elif "policy" in values:
+            raise nearest("policy", values["policy"], cls.policy_aliases)
+    for name in values:
+        if name not in known:
+            raise nearest(
+                "setting", f"algo.{name}", [f"algo.{other}" for other in sorted(known - {"env_kwargs"})]
+            )

@@ -1,0 +1,299 @@
+"""The episode's context in ``info``, and observations for critics: what they say is true, and no policy is shown it."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.privileged import context_shapes
+from filtergym.envs.task import World
+
+from filtergym import evaluate, make_policy
+
+ID = "filtergym/ManeuveringTarget-v0"
+LOOSE = "filtergym/LooselyCoupledNavigation-v0"
+ESM = "filtergym/RadarEsmTracking-v0"
+TIGHT = "filtergym/TightlyCoupledNavigation-v0"
+UAV = "filtergym/UavAutopilot-v0"
+NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
+
+
+def rollout(id, steps, seed=0, **keywords):
+    """Context at the reset and at every step of an episode, and the episodes of the engine."""
+    env = gymnasium.make(id, context=True, **keywords)
+    _, info = env.reset(seed=seed)
+    env.action_space.seed(0)
+    contexts, states = [info["context"]], [env.unwrapped.lanes.state]
+    for _ in range(steps):
+        contexts.append(env.step(env.action_space.sample())[4]["context"])
+        states.append(env.unwrapped.lanes.state)
+    return contexts, states
+
+
+@pytest.mark.parametrize("scenario_number", range(2))
+def test_context_is_finite_of_one_shape_and_the_truths_own(env_id, short, scenario_number):
+    name = list(catalogue()[env_id].scenarios)[scenario_number]
+    contexts, states = rollout(env_id, 4, scenario=name, **short)
+    task = make_task(env_id, scenario=name, **short)
+    shapes = context_shapes(task)
+    for context, state in zip(contexts, states, strict=True):
+        assert {key: values.shape for key, values in context.items()} == shapes
+        for key, values in task.world.context(state.truth).items():
+            assert np.isfinite(values).all(), key
+            np.testing.assert_array_equal(context[key], values[..., 0])
+
+
+def test_every_environment_has_a_context(env_id):
+    assert catalogue()[env_id].World.context is not World.context
+    assert context_shapes(make_task(env_id))
+
+
+def test_context_does_not_change_the_episode(env_id, short):
+    plain, telling = gymnasium.make(env_id, **short), gymnasium.make(env_id, context=True, **short)
+    np.testing.assert_array_equal(plain.reset(seed=1)[0], telling.reset(seed=1)[0])
+    action = plain.action_space.sample()
+    one, other = plain.step(action), telling.step(action)
+    np.testing.assert_array_equal(one[0], other[0])
+    assert one[1] == other[1]
+    assert "context" not in one[4]
+
+
+def test_maneuvers_are_flown_when_the_context_says():
+    found = 0
+    for seed in range(4):
+        contexts, states = rollout(ID, 99, seed, control="gain")
+        now = [c["maneuvering"] for c in contexts]
+        first, last = contexts[0]["maneuver_first"], contexts[0]["maneuver_last"]
+        scans = np.arange(1, 101)[:, None]
+        inside = ((scans >= first) & (scans <= last)).any(axis=1)
+        np.testing.assert_array_equal(now, inside)
+        velocity = np.array([state.truth.velocity[:, 0] for state in states])
+        changed = (np.diff(velocity, axis=0) != 0.0).any(axis=1)
+        np.testing.assert_array_equal(changed, inside[1:])
+        found += inside.sum()
+        assert ((first == -1) == (last == -1)).all()
+    assert found
+
+
+def test_outages_are_where_the_context_says():
+    contexts, states = rollout(LOOSE, 499, scenario="outage")
+    first, beyond = contexts[0]["outage"]
+    number = np.arange(1, 501)
+    np.testing.assert_array_equal([c["available"] for c in contexts], (number < first) | (number >= beyond))
+    np.testing.assert_array_equal(contexts[0]["jamming"], [-1.0, -1.0])
+    assert states[-1].measurement.available[0] == contexts[-1]["available"]
+
+
+def test_class_changes_when_the_context_says():
+    contexts, _ = rollout(ESM, 100, scenario="class-change")
+    start = contexts[0]
+    changed = np.arange(1, 102) >= start["change_scan"]
+    assert changed.any()
+    classes = np.array([c["target_class"] for c in contexts])
+    assert set(classes[changed]) == {start["next_class"]}
+    assert set(classes[~changed]) == {start["target_class"]}
+
+
+def test_faults_hold_when_the_context_says():
+    contexts, _ = rollout(TIGHT, 20, scenario="accelerometer-failure", decision_interval=10, horizon=300)
+    first, last = contexts[0]["stuck"]
+    steps = 1 + 10 * np.arange(21)
+    np.testing.assert_array_equal(
+        [c["stuck_now"] for c in contexts], (steps >= first) & (steps <= last) & (steps > 1)
+    )
+
+
+def test_levels_are_those_of_the_times():
+    contexts, _ = rollout(UAV, 200, scenario="random")
+    start = contexts[0]
+    for number, context in enumerate(contexts, 1):
+        part = (number >= start["level_times"]).sum()
+        assert context["level"] == start["levels"][part]
+
+
+@pytest.mark.parametrize("backend", NEEDED)
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_context_of_a_vector_is_that_of_single_environments(backend, mode):
+    pytest.importorskip(NEEDED[backend])
+    keywords = {"horizon": 3, "context": True}
+    many = gymnasium.make_vec(LOOSE, num_envs=3, backend=backend, autoreset_mode=mode, **keywords)
+    alone = [gymnasium.make(LOOSE, backend="numpy", **keywords) for _ in range(3)]
+    told = [many.reset(seed=4)[1]] + [
+        many.step(np.zeros((3, *many.single_action_space.shape)))[4] for _ in range(8)
+    ]
+    finals = 0
+    for lane, env in enumerate(alone):
+        own, over = [env.reset(seed=4 + lane)[1]], False
+        for step in range(1, 9):
+            if over and mode == "NextStep":
+                own.append(env.reset()[1])
+                over = False
+                continue
+            _, _, _, over, info = env.step(np.zeros(env.action_space.shape))
+            if over and mode == "SameStep":
+                final = told[step]["final_info"]["context"]
+                for name, values in info["context"].items():
+                    np.testing.assert_allclose(np.asarray(final[name])[lane], values, rtol=1e-12, atol=1e-12)
+                finals += 1
+                info, over = env.reset()[1], False
+            own.append(info)
+        for one, info in zip(told, own, strict=True):
+            assert bool(one["_context"][lane])
+            for name, values in info["context"].items():
+                assert bool(one["context"][f"_{name}"][lane])
+                np.testing.assert_allclose(
+                    np.asarray(one["context"][name])[lane], values, rtol=1e-12, atol=1e-12
+                )
+    assert finals == (6 if mode == "SameStep" else 0)
+
+
+def test_context_of_a_vector_has_gymnasiums_form():
+    keywords = {"num_envs": 2, "context": True, "horizon": 3}
+    own = gymnasium.make_vec(LOOSE, **keywords)
+    synced = gymnasium.make_vec(LOOSE, vectorization_mode="sync", **keywords)
+    infos = [(own.reset(seed=0)[1], synced.reset(seed=0)[1])]
+    action = np.zeros(own.action_space.shape)
+    infos += [(own.step(action)[4], synced.step(action)[4]) for _ in range(6)]
+    for one, other in infos:
+        assert one["context"].keys() == other["context"].keys()
+        np.testing.assert_array_equal(one["_context"], other["_context"])
+        for name, values in one["context"].items():
+            np.testing.assert_array_equal(values, other["context"][name])
+            assert values.dtype == other["context"][name].dtype
+
+
+# --- privileged observations
+
+
+@pytest.mark.parametrize("backend", ["numpy", "compiled"])
+def test_privileged_observations_are_context_and_error(env_id, short, backend):
+    pytest.importorskip(NEEDED[backend])
+    keywords = {"backend": backend, "detailed_info": False, **short}
+    env = gymnasium.make(env_id, observation="asymmetric", context=True, **keywords)
+    plain = gymnasium.make(env_id, **{**keywords, "detailed_info": True})
+    shown, info = env.reset(seed=2)
+    assert env.observation_space.contains(shown)
+    np.testing.assert_array_equal(shown["observation"], plain.reset(seed=2)[0])
+    components = len(env.unwrapped.task.components)
+    np.testing.assert_array_equal(shown["privileged"][-components:], 0.0)
+    env.action_space.seed(0)
+    for _ in range(3):
+        action = env.action_space.sample()
+        shown, paid, _, _, info = env.step(action)
+        other = plain.step(action)
+        np.testing.assert_allclose(shown["observation"], other[0], rtol=1e-12, atol=1e-12)
+        assert paid == pytest.approx(other[1], rel=1e-12)
+        flat = np.concatenate([np.ravel(values) for values in info["context"].values()])
+        np.testing.assert_array_equal(shown["privileged"][:-components], flat)
+        sigma = np.sqrt(np.diagonal(other[4]["covariance"]))
+        np.testing.assert_allclose(shown["privileged"][-components:], other[4]["error"] / sigma, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scenario", ["random", {"random": 0.5, "quiet": 0.5}])
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_privileged_vectors_are_those_of_single_environments(backend, scenario):
+    pytest.importorskip(NEEDED[backend])
+    keywords = {"observation": "asymmetric", "scenario": scenario, "horizon": 3, "reward": "relative"}
+    many = gymnasium.make_vec(LOOSE, num_envs=4, backend=backend, autoreset_mode="SameStep", **keywords)
+    shown = [many.reset(seed=0)[0]]
+    action = np.full((4, *many.single_action_space.shape), 0.1)
+    steps = [many.step(action) for _ in range(5)]
+    for lane in range(4):
+        env = gymnasium.make(LOOSE, backend="numpy", **keywords)
+        own = env.reset(seed=lane)[0]
+        for step, (_, paid, _, over, info) in enumerate(steps):
+            before = (shown + [s[0] for s in steps])[step]
+            for name in own:
+                np.testing.assert_allclose(np.asarray(before[name])[lane], own[name], rtol=1e-9, atol=1e-9)
+            own, earned, _, truncated, _ = env.step(action[lane])
+            assert float(paid[lane]) == pytest.approx(earned, abs=1e-9)
+            assert bool(over[lane]) == truncated
+            if truncated:
+                final = (
+                    info["final_obs"]["privileged"][lane]
+                    if backend == "torch"
+                    else info["final_obs"][lane]["privileged"]
+                )
+                np.testing.assert_allclose(np.asarray(final), own["privileged"], rtol=1e-9, atol=1e-9)
+                own = env.reset()[0]
+
+
+def test_privileged_environments_say_so():
+    env = gymnasium.make(ID, observation="asymmetric")
+    assert env.metadata["privileged"] is True
+    assert env.spec.kwargs["observation"] == "asymmetric"
+    assert "privileged" not in gymnasium.make(ID).metadata
+    many = gymnasium.make_vec(ID, num_envs=2, observation="asymmetric", dtype="float32")
+    assert many.metadata["privileged"] is True
+    assert many.observation_space.contains(many.reset(seed=0)[0])
+
+
+def test_policies_are_not_shown_what_is_privileged():
+    with pytest.raises(ValueError, match="shows what no policy may know"):
+        make_policy(gymnasium.make(ID, observation="asymmetric"), "imm")
+    with pytest.raises(ValueError, match="flies several"):
+        make_policy(gymnasium.make(ID, scenario={"random": 1, "paper": 1}), "imm")
+
+    class Cheat:
+        observation_space = gymnasium.make(ID, observation="asymmetric").observation_space
+        predict = None
+
+    with pytest.raises(ValueError, match=r"privileged observations.*no evaluation shows"):
+        evaluate(ID, {"cheat": Cheat()}, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"observation": "asymetric"}, "unknown observation 'asymetric': did you mean 'asymmetric'"),
+        ({"context": "yes"}, "context must be True or False"),
+        ({"observation": "asymmetric", "scenario": {"random": 1, "paper": 1}}, "context of another shape"),
+    ],
+)
+def test_wrong_keywords_are_told(keywords, message):
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make(ID, **keywords)
+
+
+def test_a_policy_that_is_corrected_sees_the_observation_only():
+    pytest.importorskip("torch")
+    pytest.importorskip("sb3_contrib")
+    from filtergym.agents import ResidualActions, to_sb3
+    from filtergym.baselines.names import own_competitor
+
+    task = make_task(ID, "weights")
+    policy = own_competitor(ID, "imm")(task)
+    keywords = {"control": "weights", "horizon": 4}
+    paid = []
+    for observation in ("measured", "asymmetric"):
+        env = ResidualActions(gymnasium.make(ID, observation=observation, **keywords), policy)
+        env.reset(seed=0)
+        many = gymnasium.make_vec(
+            ID, num_envs=1, autoreset_mode="SameStep", observation=observation, **keywords
+        )
+        vector = to_sb3(many, residual_to=policy)
+        vector.seed(0)
+        vector.reset()
+        zero = np.zeros(task.action_space.shape)
+        paid.append([(env.step(zero)[1], vector.step(zero[None])[1][0]) for _ in range(4)])
+    assert paid[0] == paid[1]
+
+
+def test_snippet_of_an_asymmetric_critic(capsys):
+    pytest.importorskip("stable_baselines3")
+    text = (Path(__file__).parent.parent / "docs" / "agents.md").read_text(encoding="utf-8")
+    (snippet,) = [s for s in re.findall(r"```python\n(.*?)```", text, re.S) if "asymmetric" in s]
+    short = snippet.replace("20_000", "256").replace("episodes=200", "episodes=8")
+    assert short != snippet
+    names: dict = {"__name__": "snippet"}
+    exec(compile(short, "agents.md", "exec"), names)
+    assert capsys.readouterr().out.strip()
+    # The actor's actions do not depend on what is privileged; the critic's values do.
+    model = names["model"]
+    torch = pytest.importorskip("torch")
+    shown = {name: torch.as_tensor(values) for name, values in model._last_obs.items()}
+    other = {**shown, "privileged": shown["privileged"] + 1.0}
+    assert torch.equal(model.policy._predict(shown, True), model.policy._predict(other, True))
+    assert not torch.equal(model.policy.predict_values(shown), model.policy.predict_values(other))

@@ -1,0 +1,381 @@
+"""Settings of training runs: which goes before which, what is refused, and that a run keeps and validates with them."""
+
+import csv
+import dataclasses
+import functools
+import itertools
+import shlex
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.baselines.names import own_competitor
+from filtergym.envs.catalogue import task_class
+
+from filtergym import evaluate
+
+pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+pytest.importorskip("sb3_contrib")
+from filtergym.agents import training_run
+from filtergym.agents.adapter import to_sb3
+from filtergym.agents.bptt import train_bptt
+from filtergym.agents.export import export_run
+from filtergym.agents.sb3_training import train_sb3, training_environment
+from filtergym.agents.settings import merged, parsed_settings, read_config
+from filtergym.agents.training_run import (
+    load_run,
+    new_run,
+    opened_run,
+    stored_hyperparameters,
+    training_costs,
+)
+
+ID = "filtergym/ManeuveringTarget-v0"
+SMALL = {
+    "ppo": {"n_steps": 30, "batch_size": 60, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}},
+    "bptt": {"hidden_size": 4, "truncation": 40},
+}
+
+
+@pytest.fixture(autouse=True)
+def few_validation_episodes(monkeypatch):
+    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 8)
+
+
+@pytest.fixture
+def all_training_scenarios(monkeypatch):
+    """As if every scenario were one to train on."""
+    cls = task_class(ID)
+    every = {name: dataclasses.replace(s, training=True) for name, s in cls.scenarios.items()}
+    monkeypatch.setattr(cls, "scenarios", every)
+
+
+def trained(run, folder, **keywords):
+    folder.mkdir(exist_ok=True)
+    trainer = train_bptt if run.algorithm == "bptt" else functools.partial(train_sb3, trust=True)
+    return trainer(run, folder, interval=10**9, **keywords)
+
+
+@pytest.mark.parametrize(
+    ("word", "env", "algo"),
+    [
+        ("env.range_sigma=50", {"range_sigma": 50}, {}),
+        ("env.reward=relative", {"reward": "relative"}, {}),
+        ("algo.learning_rate=3e-4", {}, {"learning_rate": 3e-4}),
+        ("algo.learning_rate=lin_1e-3", {}, {"learning_rate": "lin_1e-3"}),
+        ("algo.policy_kwargs.net_arch=[32,32]", {}, {"policy_kwargs": {"net_arch": [32, 32]}}),
+        ("algo.policy_kwargs={log_std_init: -1e0}", {}, {"policy_kwargs": {"log_std_init": -1.0}}),
+        ("env.polar_measurements=false", {"polar_measurements": False}, {}),
+        ("env.track=null", {"track": None}, {}),
+        ("env.gains=[0.2, 1e-1]", {"gains": [0.2, 0.1]}, {}),
+    ],
+)  # fmt: skip
+def test_settings_are_yaml(word, env, algo):
+    assert parsed_settings([word]) == (env, algo)
+
+
+@pytest.mark.parametrize(
+    "word", ["range_sigma=50", "env.range_sigma", "env.=1", "agent.x=1", "env..x=1", "="]
+)
+def test_other_forms_are_refused(word):
+    with pytest.raises(ValueError, match=r"--set needs env\.NAME=VALUE or algo\.NAME=VALUE"):
+        parsed_settings([word])
+
+
+def test_what_is_no_yaml_is_refused():
+    with pytest.raises(ValueError, match="cannot read the value"):
+        parsed_settings(["env.gains=[0.2"])
+
+
+def test_mappings_are_merged_key_by_key():
+    assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"c": 4}, "d": {"e": 5}}) == {
+        "a": {"b": 1, "c": 4},
+        "d": {"e": 5},
+    }
+
+
+ZOO = f"""
+{ID}:
+  n_envs: 4
+  gamma: 0.9
+  env_kwargs: {{range_sigma: 70.0}}
+  policy_kwargs: {{net_arch: [16]}}
+default:
+  gamma: 0.5
+"""
+PLAIN = "env: {range_sigma: 70.0}\nalgo: {n_envs: 4, gamma: 0.9, policy_kwargs: {net_arch: [16]}}\n"
+
+
+@pytest.mark.parametrize("text", [ZOO, PLAIN])
+def test_shipped_then_config_then_settings_then_options(text, tmp_path):
+    config = tmp_path / "mine.yml"
+    config.write_text(text)
+    shipped = stored_hyperparameters(ID, "ppo")
+    run = new_run(ID, "ppo", config=config)
+    assert run.envs == 4
+    assert run.hyperparameters["gamma"] == 0.9
+    assert run.hyperparameters["gae_lambda"] == shipped["gae_lambda"]
+    assert run.hyperparameters["policy_kwargs"] == {**shipped["policy_kwargs"], "net_arch": [16]}
+    assert run.hyperparameters["env_kwargs"] == {**shipped["env_kwargs"], "range_sigma": 70.0}
+    overrides, keywords = (
+        {"gamma": 0.8, "n_envs": 6},
+        {"range_sigma": 60.0, "reward": "cost", "control": "mode"},
+    )
+    run = new_run(ID, "ppo", config=config, overrides=overrides, keywords=keywords)
+    assert (run.envs, run.hyperparameters["gamma"], run.control) == (6, 0.8, "mode")
+    assert run.hyperparameters["env_kwargs"] == {"range_sigma": 60.0, "reward": "cost"}
+    run = new_run(ID, "ppo", "gain", envs=7, config=config, overrides=overrides, keywords=keywords)
+    assert (run.envs, run.control) == (7, "gain")
+
+
+def test_a_config_may_have_a_default_section(tmp_path):
+    config = tmp_path / "mine.yml"
+    config.write_text(ZOO)
+    assert read_config(config, "mine/Other-v0") == ({}, {"gamma": 0.5})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "needs sections by environment id or default"),
+        ("- 1", "needs sections"),
+        (
+            "mine/Other-v0: {gamma: 0.5}",
+            "has no section filtergym/ManeuveringTarget-v0 and none called default",
+        ),
+        (f"{ID}: 3", "settings of the algorithm map names to values"),
+        ("env: [1]", "settings of the environment map names"),
+        ("env: {", "cannot read settings"),
+        (f"{ID}: {{gama: 0.5}}", "unknown setting 'algo.gama': did you mean 'algo.gamma'"),
+    ],
+)
+def test_wrong_configs_are_told(text, message, tmp_path):
+    config = tmp_path / "mine.yml"
+    config.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        new_run(ID, "ppo", config=config)
+    with pytest.raises(ValueError, match="cannot read settings"):
+        new_run(ID, "ppo", config=tmp_path / "none.yml")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "keywords", "overrides", "message"),
+    [
+        ("ppo", {"range_sgma": 1.0}, {}, "unknown setting 'env.range_sgma': did you mean 'env.range_sigma'"),
+        ("ppo", {"observation": "asymmetric"}, {}, "unknown setting 'env.observation'"),
+        ("ppo", {"range_sigma": -1.0}, {}, "range_sigma must be"),
+        ("ppo", {"reward": "costs"}, {}, "unknown reward 'costs': did you mean 'cost'"),
+        ("ppo", {"dtype": "float16"}, {}, "unknown dtype"),
+        ("ppo", {"scenario": "paper"}, {}, "is held out"),
+        ("ppo", {"control": "gian"}, {}, "unknown control"),
+        (
+            "ppo",
+            {},
+            {"learning_rte": 1.0},
+            "unknown setting 'algo.learning_rte': did you mean 'algo.learning_rate'",
+        ),
+        ("ppo", {}, {"policy_kwargs": {"net_arc": []}}, "unknown setting 'algo.policy_kwargs.net_arc'"),
+        ("ppo", {}, {"policy_kwargs": "dict(net_arch=[8])"}, "policy_kwargs maps names to values"),
+        ("ppo", {}, {"policy": "MlpPolcy"}, "unknown policy 'MlpPolcy': did you mean 'MlpPolicy'"),
+        ("bptt", {}, {"gamma": 0.9}, "unknown setting 'algo.gamma'"),
+        ("bptt", {"dtype": "float32"}, {}, "leave out env.dtype"),
+    ],
+)
+def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
+    with pytest.raises(ValueError, match=message):
+        new_run(ID, algorithm, keywords=keywords, overrides=overrides)
+
+
+def test_shipped_hyperparameters_pass_the_check_of_settings():
+    for algorithm in training_run.FILES:
+        control = "mode" if algorithm == "dqn" else "gain"
+        new_run(ID, algorithm, control, overrides={"learning_rate": 1e-4})
+
+
+def test_settings_reach_environment_and_algorithm():
+    keywords = {"range_sigma": 60.0, "reward": "log-likelihood", "dtype": "float32"}
+    env = training_environment(new_run(ID, "ppo", envs=2, keywords=keywords)).env
+    assert env.task.parameters.range_sigma == 60.0
+    assert (env.reward_kind, env.dtype) == ("log-likelihood", "float32")
+
+
+def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
+    """Stable-Baselines3's SAC writes into policy_kwargs."""
+    small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
+    asked = functools.partial(new_run, ID, "sac", "gain", 20, 2, overrides=small)
+    trained(opened_run(tmp_path, asked(), False), tmp_path)
+    opened_run(tmp_path, asked(), True)
+    assert load_run(tmp_path).hyperparameters == asked().hyperparameters
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm, tmp_path):
+    keywords = {"range_sigma": 60.0, "horizon": 40, "reward": "log-likelihood"}
+    run = new_run(ID, algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
+    run = trained(opened_run(tmp_path, run, False), tmp_path)
+    kept = load_run(tmp_path)
+    assert kept.hyperparameters["env_kwargs"] == keywords
+    for word in ("env.range_sigma=60.0", "env.horizon=40", "env.reward="):
+        assert f"--set {word}" in kept.command.replace("'", "")
+    assert parsed_settings(words_of(kept.command))[0] == keywords
+    dataset = evaluate(ID, ["imm"], episodes=8, split="validation", range_sigma=60.0, horizon=40)
+    assert kept.validation[0]["paper_cost"] == pytest.approx(float(dataset["cost"].mean()), rel=1e-12)
+    # The same again goes on, other settings are refused, and none are those of the run.
+    again = new_run(ID, algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords=keywords)
+    opened_run(tmp_path, again, True)
+    other = new_run(
+        ID, algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords={**keywords, "range_sigma": 61.0}
+    )
+    with pytest.raises(ValueError, match=r"hyperparameters.env_kwargs.range_sigma 60.0, not 61.0"):
+        opened_run(tmp_path, other, True)
+    none = new_run(ID, algorithm, "gain", 480, 4)
+    run = opened_run(tmp_path, none, True, same=True)
+    assert run.hyperparameters == kept.hyperparameters
+    assert trained(run, tmp_path, resume=True).steps_done >= 480
+    # What is exported is checked under the same parameters; an evaluation is of whatever it is asked for.
+    out = tmp_path / "agent.safetensors"
+    cost = export_run(tmp_path, out).exported["cost"]
+    own = evaluate(ID, [str(out)], episodes=32, split="validation", range_sigma=60.0, horizon=40)
+    assert cost == pytest.approx(float(own["cost"].mean()), rel=1e-9)
+    assert float(evaluate(ID, [str(out)], episodes=32, split="validation")["cost"].mean()) != pytest.approx(
+        cost
+    )
+
+
+def words_of(command):
+    """Settings in a command."""
+    words = shlex.split(command)
+    return [word for before, word in itertools.pairwise(words) if before == "--set"]
+
+
+def rows(folder):
+    return [row for file in sorted(folder.glob("*.csv")) for row in csv.DictReader(file.open())]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_validations_are_curves_in_the_log(algorithm, tmp_path):
+    run = new_run(ID, algorithm, "gain", 800, 4, overrides=SMALL[algorithm])
+    trainer = train_bptt if algorithm == "bptt" else train_sb3
+    trainer(run, tmp_path, interval=300)
+    validated = [row for row in rows(tmp_path / "log") if row.get("validation/cost")]
+    assert len(validated) == len(run.validation) > 1
+    for row, entry in zip(validated, run.validation, strict=True):
+        # The log rounds nothing but what float to text does.
+        assert float(row["validation/cost"]) == pytest.approx(entry["cost"])
+        assert float(row["validation/paper_cost"]) == pytest.approx(entry["paper_cost"])
+        assert float(row["validation/cost_vs_paper"]) == pytest.approx(entry["relative_cost_difference"][0])
+        assert int(row["time/total_timesteps"]) == entry["steps"]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_tensorboard_shows_validations_over_environment_steps(algorithm, tmp_path):
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = new_run(ID, algorithm, "gain", 800, 4, overrides=SMALL[algorithm])
+    trainer = train_bptt if algorithm == "bptt" else train_sb3
+    trainer(run, tmp_path, interval=300)
+    events = EventAccumulator(str(tmp_path / "log"))
+    events.Reload()
+    shown = [(event.step, event.value) for event in events.Scalars("validation/cost")]
+    expected = [(entry["steps"], entry["cost"]) for entry in run.validation]
+    np.testing.assert_allclose(shown, expected, rtol=1e-6)
+
+
+# --- mixtures
+
+
+def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
+    for scenario in ({"random": 0.8, "paper": 0.2}, "random:0.8,paper:0.2"):
+        with pytest.raises(
+            ValueError, match=r"scenario 'paper' is held out: train on a training scenario \(random\)"
+        ):
+            new_run(ID, "ppo", scenario=scenario)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+@pytest.mark.usefixtures("all_training_scenarios")
+def test_training_on_a_mixture(algorithm, tmp_path):
+    mixture = {"random": 0.75, "cruise": 0.25}
+    asked = functools.partial(
+        new_run, ID, algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm],
+        keywords={"horizon": 20},
+    )  # fmt: skip
+    run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
+    assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
+    costs = [
+        weight * evaluate(ID, ["imm"], name, episodes=8, split="validation", horizon=20)["cost"].mean().item()
+        for name, weight in mixture.items()
+    ]
+    assert run.validation[0]["paper_cost"] == pytest.approx(sum(costs), rel=1e-12)
+    resumed = opened_run(tmp_path, asked(steps=400), True)
+    assert trained(resumed, tmp_path, resume=True).steps_done >= 400
+    assert export_run(tmp_path, tmp_path / "agent.safetensors").scenario == run.scenario
+
+
+@pytest.mark.usefixtures("all_training_scenarios")
+def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
+    run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,paper:1", backend="compiled")
+    with pytest.raises(ValueError, match="on torch only"):
+        train_bptt(run, tmp_path)
+    run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,cruise:1")
+    with pytest.raises(ValueError, match="episodes of one length, not from random:"):
+        train_bptt(run, tmp_path)
+
+
+def test_costs_of_a_mixture_are_weighted():
+    run = new_run(ID, "ppo")
+    paper = own_competitor(ID, "imm")
+    run.scenario = "random:0.25,paper:0.75"
+    mixed = training_costs(run, paper, 4)
+    parts = []
+    for name in ("random", "paper"):
+        run.scenario = name
+        parts.append(training_costs(run, paper, 4))
+    np.testing.assert_allclose(mixed, 0.25 * parts[0] + 0.75 * parts[1])
+
+
+def test_options_of_a_reset_reach_the_environments_of_an_adapter():
+    env = to_sb3(gymnasium.make_vec(ID, num_envs=2, autoreset_mode="SameStep"))
+    paper = to_sb3(gymnasium.make_vec(ID, num_envs=2, autoreset_mode="SameStep", scenario="paper"))
+    for one in (env, paper):
+        one.seed(3)
+    env.set_options({"scenario": "paper"})
+    np.testing.assert_array_equal(env.reset(), paper.reset())
+    env.set_options([{"scenario": "paper"}, {}])
+    with pytest.raises(ValueError, match="are the same for all environments"):
+        env.reset()
+
+
+def test_command_line(command, tmp_path):
+    config = tmp_path / "mine.yml"
+    config.write_text("env: {range_sigma: 70.0}\nalgo: {hidden_size: 4, truncation: 40, n_envs: 4}\n")
+    words = ("train", ID, "--algo", "bptt", "--control", "gain", "--steps", 400, "--out", tmp_path / "run")
+    code, _, errors = command(
+        *words,
+        "--config",
+        config,
+        "--set",
+        "algo.hidden_size=3",
+        "--set",
+        "env.horizon=50",
+        "--reward",
+        "log-likelihood",
+    )
+    assert code == 0, errors
+    run = load_run(tmp_path / "run")
+    assert run.hyperparameters["hidden_size"] == 3
+    assert run.hyperparameters["env_kwargs"] == {
+        "range_sigma": 70.0,
+        "horizon": 50,
+        "reward": "log-likelihood",
+    }
+    code, _, errors = command(*words, "--envs", 4, "--resume")
+    assert code == 0, errors
+    code, _, errors = command(*words, "--envs", 4, "--resume", "--set", "env.horizon=60")
+    assert code == 2
+    assert "hyperparameters" in errors
+    code, _, errors = command(*words, "--set", "env.horzon=60")
+    assert code == 2
+    assert "did you mean 'env.horizon'" in errors
