@@ -2,9 +2,9 @@
 
     python benchmarks/plain_ppo.py --out plain_ppo.json
 
-One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 where one holds for ten
-measurements), five training seeds; then the deterministic policy and the paper's algorithm meet the same episodes of the test
-split. Runs that a file holds are not repeated.
+One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 where one holds for
+ten measurements), five training seeds; then the deterministic policy and the paper's algorithm meet the same episodes of
+the test split. Runs that a file holds are not repeated.
 """
 
 import argparse
@@ -15,11 +15,11 @@ from pathlib import Path
 
 import gymnasium
 import numpy
+from filtergym.baselines.catalogue import baselines_of
 from rich.console import Console
 from rich.table import Table
 
 import filtergym
-from filtergym.baselines.catalogue import baselines_of
 
 LONG = {"filtergym/TightlyCoupledNavigation-v0"}
 """Where a decision holds for ten measurements of three filters: fewer of them, and fewer episodes."""
@@ -29,8 +29,12 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--environment", action="append", help="id; default: all")
     parser.add_argument("--seeds", type=int, default=5, help="training runs of each")
-    parser.add_argument("--steps", type=int, default=200_000, help="decisions; a quarter in TightlyCoupledNavigation")
-    parser.add_argument("--episodes", type=int, default=2000, help="of the test; a tenth in TightlyCoupledNavigation")
+    parser.add_argument(
+        "--steps", type=int, default=200_000, help="decisions; a quarter in TightlyCoupledNavigation"
+    )
+    parser.add_argument(
+        "--episodes", type=int, default=2000, help="of the test; a tenth in TightlyCoupledNavigation"
+    )
     parser.add_argument("--out", type=Path, default=Path("plain_ppo.json"))
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
     return parser.parse_args()
@@ -68,7 +72,16 @@ def table(runs: list[dict]) -> Table:
     from scipy.stats import t
 
     shown = Table(title="SB3's PPO, its defaults and ours: cost against the paper, %")
-    for head in ("environment", "control", "decisions", "mean", "95 %", "median episode", "seeds", "decisions/s"):
+    for head in (
+        "environment",
+        "control",
+        "decisions",
+        "mean",
+        "95 %",
+        "median episode",
+        "seeds",
+        "decisions/s",
+    ):
         shown.add_column(head, no_wrap=True)
     for id in sorted({found["environment"] for found in runs}):
         own = sorted((found for found in runs if found["environment"] == id), key=lambda found: found["seed"])
@@ -101,7 +114,9 @@ def main() -> None:
                 continue
             runs.append(run(id, seed, chosen.steps // part, chosen.episodes // tenth))
             chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
-            console.print(f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s")
+            console.print(
+                f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s"
+            )
     if chosen.markdown:
         from rich.box import MARKDOWN
 

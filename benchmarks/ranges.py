@@ -3,7 +3,7 @@
 Learning code expects numbers of about one. Actions are those of the paper's algorithm (where the control has it, else
 zero) and uniformly random ones.
 
-    python benchmarks/ranges.py --steps 100000 --markdown
+    python benchmarks/ranges.py --steps 100000
 """
 
 import argparse
@@ -12,17 +12,18 @@ from collections.abc import Iterator
 
 import gymnasium
 import numpy
-
-import filtergym
 from filtergym.envs.catalogue import task_class
 
-ENVIRONMENTS = filtergym.ENVIRONMENTS if hasattr(filtergym, "ENVIRONMENTS") else None
+import filtergym
+
 PARALLEL = 100
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=100_000, help="decisions in each environment and control")
+    parser.add_argument(
+        "--steps", type=int, default=100_000, help="decisions in each environment and control"
+    )
     parser.add_argument("--environment", action="append", help="id; default: all")
     parser.add_argument("--control", action="append", help="default: the environment's first")
     parser.add_argument("--scenario", help="default: the environment's own")
@@ -30,7 +31,9 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def actions(env: gymnasium.vector.VectorEnv, kind: str, generator: numpy.random.Generator) -> Iterator[numpy.ndarray]:
+def actions(
+    env: gymnasium.vector.VectorEnv, kind: str, generator: numpy.random.Generator
+) -> Iterator[numpy.ndarray]:
     space, task = env.unwrapped.single_action_space, env.unwrapped.task
     discrete = isinstance(space, gymnasium.spaces.Discrete)
     paper = task.paper_policy
@@ -40,7 +43,9 @@ def actions(env: gymnasium.vector.VectorEnv, kind: str, generator: numpy.random.
             if discrete:
                 yield generator.integers(space.n, size=env.num_envs)
             else:
-                yield generator.uniform(space.low, space.high, (env.num_envs, *space.shape)).astype(space.dtype)
+                yield generator.uniform(space.low, space.high, (env.num_envs, *space.shape)).astype(
+                    space.dtype
+                )
         elif discrete:
             yield numpy.zeros(env.num_envs, dtype=int)
         else:
@@ -86,7 +91,8 @@ def show(id: str, control: str, chosen: argparse.Namespace) -> None:
     for i, name in enumerate(names):
         shown = {k: (v[0][i], v[1][i], v[3][i]) for k, v in rows.items()}
         if chosen.fields or any(max(-a, b) > w for (a, b, _), w in zip(shown.values(), (5, 10), strict=True)):
-            print(f"    {name:40}" + "".join(f"  {k} {a:7.2f} to {b:7.2f} (sd {d:5.2f})" for k, (a, b, d) in shown.items()))
+            ranges = "".join(f"  {k} {a:7.2f} to {b:7.2f} (sd {d:5.2f})" for k, (a, b, d) in shown.items())
+            print(f"    {name:40}{ranges}")
 
 
 if __name__ == "__main__":

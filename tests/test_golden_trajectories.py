@@ -6,8 +6,8 @@ default scenario. A new environment or control gets its files by
     python tests/test_golden_trajectories.py
 
 which writes those that are missing and leaves the others alone. To accept a change, raise the task's ``interface``, by
-which agents that were trained before are refused, delete the file and run it again. Once 0.1.0 is tagged, the version of
-the id goes up instead.
+which agents that were trained before are refused, delete the file and run it again. Once 0.1.0 is tagged, the version
+of the id goes up instead.
 """
 
 import json

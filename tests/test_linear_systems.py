@@ -107,7 +107,9 @@ def test_regulator_is_the_limit_of_backward_dynamic_programming(seed: int) -> No
     for _ in range(2000):
         L = numpy.linalg.solve(R + B.T @ S @ B, B.T @ S @ F)
         S = W + F.T @ S @ (F - B @ L)
-    numpy.testing.assert_allclose(linear_systems.discrete_regulator(F, B, W, R).feedback, L, rtol=1e-8, atol=1e-10)
+    numpy.testing.assert_allclose(
+        linear_systems.discrete_regulator(F, B, W, R).feedback, L, rtol=1e-8, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -2,13 +2,14 @@
 
 import math
 
-import filtergym
 import numpy as np
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.reward import paper_task, reward
+
+import filtergym
 
 ID = "filtergym/ManeuveringTarget-v0"
 
