@@ -116,7 +116,7 @@ class _Face:
     def _check(
         self,
         task: str,
-        reward_kind: str,
+        reward_kind: str | None,
         detailed_info: bool,
         dtype: str,
         context: bool,
@@ -125,6 +125,8 @@ class _Face:
     ) -> None:
         """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
         check_names(task_class(task), names, inspect.signature(type(self)).parameters)
+        if reward_kind is None:
+            reward_kind = task_class(task).reward
         if reward_kind not in REWARDS:
             raise nearest("reward", reward_kind, REWARDS)
         if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
@@ -405,7 +407,8 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
             the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
             one scenario, drawn by these weights from the episode's generator.
-        reward: "cost" (default), "log-likelihood" or "relative"; see :mod:`.reward`.
+        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, "cost" but
+            in RadarEsmTracking.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
@@ -434,7 +437,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         task: str,
         control: str | None = None,
         scenario: ScenarioChoice = None,
-        reward: str = "cost",
+        reward: str | None = None,
         render_mode: str | None = None,
         detailed_info: bool = False,
         backend: str = "auto",
@@ -570,7 +573,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
-        reward: "cost" (default), "log-likelihood" or "relative".
+        reward: "cost", "log-likelihood" or "relative"; default: the environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
@@ -612,7 +615,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         num_envs: int = 1,
         control: str | None = None,
         scenario: ScenarioChoice = None,
-        reward: str = "cost",
+        reward: str | None = None,
         render_mode: str | None = None,
         backend: str = "auto",
         device: Any = None,

@@ -340,6 +340,8 @@ class Task(ABC):
     """What the cost is and its unit, in words."""
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward."""
+    reward: ClassVar[str] = "cost"
+    """Kind of reward that agents get unless another one is asked for, see :mod:`.reward`."""
     paper_policy: PaperPolicy
 
     parameters: Any

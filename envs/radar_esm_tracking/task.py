@@ -120,6 +120,8 @@ class RadarEsmTracking(Task):
         "and acceleration_scale"
     )
     reward_unit = 0.3
+    # The noise of the track is most of the cost, and no weight changes it.
+    reward = "relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: RadarEsmTrackingParameters
