@@ -53,16 +53,16 @@ def run(id: str, seed: int, steps: int, episodes: int) -> dict:
     paper = baselines_of(id).score_paper
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
-        results = filtergym.evaluate(id, {"ppo": model, paper: paper}, episodes=episodes, seed=0)
-    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("ppo", paper)}
+        results = filtergym.evaluate(id, {"plain": model, paper: paper}, episodes=episodes, seed=0)
+    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("plain", paper)}
     return {
         "environment": id,
         "seed": seed,
         "steps": steps,
         "seconds": round(seconds, 1),
-        "control": str(results["control"].sel(policy="ppo").values),
-        "difference": float(cost["ppo"].mean() / cost[paper].mean() - 1.0),
-        "median_difference": float(numpy.median(cost["ppo"] / cost[paper]) - 1.0),
+        "control": str(results["control"].sel(policy="plain").values),
+        "difference": float(cost["plain"].mean() / cost[paper].mean() - 1.0),
+        "median_difference": float(numpy.median(cost["plain"] / cost[paper]) - 1.0),
         "standard_deviation": model.policy.log_std.exp().tolist(),
     }
 

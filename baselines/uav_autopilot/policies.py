@@ -141,7 +141,7 @@ _MEMORIES_START = {"memory": 100.0, "gust_memory": 100.0}
 TUNABLE = {
     "fixed-best": Tunable(
         "gain",
-        {"log10_scale": (-1.0, 1.0)},
+        {"log10_scale": (-0.5, 0.5)},
         {"log10_scale": 0.0},
         lambda values: ({}, lambda task: FixedScale(task, values["log10_scale"])),
     ),

@@ -104,6 +104,8 @@ class ManeuveringTarget(Task):
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
     cost_description = "squared position error over the squared range sigma"
     reward_unit = 5.2
+    # What a turn costs rules the noise of the reward, and the paper pays for it too.
+    reward = "relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))
 
     parameters: ManeuveringTargetParameters

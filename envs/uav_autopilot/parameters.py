@@ -140,10 +140,10 @@ class UavAutopilotParameters(TaskParameters):
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
     """Range of their length in measurements. Ours: up to half a settling time."""
 
-    gain_decades: float = parameter(1.0, above=0.0, at_most=8.0)
+    gain_decades: float = parameter(0.5, above=0.0, at_most=8.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the
     circle for every positive scale, so the value is what is useful: about what ``random`` draws, and no more,
-    because an agent that explores over four decades learns to shun them. The limit is half the digits of a
+    because an agent that explores over decades learns to shun them. The limit is half the digits of a
     number."""
     wide_band_scale: float = parameter(100.0, above=0.0)
     """Scale of the process noise in mode "wide-band"."""

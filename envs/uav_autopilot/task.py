@@ -99,7 +99,7 @@ class UavAutopilot(Task):
     Parameters = UavAutopilotParameters
     World = AircraftWorld
     actions = {
-        "gain": "the process noise Q of the filter is scaled by 10^a (`gain_decades` = 1) in the "
+        "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
         "update by the measurement that was just shown; **0 is the paper's filter**",
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
         "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
@@ -112,6 +112,8 @@ class UavAutopilot(Task):
         "variance of the output's sensor"
     )
     reward_unit = 1.0
+    # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
+    reward = "relative"
     paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: UavAutopilotParameters
