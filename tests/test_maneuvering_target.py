@@ -595,7 +595,7 @@ def test_evidence_adds_nats_to_the_log_posterior():
 
 
 def test_reward_is_the_compressed_cost_in_units_of_the_papers():
-    env = gym.make(ID, control="gain", scenario="paper", detailed_info=True)
+    env = gym.make(ID, control="gain", scenario="paper", reward="cost", detailed_info=True)
     env.reset(seed=0)
     worst = 0.0
     for _ in range(100):
