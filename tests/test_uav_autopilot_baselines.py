@@ -109,7 +109,11 @@ def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
     assert theory("innovation-adaptive") is None
     # It follows the scales that the modes have, whatever an action of one does under gain.
     nominal = pytest.approx(theory("kalman"), rel=1e-12)
-    assert theory("wide-band", wide_band_scale=1.0) == nominal == theory("over-smoothed", over_smoothed_scale=1.0)
+    assert (
+        theory("wide-band", wide_band_scale=1.0)
+        == nominal
+        == theory("over-smoothed", over_smoothed_scale=1.0)
+    )
     assert theory("wide-band") == pytest.approx(theory("wide-band", gain_decades=0.1), rel=1e-12)
     assert theory("raw-sensors", plant="P", sensors=("position",)) is None
 
@@ -301,7 +305,9 @@ def test_adaptive_policy_by_hand() -> None:
         action, memory = policy.predict(observation, memory, start)
         mean = mean + 0.25 * there[k] * (nu[k] ** 2 - mean)
         decades = 0.1 + 0.5 * numpy.log10(mean[:, 0]) - 0.25 * numpy.log10(mean[:, 1])
-        wanted = numpy.clip(0.25 * numpy.array(last) + 0.75 * decades / task.parameters.value("gain_decades"), -1.0, 1.0)
+        wanted = numpy.clip(
+            0.25 * numpy.array(last) + 0.75 * decades / task.parameters.value("gain_decades"), -1.0, 1.0
+        )
         numpy.testing.assert_allclose(action[:, 0], wanted, rtol=1e-12)
 
 
