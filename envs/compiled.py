@@ -37,7 +37,7 @@ from .task import Episode, Task
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether steps can be compiled here."""
-REPORTS = ("observe", "mean", "cost", "error", "covariance", "track", "records")
+REPORTS = ("observe", "mean", "cost", "charge", "error", "covariance", "track", "records")
 """Methods of a task that are compiled as they are."""
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""

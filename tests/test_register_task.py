@@ -87,7 +87,7 @@ def test_gymnasium_makes_and_renders_it(package):
     np.testing.assert_array_equal(observation, own.reset(seed=3)[0])
     env.step(env.action_space.sample())
     assert env.render().shape == (608, 960, 3)
-    vector = gymnasium.make_vec(ID, num_envs=3, horizon=5)
+    vector = gymnasium.make_vec(ID, num_envs=3, control="gain", horizon=5)
     np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
     assert "mine/Turns-v0" in catalogue()
     assert "mine/Turns-v0" not in filtergym.envs.catalogue._shipped()
@@ -205,7 +205,7 @@ class Stumbling(ManeuveringTarget):
         (broken(banks={}), "needs at least one control"),
         (broken(scenarios={}), "needs its default scenario 'random' among its scenarios, got none"),
         (broken(Parameters=NoHorizon), "with horizon and decision_interval"),
-        (Stumbling, "cannot be made with control 'gain': KeyError"),
+        (Stumbling, "cannot be made with control 'evidence': KeyError"),
     ],
 )
 def test_an_ill_formed_task_gets_one_sentence(task, expected):

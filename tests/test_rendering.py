@@ -17,7 +17,7 @@ import filtergym  # noqa: F401  # registers the environments
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
-CONTROLS = ("gain", "mode", "weights", "evidence")
+CONTROLS = ("evidence", "gains", "gain", "mode", "weights")
 
 
 def played(steps, seed=1, **keywords):
@@ -82,7 +82,7 @@ def test_reused_figure_shows_what_a_new_one_shows(control):
 
 
 def test_rendering_leaves_the_episode_alone():
-    plain, drawn = TaskEnv(ID), TaskEnv(ID, render_mode="rgb_array")
+    plain, drawn = TaskEnv(ID, "gain"), TaskEnv(ID, "gain", render_mode="rgb_array")
     numpy.testing.assert_array_equal(plain.reset(seed=5)[0], drawn.reset(seed=5)[0])
     for alpha in numpy.linspace(-1.0, 1.0, 5):
         drawn.render()
@@ -117,7 +117,9 @@ def test_axes_stay_where_they_are_and_hold_the_track():
 
 
 def test_history_is_what_info_reports():
-    env = TaskEnv(ID, scenario="paper", render_mode="rgb_array", detailed_info=True, decision_interval=2)
+    env = TaskEnv(
+        ID, "gain", scenario="paper", render_mode="rgb_array", detailed_info=True, decision_interval=2
+    )
     env.reset(seed=2)
     for decision in range(1, 4):
         _, _, _, _, info = env.step(numpy.array([0.2 * decision], dtype=numpy.float64))

@@ -130,7 +130,7 @@ class TestNormalisation:
             )
         assert own == wrapped == given
         # By hand: what normalises and what acts.
-        shown = gymnasium.make(ID).reset(seed=0)[0]
+        shown = gymnasium.make(ID, control="gain").reset(seed=0)[0]
         scale = np.sqrt(statistics.obs_rms.var + statistics.epsilon)
         normalised = np.clip((shown - statistics.obs_rms.mean) / scale, -10, 10)
         expected = model.predict(normalised, deterministic=True)
@@ -346,7 +346,8 @@ class TestMadePolicy:
 
     @pytest.mark.parametrize("name", ["adaptive", "bptt"])
     def test_batches_and_episodes_that_begin_at_different_times(self, name):
-        env = gymnasium.make_vec(ID, num_envs=11, autoreset_mode="SameStep", detailed_info=True, **SHORT)
+        keywords = {"autoreset_mode": "SameStep", "detailed_info": True, **SHORT}
+        env = gymnasium.make_vec(ID, num_envs=11, control=competitor(ID, name).control, **keywords)
         policy = make_policy(env, name)
         observation, _ = env.reset(seed=0, options={"shortened_by": np.arange(11)})
         state, start, actions = None, np.ones(11, dtype=bool), []

@@ -24,7 +24,7 @@ from ..rendering import (
     grown,
 )
 from ..task import Episode, Task
-from .banks import Schemes, Steered
+from .banks import NOISES, Augmented, Schemes, Steered
 from .task import LooselyCoupledNavigation
 
 TRACK = (0.06, 0.075, 0.43, 0.80)
@@ -34,7 +34,7 @@ MARGIN_SIGMAS = 3.5
 
 
 class LooselyCoupledNavigationPicture(Picture):
-    """Position over time, normalised innovation, gain or weights, error with its reported band."""
+    """Position over time, normalised innovation, what is steered, error with its reported band."""
 
     strips_left = 0.555
     strip_columns = 1
@@ -49,7 +49,7 @@ class LooselyCoupledNavigationPicture(Picture):
     # --- the history
 
     def records(self, state: Episode) -> dict[str, float]:
-        """Positions in m, innovation, gain or weights."""
+        """Positions in m, innovation, and the noises of the action, gain or weights."""
         measurement, filters = state.measurement, state.bank
         missing = measurement.available[0] < 0.5
         values = {
@@ -64,6 +64,10 @@ class LooselyCoupledNavigationPicture(Picture):
             # A gain of zero has no logarithm: it is drawn at the smallest one that an action can set.
             smallest = self.task.parameters.smallest_gain
             values["log_gain"] = math.log10(max(float(filters.gain[0, 0]), smallest))
+        elif isinstance(filters, Augmented):
+            values["innovation"] = math.nan if missing else normalised[0, 0]
+            for name, action in zip(NOISES, filters.action[:, 0], strict=True):
+                values[f"noise.{name}"] = action
         else:
             assert isinstance(filters, Schemes)
             for i, weight in enumerate(filters.weights[:, 0]):
@@ -97,12 +101,16 @@ class LooselyCoupledNavigationPicture(Picture):
             low = math.log10(self.task.parameters.smallest_gain)
             innovations = {"innovation": "innovation"}
             steered = Strip(f"log10 of the gain{suffix}", {"gain": "log_gain"}, (low, 0.2), steps=True)
+        elif self.task.control == "noise":
+            innovations = {"innovation": "innovation"}
+            noises = {name: f"noise.{name}" for name in NOISES}
+            steered = Strip("action: noises", noises, (-1.08, 1.08), guides=(0.0,), steps=True)
         else:
             names = self.task.modes
             innovations = {names[2]: "innovation.2"}
             weights = {name: f"weight.{i}" for i, name in enumerate(names)}
             steered = Strip("weights", weights, (-0.04, 1.04), steps=True)
-        of = "" if self.task.control == "gain" else f" of {self.task.modes[2]}"
+        of = "" if "innovation" in innovations else f" of {self.task.modes[2]}"
         return [
             Strip(
                 f"innovation{of} over predicted σ{suffix}", innovations, (-4.0, 4.0), guides=(-2.0, 0.0, 2.0)

@@ -107,7 +107,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """m/s. Ours."""
     initial_acceleration_sigma: float = parameter(0.5, above=0.0)
     """m/s^2. Ours."""
-    initial_attitude_sigma: float = parameter(1.0, above=0.0)
+    initial_attitude_sigma: float = parameter(1.0, above=0.0, at_most=180.0)
     """Degrees. Ours."""
 
     heading: float = 45.0
