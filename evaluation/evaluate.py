@@ -169,7 +169,7 @@ def evaluate(
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
-        truth), ``cost``, ``charge`` (minus the reward), ``nees``, whatever the task records (``nis``,
+        truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
         ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
 
     Raises:

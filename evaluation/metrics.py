@@ -213,7 +213,7 @@ def tidy_records(
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval); ``mean_mode_probability``; ``cost`` (uncapped mean),
-    ``return`` (sum of the rewards).
+    ``return`` (sum of the ``cost`` rewards).
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
