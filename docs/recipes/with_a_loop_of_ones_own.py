@@ -48,5 +48,7 @@ for _ in range(UPDATES):  # each on one episode of every sub-environment
         optimizer.step()
 
 mine = filtergym.FunctionPolicy(lambda shown: actor(torch.tensor(shown, dtype=torch.float32)), "evidence")
-cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(["episode", "time"])
+cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(
+    ["episode", "time"]
+)
 print(f"cost against the paper's algorithm: {cost[0] / cost[1] - 1:+.1%}")

@@ -15,7 +15,11 @@ from torch import nn
 
 import filtergym
 
-ID, DATASET, POLICY = "filtergym/ManeuveringTarget-v0", "filtergym/maneuvering-target/ramp-v0", "adaptive-rearm-tuned"
+ID, DATASET, POLICY = (
+    "filtergym/ManeuveringTarget-v0",
+    "filtergym/maneuvering-target/ramp-v0",
+    "adaptive-rearm-tuned",
+)
 RECORDED, UPDATES, EPISODES = 100, 2_000, 200
 
 policy = filtergym.make_policy(ID, POLICY)
@@ -31,7 +35,9 @@ dataset = minari.load_dataset(DATASET)
 episodes = list(dataset.iterate_episodes())
 observations = torch.cat([torch.tensor(e.observations[:-1], dtype=torch.float32) for e in episodes])
 actions = torch.cat([torch.tensor(e.actions, dtype=torch.float32) for e in episodes])
-print(f"{dataset.total_episodes} episodes, {dataset.total_steps} steps, made again: {dataset.recover_environment().spec.id}")
+print(
+    f"{dataset.total_episodes} episodes, {dataset.total_steps} steps, made again: {dataset.recover_environment().spec.id}"
+)
 
 torch.manual_seed(0)
 actor = nn.Sequential(nn.Linear(observations.shape[1], 64), nn.Tanh(), nn.Linear(64, actions.shape[1]))
@@ -46,4 +52,6 @@ for _ in range(UPDATES):
 cloned = filtergym.FunctionPolicy(lambda o: actor(torch.tensor(o, dtype=torch.float32)), policy.control)
 names = {"cloned": cloned, POLICY: POLICY, "imm": "imm"}
 cost = filtergym.evaluate(ID, names, episodes=EPISODES)["cost"].mean(["episode", "time"])
-print(f"cost against the paper's algorithm: cloned {cost[0] / cost[2] - 1:+.1%}, {POLICY} {cost[1] / cost[2] - 1:+.1%}")
+print(
+    f"cost against the paper's algorithm: cloned {cost[0] / cost[2] - 1:+.1%}, {POLICY} {cost[1] / cost[2] - 1:+.1%}"
+)

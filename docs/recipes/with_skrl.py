@@ -52,12 +52,19 @@ agent = PPO(
     memory=RandomMemory(memory_size=100, num_envs=ENVS),
     observation_space=env.observation_space,
     action_space=env.action_space,
-    cfg={"rollouts": 100, "mini_batches": 5, "discount_factor": 0.95, "experiment": {"write_interval": 0, "checkpoint_interval": 0}},
+    cfg={
+        "rollouts": 100,
+        "mini_batches": 5,
+        "discount_factor": 0.95,
+        "experiment": {"write_interval": 0, "checkpoint_interval": 0},
+    },
 )
 # Without headless skrl renders every step.
 cfg = {"timesteps": STEPS, "headless": True, "disable_progressbar": True}
 SequentialTrainer(env=env, agents=agent, cfg=cfg).train()
 
 mine = filtergym.FunctionPolicy(lambda shown: actor.net(torch.tensor(shown, dtype=torch.float32)), "evidence")
-cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(["episode", "time"])
+cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(
+    ["episode", "time"]
+)
 print(f"cost against the paper's algorithm: {cost[0] / cost[1] - 1:+.1%}")

@@ -17,5 +17,7 @@ keywords = {"n_steps": 100, "batch_size": 2560, "gamma": 0.95, "learning_rate": 
 model = PPO("MlpPolicy", to_sb3(envs), policy_kwargs={"log_std_init": -1.0}, seed=0, **keywords)
 model.learn(STEPS)
 
-cost = filtergym.evaluate(ID, {"mine": model, "imm": "imm"}, episodes=EPISODES)["cost"].mean(["episode", "time"])
+cost = filtergym.evaluate(ID, {"mine": model, "imm": "imm"}, episodes=EPISODES)["cost"].mean(
+    ["episode", "time"]
+)
 print(f"cost against the paper's algorithm: {cost[0] / cost[1] - 1:+.1%}")

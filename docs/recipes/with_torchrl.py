@@ -47,5 +47,7 @@ for data in Collector(env, actor, frames_per_batch=100 * ENVS, total_frames=100 
         optimizer.step()
 
 mine = filtergym.FunctionPolicy(lambda shown: net(torch.tensor(shown, dtype=torch.float32))[0], "evidence")
-cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(["episode", "time"])
+cost = filtergym.evaluate(ID, {"mine": mine, "imm": "imm"}, episodes=EPISODES)["cost"].mean(
+    ["episode", "time"]
+)
 print(f"cost against the paper's algorithm: {cost[0] / cost[1] - 1:+.1%}")
