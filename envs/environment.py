@@ -21,7 +21,7 @@ from .specification import told
 from .task import Task
 
 if TYPE_CHECKING:
-    from .rendering import EpisodePicture, EpisodePictures
+    from .rendering import EpisodePicture, EpisodePictures, LatePicture
 
 FRAMES_PER_SECOND = 10
 DTYPES = ("float64", "float32")
@@ -229,14 +229,15 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         self._open(task_on(backend, task, control, scenario, **keywords), 1)
         self.render_mode = render_mode
-        self.picture: EpisodePicture | None = None
-        """What keeps and draws the episode; None without a render mode."""
+        self._late: LatePicture | None = None
         if render_mode is not None:
             # Only here: matplotlib takes longer to import than an episode takes to run.
             from . import rendering
 
             name = find_scenario(type(self.task), scenario, keywords).name
-            self.picture = rendering.EpisodePicture(self.task, name, render_mode, FRAMES_PER_SECOND)
+            self._late = rendering.LatePicture(
+                rendering.EpisodePicture(self.task, name, render_mode, FRAMES_PER_SECOND)
+            )
         self.observation_space = self._observation_space()
         self.action_space = self.task.action_space
 
@@ -251,10 +252,10 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         _checked_options(options, self.reset_options)
         super().reset(seed=_checked_seed(seed))
         self.lanes.seed(0, self.np_random)
+        if self._late is not None:
+            self._late.begin(self.np_random)
         self.lanes.restart()
-        if self.picture is not None:
-            self.picture.begin(self.lanes.state)
-            self._show()
+        self._show()
         return self._rounded(self.lanes.observe()[0]), {}
 
     def step(self, action: Any) -> tuple[numpy.ndarray, float, bool, bool, dict[str, Any]]:
@@ -263,15 +264,10 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        watch: Callable[[Any], None] | None = None
-        if self.picture is not None:
-            picture, shown = self.picture, self.lanes.observe()[0]
-
-            def watch(state: Any) -> None:
-                picture.keep(state, array, shown)
-
-        paid = self._pay(array[None], info, watch)
-        self._show()
+        paid = self._pay(array[None], info)
+        if self._late is not None:
+            self._late.keep(array)
+            self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
         shown_next, earned = self._rounded(self.lanes.observe()[0]), float(self._rounded(paid)[0])
@@ -279,8 +275,13 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
-        if self.picture is not None and self.render_mode == "human":
-            self.picture.show(self.lanes.state)
+        if self._late is not None and self.render_mode == "human":
+            self._late.show()
+
+    @property
+    def picture(self) -> "EpisodePicture | None":
+        """What keeps and draws the episode, up to date; None without a render mode."""
+        return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
         """Draw the episode so far.
@@ -292,7 +293,7 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self.picture is None:
+        if self._late is None:
             gymnasium.logger.warn(
                 'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
             )
@@ -302,12 +303,12 @@ class TaskEnv(_Face, gymnasium.Env[numpy.ndarray, Any]):
         if self.render_mode == "human":
             self._show()
             return None
-        return self.picture.frame(self.lanes.state)
+        return self._late.frame()
 
     def close(self) -> None:
         """Close the window."""
-        if self.picture is not None:
-            self.picture.close()
+        if self._late is not None:
+            self._late.close()
 
 
 class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):

@@ -28,6 +28,7 @@ from matplotlib.ticker import MaxNLocator
 
 from ..compiler.functions import mapped, padded_width
 from .backend import host_array
+from .lanes import Lanes
 from .task import Task
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
@@ -438,6 +439,64 @@ class EpisodePicture:
             for first, last in self.picture.shaded():
                 self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
         self.picture.arrange()
+
+
+class LatePicture:
+    """The picture of one episode, which is flown again when somebody looks.
+
+    Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
+    and keeping what is drawn takes far longer than a step. So only the actions are kept; an episode is fixed by them and
+    by its generator.
+
+    Args:
+        picture: that is brought up to date.
+    """
+
+    def __init__(self, picture: EpisodePicture) -> None:
+        self._picture = picture
+        self._lanes = Lanes(picture.task, 1)
+        self._generator: numpy.random.Generator | None = None
+        """Of an episode that has not begun here."""
+        self._actions: list[numpy.ndarray] = []
+        """Those not applied here."""
+
+    def begin(self, generator: numpy.random.Generator) -> None:
+        """Note a new episode, that ``generator`` is about to draw."""
+        self._generator, self._actions = copy.deepcopy(generator), []
+
+    def keep(self, action: numpy.ndarray) -> None:
+        """Note an action, ``(A,)`` or a scalar."""
+        self._actions.append(action.copy())
+
+    @property
+    def picture(self) -> EpisodePicture:
+        """The picture with all that has happened."""
+        lanes, task, picture = self._lanes, self._lanes.task, self._picture
+        if self._generator is not None:
+            lanes.seed(0, self._generator)
+            lanes.restart()
+            picture.begin(lanes.state)
+            self._generator = None
+        for action in self._actions:
+            shown, widened = lanes.observe()[0], lanes.widened(action[None])
+            lanes.step(
+                lambda state, widened=widened: task.act(state, widened),
+                lambda state, _, action=action, shown=shown: picture.keep(state, action, shown),
+            )
+        self._actions = []
+        return picture
+
+    def frame(self) -> numpy.ndarray:
+        """Draw and return the picture, ``(height, width, 3)`` bytes."""
+        return self.picture.frame(self._lanes.state)
+
+    def show(self) -> None:
+        """Draw into the window."""
+        self.picture.show(self._lanes.state)
+
+    def close(self) -> None:
+        """Close the window and forget the figure."""
+        self._picture.close()
 
 
 class EpisodePictures:
