@@ -445,8 +445,8 @@ class LatePicture:
     """The picture of one episode, which is flown again when somebody looks.
 
     Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
-    and keeping what is drawn takes far longer than a step. So only the actions are kept; an episode is fixed by them and
-    by its generator.
+    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its generator fix an
+    episode.
 
     Args:
         picture: that is brought up to date.
@@ -471,20 +471,24 @@ class LatePicture:
     @property
     def picture(self) -> EpisodePicture:
         """The picture with all that has happened."""
-        lanes, task, picture = self._lanes, self._lanes.task, self._picture
+        lanes, picture = self._lanes, self._picture
         if self._generator is not None:
             lanes.seed(0, self._generator)
             lanes.restart()
             picture.begin(lanes.state)
             self._generator = None
         for action in self._actions:
-            shown, widened = lanes.observe()[0], lanes.widened(action[None])
-            lanes.step(
-                lambda state, widened=widened: task.act(state, widened),
-                lambda state, _, action=action, shown=shown: picture.keep(state, action, shown),
-            )
+            self._apply(action)
         self._actions = []
         return picture
+
+    def _apply(self, action: numpy.ndarray) -> None:
+        lanes, shown = self._lanes, self._lanes.observe()[0]
+        widened = lanes.widened(action[None])
+        lanes.step(
+            lambda state: lanes.task.act(state, widened),
+            lambda state, _: self._picture.keep(state, action, shown),
+        )
 
     def frame(self) -> numpy.ndarray:
         """Draw and return the picture, ``(height, width, 3)`` bytes."""

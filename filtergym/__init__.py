@@ -18,7 +18,15 @@ if TYPE_CHECKING:
     from .names import evaluate, make_policy, tidy_records
 
 __version__ = "0.1.0"
-__all__ = ["FunctionPolicy", "Trajectory", "evaluate", "make_policy", "register", "register_task", "tidy_records"]
+__all__ = [
+    "FunctionPolicy",
+    "Trajectory",
+    "evaluate",
+    "make_policy",
+    "register",
+    "register_task",
+    "tidy_records",
+]
 
 register()
 
