@@ -29,7 +29,7 @@ from matplotlib.ticker import MaxNLocator
 from ..compiler.functions import mapped, padded_width
 from .backend import host_array
 from .lanes import Lanes
-from .task import Task
+from .task import Array, Task
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
     "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#E69F00", "#CC79A7", "#000000", "#8A8A8A",
@@ -464,9 +464,9 @@ class LatePicture:
         """Note a new episode, that ``generator`` is about to draw."""
         self._generator, self._actions = copy.deepcopy(generator), []
 
-    def keep(self, action: numpy.ndarray) -> None:
+    def keep(self, action: Array) -> None:
         """Note an action, ``(A,)`` or a scalar."""
-        self._actions.append(action.copy())
+        self._actions.append(numpy.array(host_array(action)))
 
     @property
     def picture(self) -> EpisodePicture:
