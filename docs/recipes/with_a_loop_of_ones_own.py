@@ -14,7 +14,7 @@ ID, ENVS, UPDATES, EPISODES = "filtergym/ManeuveringTarget-v0", 128, 40, 200
 GAMMA, LAMBDA, CLIP = 0.95, 0.9, 0.2
 
 torch.manual_seed(0)
-keywords = {"control": "evidence", "reward": "relative", "dtype": "float32", "autoreset_mode": "SameStep"}
+keywords = {"dtype": "float32", "autoreset_mode": "SameStep"}
 envs = gym.make_vec(ID, num_envs=ENVS, **keywords)
 length, fields = envs.spec.max_episode_steps, envs.single_observation_space.shape[0]
 actor = nn.Sequential(nn.Linear(fields, 64), nn.Tanh(), nn.Linear(64, envs.single_action_space.shape[0]))

@@ -11,7 +11,7 @@ from ray.rllib.core.columns import Columns
 import filtergym
 
 ID, ENVS, UPDATES, EPISODES = "filtergym/ManeuveringTarget-v0", 64, 8, 200
-keywords = {"control": "evidence", "reward": "relative", "dtype": "float32"}
+keywords = {"dtype": "float32"}
 
 
 def trained(vectorize_mode, updates):

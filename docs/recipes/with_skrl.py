@@ -44,7 +44,7 @@ class Critic(DeterministicMixin, Network):
 
 
 set_seed(0)
-keywords = {"control": "evidence", "reward": "relative", "dtype": "float32", "autoreset_mode": "SameStep"}
+keywords = {"dtype": "float32", "autoreset_mode": "SameStep"}
 env = wrap_env(gym.make_vec(ID, num_envs=ENVS, **keywords))
 actor, critic = Actor(), Critic()
 agent = PPO(

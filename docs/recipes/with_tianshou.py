@@ -19,7 +19,7 @@ import filtergym
 ID, ENVS, STEPS, EPISODES = "filtergym/ManeuveringTarget-v0", 16, 40_000, 200
 
 torch.manual_seed(0)
-envs = DummyVectorEnv([lambda: gym.make(ID, control="evidence", reward="relative") for _ in range(ENVS)])
+envs = DummyVectorEnv([lambda: gym.make(ID) for _ in range(ENVS)])
 fields, actions = envs.observation_space[0].shape, envs.action_space[0].shape
 net = Net(state_shape=fields, hidden_sizes=[64])
 actor = ContinuousActorProbabilistic(preprocess_net=net, action_shape=actions, unbounded=True)

@@ -20,7 +20,7 @@ ID, ENVS, UPDATES, EPISODES = "filtergym/ManeuveringTarget-v0", 128, 15, 200
 
 torch.manual_seed(0)
 # GymEnv(ID) is a single environment. TorchRL resets by itself and holds rewards in float32.
-keywords = {"control": "evidence", "reward": "relative", "dtype": "float32", "autoreset_mode": "Disabled"}
+keywords = {"dtype": "float32", "autoreset_mode": "Disabled"}
 env = GymWrapper(gym.make_vec(ID, num_envs=ENVS, **keywords))
 fields, actions = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
 net = nn.Sequential(
