@@ -90,7 +90,7 @@ def descend_episodes(
             the mean cost of a decision since the last time; uses and clears them.
 
     Returns:
-        Mean cost of a measurement, the reward's (capped) one.
+        Mean cost of a measurement, in the unit of the reward and compressed as there.
     """
     observation, _ = env.reset()
     hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)

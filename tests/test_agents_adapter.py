@@ -15,13 +15,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 ID = "filtergym/ManeuveringTarget-v0"
 
 
-def native(count, staggered=False, **keywords):
-    env = gymnasium.make_vec(ID, num_envs=count, autoreset_mode="SameStep", **keywords)
+def native(count, staggered=False, control="gain", **keywords):
+    env = gymnasium.make_vec(ID, num_envs=count, autoreset_mode="SameStep", control=control, **keywords)
     return to_sb3(env, staggered)
 
 
-def dummy(count, **keywords):
-    return DummyVecEnv([lambda: Monitor(TaskEnv(ID, **keywords)) for _ in range(count)])
+def dummy(count, control="gain", **keywords):
+    return DummyVecEnv([lambda: Monitor(TaskEnv(ID, control=control, **keywords)) for _ in range(count)])
 
 
 def compare(one, other, steps, draw):
@@ -108,8 +108,8 @@ def test_staggered_episodes_are_shorter_once():
 
 
 def test_shortened_episode_is_the_beginning_of_the_whole_one():
-    whole = TaskVectorEnv(ID, 3, horizon=9, autoreset_mode="Disabled")
-    cut = TaskVectorEnv(ID, 3, horizon=9, autoreset_mode="Disabled")
+    whole = TaskVectorEnv(ID, 3, "gain", horizon=9, autoreset_mode="Disabled")
+    cut = TaskVectorEnv(ID, 3, "gain", horizon=9, autoreset_mode="Disabled")
     whole.reset(seed=4)
     cut.reset(seed=4, options={"shortened_by": np.array([0, 4, 0])})
     for step in range(1, 6):

@@ -72,21 +72,59 @@ def test_there_are_shipped_agents():
     }
 
 
-def test_policy_of_another_environment_is_refused(tmp_path):
-    from filtergym.agents.learned_policy import stored_policy
-    from safetensors import safe_open
+@pytest.fixture
+def stored(tmp_path):
+    """Store an agent that always answers zero, its header changed by keywords."""
     from safetensors.numpy import save_file
 
-    with safe_open(PRETRAINED / "ManeuveringTarget-v0" / "ppo.safetensors", framework="numpy") as file:
-        header = dict(file.metadata())
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    save_file(arrays, tmp_path / "other.safetensors", header | {"environment": "filtergym/Other-v0"})
+    task = make_task(ID, "gain")
+    fields = [field.name for field in task.fields]
+    arrays = {
+        "observation_mean": np.zeros(len(fields), np.float32),
+        "observation_scale": np.ones(len(fields), np.float32),
+        "weight_0": np.zeros((1, len(fields)), np.float32),
+        "bias_0": np.zeros(1, np.float32),
+    }
+    header = {
+        "environment": ID,
+        "control": "gain",
+        "interface": str(task.interface),
+        "fields": json.dumps(fields),
+        "output": "clip",
+        "activation": "tanh",
+        "run": "{}",
+    }
+
+    def store(**changes):
+        path = tmp_path / "agent.safetensors"
+        save_file(arrays, path, header | changes)
+        return path
+
+    return store
+
+
+def test_policy_of_another_environment_is_refused(stored):
+    from filtergym.agents.learned_policy import stored_policy
+
+    assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
+    path = stored(environment="filtergym/Other-v0")
     with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
-        stored_policy(ID, tmp_path / "other.safetensors")
-    fields = header["fields"].replace(json.loads(header["fields"])[0], "range")
-    save_file(arrays, tmp_path / "fields.safetensors", header | {"fields": fields})
+        stored_policy(ID, path)
+    fields = [field.name for field in make_task(ID, "gain").fields]
+    path = stored(fields=json.dumps(["range", *fields[1:]]))
     with pytest.raises(ValueError, match="was trained on other fields"):
-        evaluate(ID, [str(tmp_path / "fields.safetensors")], episodes=1)
+        evaluate(ID, [str(path)], episodes=1)
+
+
+def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command):
+    now = make_task(ID).interface
+    path = stored(interface=str(now - 1))
+    with pytest.raises(ValueError, match=rf"its interface {now - 1}, now {now}\): train it again"):
+        evaluate(ID, [str(path)], episodes=1)
+    code, _, error = command("evaluate", ID, "--policy", path, "--episodes", 1)
+    assert code == 2
+    assert error.startswith("Error: ")
+    assert error.count("\n") == 1
 
 
 def test_layers_by_hand():
@@ -119,7 +157,7 @@ def paid(env, actions):
 
 def test_zero_correction_is_exactly_the_policy():
     policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
-    env = ResidualActions(gymnasium.make(ID), policy)
+    env = ResidualActions(gymnasium.make(ID, control="gain"), policy)
     memory = None
 
     def alone(shown):
@@ -127,7 +165,7 @@ def test_zero_correction_is_exactly_the_policy():
         action, memory = policy.predict(shown[None], memory, np.array([memory is None]))
         return action[0]
 
-    expected = paid(gymnasium.make(ID), [alone] * 60)
+    expected = paid(gymnasium.make(ID, control="gain"), [alone] * 60)
     for _ in range(2):  # twice: the policy's memory starts anew with the episode
         for one, other in zip(paid(env, [lambda _: np.zeros(1, np.float32)] * 60), expected, strict=True):
             np.testing.assert_array_equal(one, other)
@@ -151,7 +189,7 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
     policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
 
     def native():
-        return gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", horizon=30)
+        return gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", control="gain", horizon=30)
 
     env, alone = to_sb3(native(), staggered=True, residual_to=policy), to_sb3(native(), staggered=True)
     env.seed(0)

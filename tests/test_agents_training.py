@@ -202,7 +202,7 @@ def test_exported_recurrent_policy_acts_like_the_network(tmp_path):
 
 
 def gradient_of_bias(truncation, horizon=6):
-    env = TaskVectorEnv(ID, 3, horizon=horizon, backend="torch", autoreset_mode="Disabled")
+    env = TaskVectorEnv(ID, 3, "gain", horizon=horizon, backend="torch", autoreset_mode="Disabled")
     env.reset(seed=1)
     torch.manual_seed(0)
     policy = RecurrentPolicy(len(env.task.fields), env.task.action_space, 4).double()

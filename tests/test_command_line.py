@@ -115,7 +115,7 @@ def test_a_table_says_what_its_references_know(tmp_path):
         (("evaluate", "Manoeuvre"), "unknown environment"),
         (("evaluate", ENV, "--scenario", "papr"), "did you mean 'paper'"),
         (("evaluate", ENV, "--policy", "adaptiv"), "did you mean 'adaptive'"),
-        (("evaluate", ENV, "--control", "gains"), "unknown control 'gains'"),
+        (("evaluate", ENV, "--control", "gian"), "unknown control 'gian'"),
         (("evaluate", ENV, "--policy", "imm", "--control", "gain"), "made for control 'weights'"),
         (("evaluate", ENV, "--set", "gain=1"), "did you mean 'gains'"),
         (("evaluate", ENV, "--set", "gains"), "--set needs name=value"),

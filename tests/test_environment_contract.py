@@ -201,7 +201,7 @@ def test_relative_reward_is_the_difference_of_costs(env_id, control, short, rand
     ours, relative = (
         TaskVectorEnv(env_id, 3, control=control, reward=r, **short) for r in ("cost", "relative")
     )
-    paper = TaskVectorEnv(env_id, 3, control=task.paper_policy.control, **short)
+    paper = TaskVectorEnv(env_id, 3, control=task.paper_policy.control, reward="cost", **short)
     for env in (ours, relative, paper):
         env.reset(seed=1)
     paper_action = np.tile(np.asarray(task.paper_policy.action), (3, 1))

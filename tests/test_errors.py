@@ -51,7 +51,7 @@ def test_names_through_gymnasium():
     with pytest.raises(ValueError, match="did you mean 'paper'"):
         gym.make(ID, scenario="papr")
     with pytest.raises(ValueError, match="did you mean 'gain'"):
-        gym.make_vec(ID, num_envs=2, control="gains")
+        gym.make_vec(ID, num_envs=2, control="gian")
 
 
 @pytest.mark.parametrize(

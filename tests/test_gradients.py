@@ -127,8 +127,8 @@ def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, toler
     # Windows of three decisions, three and one; five episodes in eight lanes.
     envs = [
         TaskVectorEnv(
-            f"filtergym/{name}-v0", 5, control=control, backend=backend, autoreset_mode="Disabled",
-            **{"max_episode_steps": 7, **keywords},
+            f"filtergym/{name}-v0", 5, control=control, backend=backend, reward="cost",
+            autoreset_mode="Disabled", **{"max_episode_steps": 7, **keywords},
         )
         for backend in ("torch", "compiled")
     ]  # fmt: skip

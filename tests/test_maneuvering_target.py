@@ -55,15 +55,18 @@ def paper_data(seed):
 
 
 def naive_imm(start, measurements, gains, transition, probabilities):
-    """Equations (8) to (16) with the Joseph covariance: estimates and mode probabilities of every scan."""
+    """Equations (8) to (16) with the Joseph covariance: estimates and mode probabilities of every scan.
+
+    Gains are ``(M,)``, or ``(scans, M)`` where they change.
+    """
     F = np.kron([[1.0, T], [0.0, 1.0]], np.eye(2))
     H = np.eye(2, 4)
     R0 = variances(*start[:2])
-    M = len(gains)
+    M = len(probabilities)
     x, P = [start] * M, [np.diag(np.concatenate([R0, 2 * R0 / T**2]))] * M
     mu = np.array(probabilities)
     estimates, history = [], []
-    for z in measurements:
+    for z, used in zip(measurements, np.broadcast_to(gains, (len(measurements), M)), strict=True):
         predicted = np.array([sum(transition[i][j] * mu[i] for i in range(M)) for j in range(M)])
         R = np.diag(variances(*z))
         new_x, new_P, log_weights = [], [], []
@@ -74,8 +77,8 @@ def naive_imm(start, measurements, gains, transition, probabilities):
             x0, P0 = F @ x0, F @ P0 @ F.T
             S = H @ P0 @ H.T + R
             log_weights.append(math.log(predicted[j]) + multivariate_normal.logpdf(z, H @ x0, S))
-            beta = gains[j] ** 2 / (2 - gains[j])
-            K = np.kron([[gains[j]], [beta / T]], np.eye(2))
+            beta = used[j] ** 2 / (2 - used[j])
+            K = np.kron([[used[j]], [beta / T]], np.eye(2))
             rest = np.eye(4) - K @ H
             new_x.append(x0 + K @ (z - H @ x0))
             new_P.append(rest @ P0 @ rest.T + K @ R @ K.T)
@@ -120,6 +123,50 @@ def test_imm_policy_equals_the_imm_as_plain_filter(bank, seed):
         np.testing.assert_allclose(info["error"] + truth[k], expected[k - 1], rtol=0, atol=1e-6)
         np.testing.assert_allclose(info["mode_probability"], probabilities[k - 1], rtol=0, atol=1e-9)
     assert truncated
+
+
+@pytest.mark.parametrize("bank", BANKS)
+@pytest.mark.parametrize("steered", [False, True])
+def test_gains_are_those_of_a_naive_imm(bank, steered):
+    """Of every filter the logit of the gain moves by the action; at zero it is the paper's IMM."""
+    gains, transition, initial = bank
+    env = gym.make(
+        ID,
+        control="gains",
+        scenario="paper",
+        gains=gains,
+        transition=transition,
+        initial_probabilities=initial,
+        gain_logits=1.5,
+        detailed_info=True,
+    )
+    truth, start, measurements = paper_data(1)
+    actions = np.random.default_rng(2).uniform(-1.2, 1.2, (101, len(gains))) * steered
+    odds = np.array(gains) / (1.0 - np.array(gains)) * np.exp(1.5 * np.clip(actions, -1.0, 1.0))
+    alpha = odds / (1.0 + odds)
+    expected, probabilities = naive_imm(start, measurements, alpha, transition, initial)
+    last = [f.name for f in env.unwrapped.observation_fields].index("last_alpha_1")
+    env.reset(seed=1)
+    for k in range(1, 101):
+        observation, _, _, truncated, info = env.step(actions[k - 1])
+        np.testing.assert_allclose(observation[last : last + len(gains)], alpha[k - 1], rtol=1e-12)
+        # An IMM amplifies rounding.
+        np.testing.assert_allclose(info["error"] + truth[k], expected[k - 1], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(info["mode_probability"], probabilities[k - 1], rtol=0, atol=1e-9)
+    assert truncated
+
+
+def test_no_change_of_the_gains_is_zero_evidence():
+    steps, banks = [], [make_task(ID, control, "random") for control in ("gains", "evidence")]
+    for task in banks:
+        rng = np.random.default_rng(4)
+        state = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+        steps.append([])
+        for _ in range(60):
+            state = task.act(task.measure(state, rng.normal(size=(2, 8))), np.zeros((2, 8)))
+            steps[-1].append(task.mean(state))
+    # The gain goes into a logit and back, and an IMM amplifies the rounding; metres.
+    np.testing.assert_allclose(*steps, rtol=0, atol=1e-6)
 
 
 def test_zero_evidence_is_the_plain_filter_bit_for_bit():
@@ -472,7 +519,7 @@ def test_polar_measurements_have_their_stated_errors():
 # --- no truth
 
 
-@pytest.mark.parametrize("control", ["gain", "mode", "weights", "evidence"])
+@pytest.mark.parametrize("control", ["evidence", "gains", "gain", "mode", "weights"])
 @pytest.mark.parametrize("scenario", ["random", "paper", "atc"])
 class TestNoTruth:
     def actions(self, task, rng):
@@ -547,18 +594,17 @@ def test_evidence_adds_nats_to_the_log_posterior():
     assert log_odds[1] - log_odds[0] == pytest.approx(4.0 * 0.75, rel=1e-9)
 
 
-def test_reward_is_minus_the_cost_and_linear_beyond_the_bound():
-    env = gym.make(ID, control="gain", scenario="paper", detailed_info=True)
+def test_reward_is_the_compressed_cost_in_units_of_the_papers():
+    env = gym.make(ID, control="gain", scenario="paper", reward="cost", detailed_info=True)
     env.reset(seed=0)
-    seen = set()
+    worst = 0.0
     for _ in range(100):
         _, reward, _, _, info = env.step(np.array([-1.0]))  # alpha = 0.05 loses the turn
         distance = math.hypot(*info["error"][:2]) / RANGE_SIGMA
         assert info["cost"] == pytest.approx(distance**2, rel=1e-12)
-        expected = distance**2 if distance <= 60 else 2 * 60 * distance - 60**2
-        assert reward == pytest.approx(-expected, rel=1e-12)
-        seen.add(distance > 60)
-    assert seen == {False, True}
+        assert reward == pytest.approx(-30.0 * math.log(1.0 + distance**2 / 5.2 / 30.0), rel=1e-12)
+        worst = max(worst, info["cost"])
+    assert worst > 100.0 * 5.2  # where it matters
 
 
 def test_log_likelihood_reward_is_that_of_the_truth():
@@ -583,7 +629,7 @@ def test_restarted_lane_is_not_rounded_to_the_precision_of_the_actions():
 
 
 def test_decision_interval_averages_rewards_over_the_same_noise():
-    slow, fast = gym.make(ID, decision_interval=5), gym.make(ID)
+    slow, fast = gym.make(ID, control="gain", decision_interval=5), gym.make(ID, control="gain")
     slow.reset(seed=0), fast.reset(seed=0)
     for action in np.linspace(-1, 1, 20):
         observation, reward, _, slow_done, _ = slow.step(np.array([action]))

@@ -64,8 +64,9 @@ def test_bound_is_the_dense_recursion():
     """Random legs and faults with dense matrices and the information form, one lane at a time."""
     keywords = {
         "leg_duration": (0.05, 0.1), "rate_fault_probability": 1.0, "rate_fault_duration": (0.1, 0.15),
-        "stick_probability": 1.0, "stick_duration": (0.1, 0.15), "satellites_outage": 0.1,
-        "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
+        "stick_probability": 1.0, "stick_duration": (0.1, 0.15), "rates_outage_probability": 0.5,
+        "rates_outage_duration": (0.05, 0.1), "satellites_outage_probability": 1.0,
+        "satellites_outage_duration": (0.1, 0.1), "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
     }  # fmt: skip
     task = make_task(ID, **keywords)
     seen, bounds = [], []
@@ -163,12 +164,13 @@ def observed(task, **values):
 def test_nis_adaptive_divides_the_excess():
     task = make_task(ID, "gain")
     policy = policies.NisAdaptive(task, threshold=2.0, rates=0.5, accelerometers=3.0, base=0.1)
-    action, _ = policy.predict(observed(task, average_nis_rates=math.log1p(2.0 * 9.0)))
+    shown = math.log1p(2.0 * 9.0) / (1.0 + math.log1p(2.0 * 9.0) / 8.0)
+    action, _ = policy.predict(observed(task, average_nis_rates=shown))
     excess = math.log(9.0) / (2 * math.log(300.0))
     assert action[0] == pytest.approx([0.0, 0.5 * excess, 0.1 + 3.0 * excess, 0.0], rel=1e-12)
     assert action[1] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
     policy = policies.NisAdaptive(task, threshold=2.0, own=0.5)
-    action, _ = policy.predict(observed(task, average_nis_accelerometers=math.log1p(2.0 * 9.0)))
+    action, _ = policy.predict(observed(task, average_nis_accelerometers=shown))
     assert action[0] == pytest.approx([0.0, 0.0, 0.5 * excess, 0.0], rel=1e-12)
 
 
@@ -245,7 +247,12 @@ def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
 
 def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
     task = make_task(
-        ID, rate_fault_probability=0.0, stick_probability=1.0, horizon=200, satellites_outage=0.5
+        ID,
+        rate_fault_probability=0.0,
+        stick_probability=1.0,
+        horizon=200,
+        satellites_outage_probability=1.0,
+        satellites_outage_duration=(0.5, 0.5),
     )
     estimator = estimators.HuberStuckCheck(task)
     seen, told = [], []

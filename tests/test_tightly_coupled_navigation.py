@@ -1,5 +1,7 @@
 """The task of tightly coupled navigation, driven without an engine."""
 
+import math
+
 import numpy
 import pytest
 from filtergym.envs.task import Episode
@@ -228,7 +230,7 @@ def test_fields_match_the_observation_and_are_of_order_one(scenario):
     for *_, observation, _ in drive(task, 8, 8, 20):
         assert observation.shape == (len(task.fields), 8)
         assert numpy.isfinite(observation).all()
-        assert abs(observation).max() < 25.0
+        assert abs(observation).max() < 10.0
 
 
 def test_innovations_are_read_in_their_units():
@@ -246,12 +248,12 @@ def test_innovations_are_read_in_their_units():
 
 @pytest.mark.parametrize("slots", [(19,), (1, 19), (1, 11, 19), (1, 2, 11, 19, 20)])
 def test_other_numbers_of_satellites(slots):
-    task = make("random", satellites=slots)
+    task = make("random", satellites=slots, satellites_outage_probability=0.0)
     *_, (*_, observation, state) = drive(task, 8, 9, 60)
     assert observation.shape[0] == len(task.fields)
     assert numpy.isfinite(task.cost(state)).all()
     sigma = numpy.sqrt(numpy.einsum("iin->in", state.bank.covariance)[:3]).mean()
-    full = make("random")
+    full = make("random", satellites_outage_probability=0.0)
     *_, (*_, reference) = drive(full, 8, 9, 60)
     better = sigma < numpy.sqrt(numpy.einsum("iin->in", reference.bank.covariance)[:3]).mean()
     assert better == (len(slots) > 4)
@@ -262,6 +264,7 @@ def test_other_numbers_of_satellites(slots):
     [
         ({"satellites": (1, 1, 11, 19)}, "different slots"),
         ({"satellites": ()}, "at least one"),
+        ({"satellites": (19,), "satellites_outage_probability": 0.2}, "two satellites, got .*: set it to 0"),
         ({"satellites": (1, 10, 11, 19)}, "satellite 10 stands at .* below elevation_mask"),
         ({"satellites": (1, 11, 19, 25)}, "1 to 24"),
         ({"satellites": (1, 2, 11, 19), "epoch": 505.292}, "degenerate geometry"),
@@ -295,7 +298,14 @@ def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
 
 
 def test_faults_and_outages_happen_when_and_where_they_are_drawn():
-    task = make("random", stick_probability=1.0, rate_fault_probability=1.0, satellites_outage=2.0)
+    task = make(
+        "random",
+        stick_probability=1.0,
+        rate_fault_probability=1.0,
+        rates_outage_probability=0.0,
+        satellites_outage_probability=1.0,
+        satellites_outage_duration=(2.0, 2.0),
+    )
     previous, noisy, stuck, out = None, 0, 0, 0
     for k, state, _, _ in drive(task, 8, 11, 600):
         s, said = state.truth, state.measurement
@@ -315,6 +325,40 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()
+
+
+def test_rates_are_lost_when_it_is_drawn():
+    task = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5)
+    lost, drawn = 0, 0
+    for _, state, _, _ in drive(task, 16, 11, 600):
+        (first, last), step = state.truth.faults.no_rates, state.truth.step
+        inside = (first <= step) & (step <= last)
+        assert (state.measurement.available[4:8] == ~inside).all()
+        assert (state.measurement.available[:4] == 1.0).all()
+        lost, drawn = lost + inside, numpy.where(first < 0.0, 0.0, last - first + 1.0)
+    assert (lost == drawn).all()
+    assert 0 < (drawn > 0).sum() < 16
+
+
+def test_outages_are_as_probable_and_as_long_as_stated():
+    runs = 4000
+    task = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6)
+    p = task.parameters
+    faults = task.begin(*numbers(task, runs, 14, 0)[:2]).truth.faults
+    for (first, last), probability, seconds in (
+        (faults.no_rates, 0.3, p.rates_outage_duration),
+        (faults.hidden, 0.6, p.satellites_outage_duration),
+    ):
+        there = first > 0.0
+        assert abs(there.mean() - probability) < 4 * math.sqrt(probability * (1 - probability) / runs)
+        length = p.sampling_interval * (last - first + 1.0)[there]
+        low, high = seconds
+        half = 0.5 * p.sampling_interval + 1e-9
+        assert low - half <= length.min() < low + 0.05
+        assert high - 0.05 < length.max() <= high + half
+        assert first[there].min() >= 1.0
+        assert last[there].max() <= p.horizon
+        assert (last[~there] < 1.0).all()
 
 
 def test_urban_errors_have_the_stated_quantiles():

@@ -17,6 +17,7 @@ from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.reproduction import experiment
 from filtergym.baselines.uav_autopilot.theory import stationary
 from filtergym.envs.catalogue import make_task
+from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.rollout import run_reference
@@ -106,7 +107,14 @@ def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
     assert theory("kalman", "random") is None
     assert theory("kalman", "actuator-lag") is None
     assert theory("innovation-adaptive") is None
-    assert theory("wide-band", gain_decades=1.0) is None
+    # It follows the scales that the modes have, whatever an action of one does under gain.
+    nominal = pytest.approx(theory("kalman"), rel=1e-12)
+    assert (
+        theory("wide-band", wide_band_scale=1.0)
+        == nominal
+        == theory("over-smoothed", over_smoothed_scale=1.0)
+    )
+    assert theory("wide-band") == pytest.approx(theory("wide-band", gain_decades=0.1), rel=1e-12)
     assert theory("raw-sensors", plant="P", sensors=("position",)) is None
 
 
@@ -245,7 +253,8 @@ def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
             self, observation: numpy.ndarray, state: Any, start: numpy.ndarray
         ) -> tuple[numpy.ndarray, Any]:
             left = self.task.horizon * (1.0 - observation[:, self.task.columns(["time"])[0]])
-            return numpy.where(left < 9.5, -0.3, 0.0)[:, None], None
+            decades = numpy.where(left < 9.5, -0.6, 0.0)
+            return decades[:, None] / self.task.parameters.gain_decades, None
 
     dataset = evaluate(ID, {"kalman": module.Kalman, "resting": RestAtTheEnd}, "paper-noise", 200)
     saved = dataset["cost"].values[0].mean(axis=1) - dataset["cost"].values[1].mean(axis=1)
@@ -258,15 +267,20 @@ def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
 
 
 @BOTH
-def test_constant_policies_name_the_scales_they_stand_for(plant: str) -> None:
+def test_constant_policies_name_the_scales_and_modes_they_stand_for(plant: str) -> None:
+    policies = baselines_of(ID).policies
     task = make_task(ID, "gain", plant=plant)
-    wanted = {"kalman": 0.0, "over-smoothed": -1.0, "wide-band": 1.0}
     observation = numpy.zeros((3, len(task.fields)))
-    for name, value in wanted.items():
-        action, _ = baselines_of(ID).policies[name](task).predict(observation)
-        numpy.testing.assert_allclose(action, numpy.full((3, 1), value), rtol=0, atol=1e-12)
-    narrow = make_task(ID, "gain", plant=plant, gain_decades=1.0)
-    assert baselines_of(ID).policies["wide-band"](narrow).predict(observation)[0].max() == 1.0
+    numpy.testing.assert_array_equal(policies["kalman"](task).predict(observation)[0], numpy.zeros((3, 1)))
+    decades = task.parameters.value("gain_decades")
+    for scale, action in ((0.5, 0.5 / decades), (2.0 * decades, 1.0), (-2.0 * decades, -1.0)):
+        found, _ = module.FixedScale(task, scale).predict(observation)
+        numpy.testing.assert_allclose(found, numpy.full((3, 1), action), rtol=1e-12)
+    task = make_task(ID, "mode", plant=plant)
+    observation = numpy.zeros((3, len(task.fields)))
+    for name in ("wide-band", "raw-sensors", "over-smoothed"):
+        found, _ = policies[name](task).predict(observation)
+        assert [MODES[i] for i in found] == [name] * 3
 
 
 def test_adaptive_policy_by_hand() -> None:
@@ -291,7 +305,9 @@ def test_adaptive_policy_by_hand() -> None:
         action, memory = policy.predict(observation, memory, start)
         mean = mean + 0.25 * there[k] * (nu[k] ** 2 - mean)
         decades = 0.1 + 0.5 * numpy.log10(mean[:, 0]) - 0.25 * numpy.log10(mean[:, 1])
-        wanted = numpy.clip(0.25 * numpy.array(last) + 0.75 * decades / 2.0, -1.0, 1.0)
+        wanted = numpy.clip(
+            0.25 * numpy.array(last) + 0.75 * decades / task.parameters.value("gain_decades"), -1.0, 1.0
+        )
         numpy.testing.assert_allclose(action[:, 0], wanted, rtol=1e-12)
 
 

@@ -362,8 +362,9 @@ class GainBank(_KalmanBucyBank):
     def gain(self, action: Array) -> Array:
         """Gain that an action sets, logarithmic from the paper's at 0 to 1 at 1 and to the smallest; zero at -1."""
         middle, smallest = self.middle, math.log(self.parameters.smallest_gain)
-        slope = self.xp.where(action > 0.0, -middle, middle - smallest)
-        return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + slope * action))
+        # Torch would choose between two numbers in float32.
+        beyond = self.xp.where(action > 0.0, -middle * action, (middle - smallest) * action)
+        return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + beyond))
 
     def action_for_gain(self, gain: Any) -> Any:
         """Action that sets gains, NumPy: the inverse of :meth:`gain`; the smallest one and less count as zero.

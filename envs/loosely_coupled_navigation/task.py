@@ -30,36 +30,41 @@ class LooselyCoupledNavigation(Task):
     increments drive the estimate and pulls it to the measurement by a gain. A high gain follows the receiver
     noise, a low one follows the drift, and which is better depends on noise levels that no one announces.
 
-    With ``control="gain"`` the action acts on the estimate itself and so on all later ones. With ``mode`` and
-    ``weights`` a bank of three filters runs beside the agent without mixing: the plain scheme tuned to the
-    white noise, the plain scheme with the coloured noise reduced to white, both with the gain (4) of the
-    Riccati equation, and the augmented filter that also estimates the rate errors. The action then chooses
-    only what is reported *now*: the problem is myopic, a discount factor of zero suffices.
+    With ``control="noise"`` (default) the augmented filter, which also estimates the rate errors, computes its
+    gain from noises that the action scales. With ``gain`` the action sets the gain of the plain scheme itself.
+    Both act on the estimate and so on all later ones. With ``mode`` and ``weights`` a bank of three filters runs
+    beside the agent without mixing: the plain scheme tuned to the white noise, the plain scheme with the
+    coloured noise reduced to white, both with the gain (4) of the Riccati equation, and the augmented filter.
+    The action then chooses only what is reported *now*: the problem is myopic, a discount factor of zero
+    suffices.
 
-    Axes are independent: one gain for each, one set of weights for all.
+    Axes are independent: one gain for each, one set of noises or weights for all.
 
     ### Action Space
 
     What each control means stands in ``actions``. Values outside the box are taken at its edge.
 
-    Without a measurement the gain is zero, whatever the action.
+    Without a measurement the gain is zero, whatever the action; under ``noise`` the covariance still grows by
+    the rate errors' noises that the action states.
 
     ### Observation Space
 
-    A flat ``Box``; for each filter (one under gain, three otherwise) and axis, in this order: innovation over
-    its standard deviation; signed logarithm of the innovation over the receiver's *reported* noise; short
-    averages of the normalised innovation, of its square (as ``log(1 + x)``) and of its product with the one
-    before. Then the logarithm of the reported over the nominal noise (the report may be wrong), whether there
-    is a measurement, the last action (under mode and weights: the weights in force), and the time t as
-    ``t / (t + tau)``. A filter without a measurement has the innovation zero, and its averages stand still.
+    A flat ``Box``; for each filter (three under mode and weights, one otherwise) and axis, in this order:
+    innovation over its standard deviation; innovation over the receiver's *reported* noise; short averages of
+    the normalised innovation, of its square and of its product with the one before. All are shown as signed
+    logarithms ``sign(x) log(1 + |x|)``. Then the logarithm of the reported over the nominal noise (the report may
+    be wrong), whether there is a measurement, the last action (under mode and weights: the weights in force), and
+    the time t as ``t / (t + tau)``; under noise also the logarithm of the predicted standard deviation of the
+    position. A filter without a measurement has the innovation zero, and its averages stand still. What is
+    predicted under noise, for these as well, is predicted with the noises of the last action.
 
     The increments of the INS are not shown: the reference motion is always the same, so whoever knows it by
     heart could read the rate errors off them. All that is shown depends on the errors alone.
 
     ### Rewards
 
-    Minus the squared error of position, summed over the axes, in units of the nominal variance of a
-    measurement (``N / sampling_interval``); linear beyond 30 standard deviations.
+    ``-30 log(1 + x / 30)``, x the squared error of position, summed over the axes, over the nominal variance of a
+    measurement (``N / sampling_interval``), in units of 0.07, what the paper's plain scheme is charged on average.
 
     ### Starting State
 
@@ -73,7 +78,7 @@ class LooselyCoupledNavigation(Task):
     ### Arguments
 
     ``scenario``: "random" (default; noise levels over a decade, changes of the receiver noise, outages),
-    "paper", "outage", "jamming", "spoof-ramp", "quiet". ``control``: "gain", "mode", "weights". Every field
+    "paper", "outage", "jamming", "spoof-ramp", "quiet". ``control``: "noise", "gain", "mode", "weights". Every field
     of :class:`LooselyCoupledNavigationParameters` is a keyword.
 
     ### Version History

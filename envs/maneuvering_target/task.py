@@ -30,9 +30,10 @@ class ManeuveringTarget(Task):
     A surveillance radar scans every 6 s and measures the position of one aircraft with errors of 100 m in
     range and 0.25 degrees in azimuth. The aircraft flies straight, sometimes turns or changes speed, and
     flies straight again. A small filter gain is quiet on the straight legs and lags far behind in a
-    manoeuvre; a large gain follows and is noisy. The agent sees the innovations of the filter and sets its
-    gain, or the weights of two filters of different gain that mix on those weights as in the interacting
-    multiple model (IMM). The paper's algorithm is the IMM; zero ``evidence`` is exactly it.
+    manoeuvre; a large gain follows and is noisy. The paper runs two filters of different gain that mix on
+    their weights, an interacting multiple model (IMM). The agent sees their innovations and corrects Bayes'
+    rule for the weights, states the weights, or moves the filters' gains; or it sets the gain of one filter
+    alone. Zero ``evidence`` is exactly the paper's IMM, and so is zero ``gains``.
 
     ## Action Space
 
@@ -44,12 +45,14 @@ class ManeuveringTarget(Task):
     `gain`: innovations over their predicted sigma, log(1 + normalised innovation squared), exponential
     averages of both, the share 1 - R/S of the innovation variance that is the filter's own, the last alpha,
     the measurement sigma, scans since the start. Bank: the same for each filter, log-likelihoods relative to
-    the largest, log predicted mode probabilities, last weights. Large values are compressed by
-    sign(x) log(1 + |x|).
+    the largest, log predicted mode probabilities, last weights, under `gains` the last gains. Large values are
+    compressed by sign(x) log(1 + |x|).
 
     ## Rewards
 
-    Minus the squared position error over `range_sigma` squared, linear in the error beyond 60 sigma.
+    By default ("relative") what the paper's IMM is charged on the same flight and noise less what the agent is
+    charged: `30 log(1 + x / 30)` each, x the squared position error over `range_sigma` squared in units of 5.2,
+    what the IMM is charged on average. "cost" is the agent's own part, below zero.
 
     ## Starting State
 
@@ -78,13 +81,13 @@ class ManeuveringTarget(Task):
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
     actions = {
+        "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
         "the beta that belongs to it; **0 is the paper's IMM**",
         "gain": "position gain alpha of one filter, linear over `alpha_range`; 0 is alpha = 0.5; "
         "beta = alpha^2 / (2 - alpha)",
         "mode": "the filter of the bank that is believed; the bank collapses to one filter that switches",
         "weights": "weights of the bank, normalised; all zero is uniform",
-        "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
     }
     banks = {
         "evidence": FilterBank,

@@ -37,13 +37,13 @@ class RadarEsmTracking(Task):
     ``evidence`` is the paper's algorithm. In order (8)-(10): every filter predicts and updates with the radar
     measurement under the class at the previous scan; the weights in force times the radar likelihoods go
     through the class transition, and the filters mix on them; the agent is shown the result; the ESM
-    decision is the last factor, and the action gives P(s(k)) given everything to k. What the action sets
-    thus meets the next transition and mixing at the next scan.
+    decision is the last factor, and the action gives P(s(k)) given everything to k. Evidence is added to the
+    weights of this scan only: Bayes' rule goes on from what it found itself. ``mode`` and ``weights`` replace
+    it, and what they set meets the next transition and mixing at the next scan.
 
     With a constant class (``class_transition`` the identity, the default) nothing mixes: the action decides
-    only which combination of the filters is reported now, and which weights Bayes' rule starts from at the
-    next scan. The filters never feel it, and for the weights that an agent states outright the problem is
-    myopic: a discount of 0 suffices.
+    only which combination of the filters is reported now. The filters never feel it, and the problem is
+    myopic: a discount of 0 suffices. Under ``evidence`` it is so whatever the transition.
 
     `paper` redraws the emitter type for every decision, which is the assumption behind (8) and makes it
     exactly Bayesian for the radar and the decisions that pass the gate. A real target has one type: in
@@ -64,13 +64,17 @@ class RadarEsmTracking(Task):
     exponential averages of these, the radar log-likelihood of this scan and its sum since the start, both
     relative to the largest. Of the ESM: the decision (one-hot, or "none"; "refused by the gate" is shown
     beside the decision it refuses), counts of used and of refused decisions, the bearing difference
-    over the gate. The last weights and the time. Large values are compressed by sign(x) log(1 + |x|).
+    over the gate. The last weights and the time. Large values are compressed by y = sign(x) log(1 + |x|), the sum
+    of the log-likelihoods, which grows without limit, by y / (1 + |y| / 8).
     Only differences between measurements and predictions enter: range and speed themselves do not.
 
     ## Rewards
 
-    Minus the mean of three squared errors: range over `range_scale`, range rate over `range_rate_scale`,
-    acceleration over `acceleration_scale`. Linear in the error beyond 10.
+    By default ("relative") what the paper's algorithm is charged on the same noise less what the agent is
+    charged: `30 log(1 + x / 30)` each, x the mean of three squared errors (range over `range_scale`, range rate
+    over `range_rate_scale`, acceleration over `acceleration_scale`) in units of 0.3, what the paper's algorithm is
+    charged on average. The noise of the track, which no weight changes, cancels. "cost" is the agent's own part,
+    below zero.
 
     ## Starting State
 

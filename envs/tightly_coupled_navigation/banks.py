@@ -87,7 +87,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     @property
     def blocks(self) -> Sequence[Block]:
-        """What each filter says by group of sensors, readings, the sky, and clock."""
+        """What each filter says by group of sensors, readings, what is missing, and the clock."""
         xp, p, task = self.xp, self.parameters, self.task
         slots = [str(slot) for slot in p.satellites]
         each = [f"{sensor.name}_{hypothesis}" for sensor in task.sensors for hypothesis in HYPOTHESES]

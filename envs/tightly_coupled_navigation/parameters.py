@@ -192,7 +192,9 @@ class TightlyCoupledNavigationParameters(TaskParameters):
         if not self.satellites or len(set(self.satellites)) != len(self.satellites):
             raise ValueError(f"satellites must be different slots, at least one, got {self.satellites!r}")
         if self.satellites_outage_probability > 0.0 and len(self.satellites) < 2:
-            raise ValueError(f"satellites_outage_probability takes two satellites, got {self.satellites!r}")
+            raise ValueError(
+                f"satellites_outage_probability takes two satellites, got {self.satellites!r}: set it to 0"
+            )
         times = self.epoch + self.sampling_interval * numpy.array([0.0, self.horizon + 1.0])
         local, _ = satellites.local_orbits(self.satellites, times, *self.site)
         lowest = satellites.look_angles(local)[1].min(axis=1) / DEGREE

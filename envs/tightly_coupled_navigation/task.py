@@ -40,7 +40,8 @@ class TightlyCoupledNavigation(Task):
     (position, velocity, acceleration, receiver clock, attitude errors) run side by side, one for each
     hypothesis on the motion: rest, constant velocity, Singer manoeuvre. They are mixed before every step by
     the weights in force and combined into the estimate after it. Sensors fail for a while in the default
-    scenario: a rate channel becomes five times noisier, the accelerometers stick.
+    scenario: a rate channel becomes five times noisier, the accelerometers stick, all rates or two satellites
+    are lost.
 
     The paper is Moroz, adaptive multi-hypothesis measurer of an inertial-satellite navigation system. In its
     own experiment (scenario `paper`) the velocity grows in leg 2 while the accelerometers show nothing: that
@@ -58,12 +59,14 @@ class TightlyCoupledNavigation(Task):
     normalised innovation squared by sensor group (now, and as a short average; given the groups before it in
     the order of the action `gain`), the log-likelihood relative to the largest, the predicted
     log-probability; the accelerometers; the innovations of pseudoranges and rates at the combined prediction;
-    availability of every satellite; the time; the last action.
+    availability of every satellite; the time; the last action. Innovations and likelihoods, which a wrong
+    hypothesis makes as large as it likes, are shown as ``y / (1 + |y| / 8)`` of ``y = sign(x) log(1 + |x|)``, so below 8.
 
     ## Rewards
 
-    Minus the squared error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s): the errors of a
-    fix from one epoch alone. Beyond a root of 100 it grows linearly.
+    ``-30 log(1 + x / 30)``, x the squared error of position (unit 7.4 m) plus that of velocity (unit 0.25 m/s): the
+    errors of a fix from one epoch alone. That is between the median and the mean of what the paper's algorithm is
+    charged, whose mean is a few lost tracks'.
 
     ## Starting State
 

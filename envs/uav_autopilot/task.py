@@ -57,16 +57,21 @@ class UavAutopilot(Task):
     its square, the reading, and whether it answered; the log NIS per reading and that of its short average;
     the command, the control in force, the log trace of the covariance, the time, the last action.
     Innovations, command, control and readings are compressed by ``sign(x) log(1 + |x|)`` in units of one
-    sigma of a sensor. Sigmas are those of the filter before it is acted on: its last covariance, predicted
+    sigma of a sensor; the logarithms of squares stop at 0.01. Sigmas are those of the filter before it is acted on: its last covariance, predicted
     with the Q of the last action.
 
     ## Rewards
 
-    Minus the quadratic cost of the loop at this measurement,
+    The cost of the loop at a measurement, which evaluations report, is
     ``((x - x_r)^T W (x - x_r) + R u^2) / sigma^2``. ``x_r`` is the equilibrium of the command (output r, all
     else zero), u the control that follows from the estimate, sigma the nominal standard deviation of the
-    output's sensor (U: 0.5 deg; P: 1 m). Beyond the Huber bound it grows linearly. An action shows at once in
-    the control and later in the tracking error: the problem is not myopic.
+    output's sensor (U: 0.5 deg; P: 1 m). Most of it is what gusts and commands cost any control. Charged is what
+    the agent can change, the loss of u against the optimal control u* of the true state,
+    ``x = (R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation: on average it differs between two
+    filters by what the costs of their episodes differ. By default ("relative") the reward is what the paper's
+    filter is charged on the same noise less what the agent is charged, ``30 log(1 + x / 30)`` each; "cost" is the
+    agent's own part, below zero. An action shows at once in the control and later in the estimate: the problem
+    is not myopic.
 
     ## Starting State
 

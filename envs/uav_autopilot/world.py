@@ -251,9 +251,10 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     def charge(self, truth: Truth, mean: Array) -> Array:
         """What the control that follows from an estimate loses against the optimal one for the true state.
 
-        ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation. Summed over the episode it is the cost
-        but for a part that noise and command decide and no action can change (see :class:`.Regulator`); without that
-        part one sees what an action was worth.
+        ``(R + B^T S B) (u - u*)^2 / sigma^2`` with S of the Riccati equation (see :class:`.Regulator`). Of two filters
+        the sums over an episode differ on average by what the costs differ, the value ``x^T S x`` of where they end
+        included; left out is what noise and command cost any control, and the luck of it. Without that one sees sooner,
+        and at once, what an action was worth.
         """
         if self.optimal is None:
             return self.cost(truth, mean)
