@@ -228,7 +228,7 @@ class Episodes(NamedTuple):
 
 def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
     """Episodes of ``gymnasium.make``."""
-    env: Any = gymnasium.make(id, control=control, decision_interval=1, **backend)
+    env: Any = gymnasium.make(id, control=control, decision_interval=1, reward="cost", **backend)
     env.action_space.seed(0)
     action = env.action_space.sample()
 

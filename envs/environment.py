@@ -1,5 +1,6 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
+import copy
 import functools
 import inspect
 import math
@@ -24,7 +25,7 @@ from .specification import told
 from .task import Task
 
 if TYPE_CHECKING:
-    from .rendering import EpisodePicture, EpisodePictures
+    from .rendering import EpisodePicture, EpisodePictures, LatePicture
 
 FRAMES_PER_SECOND = 10
 DTYPES = ("float64", "float32")
@@ -407,8 +408,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
             the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
             one scenario, drawn by these weights from the episode's generator.
-        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, "cost" but
-            in RadarEsmTracking.
+        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
@@ -453,8 +453,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
         self._open(functools.partial(task_on, backend, task, control), scenario, keywords, 1, None)
         self.render_mode = render_mode
-        self.picture: EpisodePicture | None = None
-        """What keeps and draws the episode; None without a render mode."""
+        self._late: LatePicture | None = None
         if render_mode is not None:
             self._picture_of(self._first_course.names[0])
         self.observation_space = self._observation_space()
@@ -466,7 +465,9 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         from . import rendering
 
         assert self.render_mode is not None
-        self.picture = rendering.EpisodePicture(self.task, scenario, self.render_mode, FRAMES_PER_SECOND)
+        self._late = rendering.LatePicture(
+            rendering.EpisodePicture(self.task, scenario, self.render_mode, FRAMES_PER_SECOND)
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -485,15 +486,18 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         self._send(wanted, [0])
         super().reset(seed=seed)
         self.lanes.seed(0, self.np_random)
+        ahead = None if self._late is None else copy.deepcopy(self.np_random)
         self.lanes.restart()
         self._forget_errors([0])
         if isinstance(self.lanes, MixedLanes):
             self.task = self.lanes.task_of(0)
-            if self.picture is not None and self.picture.task is not self.task:
-                self.picture.close()
-                self._picture_of(self.lanes.scenario_of(0))
-        if self.picture is not None:
-            self.picture.begin(self.lanes.state)
+            if self._late is not None and ahead is not None:
+                self.lanes.course_of(0).drawn(ahead)  # comes before the episode
+                if self._late.task is not self.task:
+                    self._late.close()
+                    self._picture_of(self.lanes.scenario_of(0))
+        if self._late is not None and ahead is not None:
+            self._late.begin(ahead)
             self._show()
         return self._shown_alone(), self._with_context({})
 
@@ -514,15 +518,10 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        watch: Callable[[Any], None] | None = None
-        if self.picture is not None:
-            picture, shown = self.picture, self.lanes.observe()[0]
-
-            def watch(state: Any) -> None:
-                picture.keep(state, array, shown)
-
-        paid = self._pay(array[None], info, watch)
-        self._show()
+        paid = self._pay(array[None], info)
+        if self._late is not None:
+            self._late.keep(array)
+            self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
         if self.tells_context:
@@ -532,8 +531,13 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
-        if self.picture is not None and self.render_mode == "human":
-            self.picture.show(self.lanes.state)
+        if self._late is not None and self.render_mode == "human":
+            self._late.show()
+
+    @property
+    def picture(self) -> "EpisodePicture | None":
+        """What keeps and draws the episode, up to date; None without a render mode."""
+        return None if self._late is None else self._late.picture
 
     def render(self) -> numpy.ndarray | None:
         """Draw the episode so far.
@@ -545,7 +549,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self.picture is None:
+        if self._late is None:
             gymnasium.logger.warn(
                 'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
             )
@@ -555,12 +559,12 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         if self.render_mode == "human":
             self._show()
             return None
-        return self.picture.frame(self.lanes.state)
+        return self._late.frame()
 
     def close(self) -> None:
         """Close the window."""
-        if self.picture is not None:
-            self.picture.close()
+        if self._late is not None:
+            self._late.close()
 
 
 class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):

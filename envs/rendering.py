@@ -28,7 +28,8 @@ from matplotlib.ticker import MaxNLocator
 
 from ..compiler.functions import mapped, padded_width
 from .backend import host_array
-from .task import Task
+from .lanes import Lanes
+from .task import Array, Task
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
     "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#E69F00", "#CC79A7", "#000000", "#8A8A8A",
@@ -438,6 +439,69 @@ class EpisodePicture:
             for first, last in self.picture.shaded():
                 self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
         self.picture.arrange()
+
+
+class LatePicture:
+    """The picture of one episode, which is flown again when somebody looks.
+
+    Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
+    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its generator fix an
+    episode.
+
+    Args:
+        picture: that is brought up to date.
+    """
+
+    def __init__(self, picture: EpisodePicture) -> None:
+        self.task = picture.task
+        self._picture = picture
+        self._lanes = Lanes(picture.task, 1)
+        self._generator: numpy.random.Generator | None = None
+        """Of an episode that has not begun here."""
+        self._actions: list[numpy.ndarray] = []
+        """Those not applied here."""
+
+    def begin(self, generator: numpy.random.Generator) -> None:
+        """Note a new episode, that ``generator`` is about to draw."""
+        self._generator, self._actions = copy.deepcopy(generator), []
+
+    def keep(self, action: Array) -> None:
+        """Note an action, ``(A,)`` or a scalar."""
+        self._actions.append(numpy.array(host_array(action)))
+
+    @property
+    def picture(self) -> EpisodePicture:
+        """The picture with all that has happened."""
+        lanes, picture = self._lanes, self._picture
+        if self._generator is not None:
+            lanes.seed(0, self._generator)
+            lanes.restart()
+            picture.begin(lanes.state)
+            self._generator = None
+        for action in self._actions:
+            self._apply(action)
+        self._actions = []
+        return picture
+
+    def _apply(self, action: numpy.ndarray) -> None:
+        lanes, shown = self._lanes, self._lanes.observe()[0]
+        widened = lanes.widened(action[None])
+        lanes.step(
+            lambda state: lanes.task.act(state, widened),
+            lambda state, _: self._picture.keep(state, action, shown),
+        )
+
+    def frame(self) -> numpy.ndarray:
+        """Draw and return the picture, ``(height, width, 3)`` bytes."""
+        return self.picture.frame(self._lanes.state)
+
+    def show(self) -> None:
+        """Draw into the window."""
+        self.picture.show(self._lanes.state)
+
+    def close(self) -> None:
+        """Close the window and forget the figure."""
+        self._picture.close()
 
 
 class EpisodePictures:

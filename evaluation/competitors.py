@@ -8,11 +8,12 @@ nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, 
 """
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy
 
+from ..envs.backend import host_array
 from ..envs.task import Array, Task
 
 Kind = Literal["policy", "estimator", "reference", "bound"]
@@ -116,6 +117,24 @@ class Policy:
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Answer a batch; ``start`` is true where memory must begin anew."""
         raise NotImplementedError
+
+
+class FunctionPolicy(Policy):
+    """Actions by a function of the observation: how an agent of any library is evaluated.
+
+    Args:
+        function: given observations ``(N, fields)``, returns actions, batch first, as an array or a tensor on the CPU.
+        control: that the actions are meant for; default: the environment's first.
+    """
+
+    def __init__(self, function: Callable[[numpy.ndarray], Any], control: str | None = None) -> None:
+        self.function = function
+        if control is not None:
+            self.control = control  # type: ignore[misc]  # of the function, not of the class
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Ask the function."""
+        return host_array(self.function(observation)), None
 
 
 class ConstantPolicy(Policy):

@@ -12,12 +12,21 @@ from .envs.catalogue import register
 from .envs.registration import add_task
 from .envs.task import Task
 from .envs.trajectory import Trajectory
+from .evaluation.competitors import FunctionPolicy
 
 if TYPE_CHECKING:
     from .names import evaluate, make_policy, tidy_records
 
 __version__ = "0.1.0"
-__all__ = ["Trajectory", "evaluate", "make_policy", "register", "register_task", "tidy_records"]
+__all__ = [
+    "FunctionPolicy",
+    "Trajectory",
+    "evaluate",
+    "make_policy",
+    "register",
+    "register_task",
+    "tidy_records",
+]
 
 register()
 

@@ -262,3 +262,22 @@ def test_animation_is_a_small_looping_file(tmp_path):
         assert image.info["loop"] == 0
     with pytest.raises(ValueError, match="does not act"):
         episode_frames(ID, "known-turn", competitor(ID, "known-turn"))
+
+
+def test_steps_that_nobody_looks_at_are_drawn_when_somebody_does(env_id, short):
+    """Stable-Baselines3's ``make_vec_env`` asks for a render mode always: it must cost nothing."""
+    watched, unwatched = (
+        gymnasium.make(env_id, render_mode="rgb_array", **short).unwrapped for _ in range(2)
+    )
+    for seed, steps in ((1, 2), (None, 3)):  # the second episode goes on with the first one's generator
+        for env in (watched, unwatched):
+            env.reset(seed=seed)
+        watched.action_space.seed(0)
+        for _ in range(steps):
+            action = watched.action_space.sample()
+            watched.step(action)
+            unwatched.step(action)
+            watched.render()
+            assert unwatched._late._picture.count == 0
+    numpy.testing.assert_array_equal(unwatched.render(), watched.render())
+    assert unwatched._late._picture.count == 3 * watched.task.decision_interval

@@ -74,7 +74,6 @@ class ManeuveringTarget(Task):
     """
 
     id = "filtergym/ManeuveringTarget-v0"
-    interface = 2
     paper_source = (
         "P. A. Bakulev, M. I. Sychev, Nguyen Trong Luu, Tracking a manoeuvring target with an IMM algorithm "
         "over two alpha-beta filters (in Russian)"
