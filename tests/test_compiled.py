@@ -164,7 +164,7 @@ def test_snapshots_are_gone_back_to(env_id, short):
 
 
 def _elsewhere(pipe):
-    env = gym.make("filtergym/ManeuveringTarget-v0", backend="compiled", horizon=5)
+    env = gym.make("filtergym/ManeuveringTarget-v0", control="gain", backend="compiled", horizon=5)
     env.reset(seed=1)
     pipe.send([env.step(np.zeros(1))[0] for _ in range(4)])
 
@@ -246,7 +246,7 @@ def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
     monkeypatch.setattr(MANEUVERING, "World", world)
     compiled_tasks._remembered.cache_clear()
     with pytest.warns(UserWarning, match=told) as said:
-        env = gym.make(MANEUVERING.id)
+        env = gym.make(MANEUVERING.id, control="gain")
     assert len([w for w in said if "runs with NumPy" in str(w.message)]) == 1
     assert env.unwrapped.backend == "numpy"
     env.reset(seed=0)
@@ -257,12 +257,12 @@ def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
 
 
 def test_a_report_that_cannot_be_traced_is_made_with_numpy():
-    task = task_on("compiled", MANEUVERING.id, horizon=5)
+    task = task_on("compiled", MANEUVERING.id, "gain", horizon=5)
 
     def odd(task, episode):
         return {"cost": task.cost(episode), "largest": np.full(8, float(task.cost(episode).max()))}
 
-    env = TaskVectorEnv(MANEUVERING.id, 3, backend="compiled", horizon=5)
+    env = TaskVectorEnv(MANEUVERING.id, 3, "gain", backend="compiled", horizon=5)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="odd of filtergym/ManeuveringTarget-v0 is not compiled"):
         ((found, _),) = env.lanes.decide(np.zeros((3, 1)), odd)
@@ -288,7 +288,7 @@ def test_two_scenarios_share_their_code(tmp_path, monkeypatch):
     monkeypatch.setenv("FILTERGYM_COMPILER_CACHE", str(tmp_path))
     counts = []
     for sigma in (40.0, 41.5):
-        env = TaskEnv("filtergym/ManeuveringTarget-v0", backend="compiled", range_sigma=sigma)
+        env = TaskEnv("filtergym/ManeuveringTarget-v0", "gain", backend="compiled", range_sigma=sigma)
         env.reset(seed=0)
         env.step(np.zeros(1))
         counts.append(len(list(Path(tmp_path).iterdir())))
