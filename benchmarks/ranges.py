@@ -14,8 +14,6 @@ import gymnasium
 import numpy
 from filtergym.envs.catalogue import task_class
 
-import filtergym
-
 PARALLEL = 100
 
 

@@ -1,11 +1,13 @@
 """Observations made of blocks: what is shown, and what is read back."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.observation import (
+    BOUNDED_LOG,
     KEPT_AS_LOG1P,
     LOG1P,
     SIGNED_LOG,
@@ -73,6 +75,22 @@ def test_readers_undo_what_the_observation_does(state):
     np.testing.assert_allclose(blocks.reader("d")(observation), state.d.reshape(4, 8).T, rtol=1e-13)
     total = state.a.T + (state.b + 0.5)[:, None]
     np.testing.assert_allclose(blocks.reader("twice")(observation), 2.0 * total, rtol=1e-13)
+
+
+def test_a_bounded_logarithm_is_the_value_near_zero_and_below_eight_everywhere():
+    blocks = Blocks((Block("g", lambda state, _: state, "anything", shown=BOUNDED_LOG),), (), np)
+    values = np.array([0.0, 1e-7, -1e-7, 1.0, -math.e + 1.0, 1e4, -1e4, 1e300])
+    shown = blocks.observe(values, None)[0]
+    by_hand = [math.copysign(math.log1p(abs(x)), x) for x in values]
+    np.testing.assert_allclose(shown, [y / (1.0 + abs(y) / 8.0) for y in by_hand], rtol=1e-14)
+    np.testing.assert_allclose(shown[:3], values[:3], rtol=1e-6)
+    assert shown[4] == pytest.approx(-1.0 / 1.125, rel=1e-14)
+    assert (abs(shown) < 8.0).all()
+    # Read back with what is left of the digits so near the bound.
+    read = blocks.reader("g")(shown[:, None])[:, 0]
+    np.testing.assert_allclose(read[:7], values[:7], rtol=1e-12)
+    assert read[7] == pytest.approx(1e300, rel=1e-9)
+    assert blocks.fields[0].description == "y / (1 + |y| / 8) with y = sign(x) log(1 + |x|) of anything"
 
 
 def test_unknown_names_and_names_said_twice():

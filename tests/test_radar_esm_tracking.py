@@ -240,6 +240,33 @@ def test_zero_evidence_is_the_recursion(transition):
         assert state.bank.probabilities == pytest.approx(P, rel=1e-8, abs=1e-14)
 
 
+@pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
+def test_evidence_acts_on_the_weights_of_its_scan_only(transition):
+    keywords = {} if transition is None else {"class_transition": transition}
+    task = make("random", horizon=60, evidence_scale=3.0, **keywords)
+    rng = numpy.random.default_rng(3)
+    actions = rng.uniform(-1.2, 1.2, (61, 3, 8))
+    paper = list(roll(task, draw(task, 8, 4)))
+    chosen = iter(actions)
+    for (measured, _, state), (paper_measured, _, paper_state), action in zip(
+        roll(task, draw(task, 8, 4), lambda _: next(chosen)), paper, actions, strict=True
+    ):
+        # All that is known before the action is as without the actions before, but for the weights that were reported.
+        kept = measured.bank._replace(probabilities=paper_measured.bank.probabilities)
+        for one, other in zip(leaves(kept), leaves(paper_measured.bank), strict=True):
+            numpy.testing.assert_array_equal(one, other)
+        moved = paper_state.bank.probabilities * numpy.exp(3.0 * numpy.clip(action, -1.0, 1.0))
+        numpy.testing.assert_allclose(state.bank.probabilities, moved / moved.sum(axis=0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("control", ["mode", "weights"])
+def test_weights_that_are_stated_are_the_prior_of_the_next_scan(control):
+    task = make("random", control, horizon=20)
+    stated = numpy.full(8, 2) if control == "mode" else numpy.tile([[0.0], [0.0], [1.0]], 8)
+    for _, _, state in roll(task, draw(task, 8, 4), lambda _: stated):
+        numpy.testing.assert_array_equal(state.bank.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
+
+
 def test_everyone_is_told_the_first_measurement_and_how_good_it_is():
     task = make("fixed-type", prior=(0.2, 0.3, 0.5))
     uniforms, normals, _ = draw(task, 40000, 15)

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
@@ -53,6 +54,33 @@ def test_one_is_what_the_paper_pays_on_average(env_id):
         assert np.median(charged) < 1.0 < charged.mean()
     else:
         assert 0.8 < charged.mean() < 1.25
+
+
+def test_the_default_is_the_environments_own(env_id, short, random_actions):
+    own = make_task(env_id).reward
+    envs = [TaskVectorEnv(env_id, 2, reward=kind, **short) for kind in (None, own, "cost", "relative")]
+    for env in envs:
+        env.reset(seed=4)
+    actions = random_actions(envs[0].single_action_space, 2, 0)
+    default, same, cost, relative = (env.step(actions)[1] for env in envs)
+    np.testing.assert_array_equal(default, same)
+    assert (cost != relative).any()
+
+
+@pytest.mark.parametrize("kind", ["cost", "relative", "log-likelihood"])
+def test_what_else_is_told_leaves_the_reward_alone(env_id, kind, short, random_actions):
+    """To the last bit: compiled logarithms may round otherwise than NumPy's."""
+    envs = [
+        TaskVectorEnv(env_id, 11, reward=kind, **keywords, **short)
+        for keywords in ({}, {"detailed_info": True}, {"observation": "asymmetric"})
+    ]
+    for env in envs:
+        env.reset(seed=4)
+    for step in range(3):
+        actions = random_actions(envs[0].single_action_space, 11, step)
+        first, *others = (env.step(actions)[1] for env in envs)
+        for other in others:
+            np.testing.assert_array_equal(other, first)
 
 
 def test_one_decisions_reward_is_the_mean_over_its_measurements():
