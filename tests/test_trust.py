@@ -51,7 +51,7 @@ def test_a_model_is_not_unpickled(stranger, command):
     record = json.loads((folder / "run.json").read_text())
     train = (
         "train", ID, "--out", folder, "--algo", "ppo", "--resume", "--steps", 2 * record["steps"],
-        "--envs", record["envs"], "--seed", record["seed"],
+        "--envs", record["envs"], "--seed", record["seed"], "--control", record["control"],
     )  # fmt: skip
     model = folder / "best" / "model.zip"
     for words in (
