@@ -82,6 +82,8 @@ class TrainingRun:
     validation: list[Validated] = field(default_factory=list)
     exported: dict[str, Any] | None = None
     """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
+    interface: int = 1
+    """Of the environment when the run began, see :class:`~..envs.task.Task`."""
 
     @property
     def finished(self) -> bool:
@@ -166,6 +168,7 @@ def new_run(
         steps,
         values,
         backend,
+        interface=cls.interface,
     )
 
 
@@ -318,7 +321,17 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
         if own:
             raise ValueError(f"cannot read the checkpoint in {checkpoint}: {error}") from error
         raise
-    for name in ("environment", "control", "scenario", "algorithm", "seed", "envs", "hyperparameters"):
+    compared = (
+        "environment",
+        "interface",
+        "control",
+        "scenario",
+        "algorithm",
+        "seed",
+        "envs",
+        "hyperparameters",
+    )
+    for name in compared:
         has, wanted = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
         while isinstance(has, dict) and isinstance(wanted, dict) and has != wanted:
             inside = next(n for n in {**has, **wanted} if has.get(n) != wanted.get(n))

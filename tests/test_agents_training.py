@@ -1,5 +1,6 @@
 """Training runs: what they refuse, that a resumed one equals one that never stopped, and what they export."""
 
+import dataclasses
 import functools
 import os
 import shutil
@@ -277,6 +278,9 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
         resumed_run(tmp_path, small_run(algorithm, 400, control="weights"))
     with pytest.raises(ValueError, match="holds a run with seed 0, not 3"):
         resumed_run(tmp_path, small_run(algorithm, 400, seed=3))
+    later = dataclasses.replace(small_run(algorithm, 400), interface=7)
+    with pytest.raises(ValueError, match="holds a run with interface 1, not 7"):
+        resumed_run(tmp_path, later)
     for file in (tmp_path / "checkpoint").iterdir():
         file.write_bytes(b"\x80garbage" * 20)
     with pytest.raises(ValueError, match=r"cannot read the checkpoint in"):
