@@ -45,15 +45,14 @@ def test_reward_is_the_compressed_charge(env_id):
 
 
 def test_one_is_what_the_paper_pays_on_average(env_id):
-    """But in TightlyCoupledNavigation, where few lost tracks rule the mean: between its median and its mean."""
+    """In TightlyCoupledNavigation few lost tracks rule the mean: 256 episodes tell it to a factor of two and a half."""
     paper = baselines_of(env_id).score_paper
-    episodes = 64 if "Tightly" in env_id else 500
+    rare = "Tightly" in env_id
+    episodes = 256 if rare else 500
     charged = filtergym.evaluate(env_id, [paper], episodes=episodes, split="train")["charge"].values
     charged = 30.0 * np.expm1(charged / 30.0)  # in units, no longer compressed
-    if "Tightly" in env_id:
-        assert np.median(charged) < 1.0 < charged.mean()
-    else:
-        assert 0.8 < charged.mean() < 1.25
+    factor = 2.5 if rare else 1.25
+    assert 1.0 / factor < charged.mean() < factor
 
 
 def test_the_default_is_the_environments_own(env_id, short, random_actions):

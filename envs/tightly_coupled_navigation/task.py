@@ -135,7 +135,7 @@ class TightlyCoupledNavigation(Task):
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix"
     )
-    reward_unit = 1.0
+    reward_unit = 10.0
     paper_policy = PaperPolicy("evidence", (0.0, 0.0, 0.0))
 
     parameters: TightlyCoupledNavigationParameters
