@@ -33,7 +33,7 @@ def arguments() -> argparse.Namespace:
         "--steps", type=int, default=200_000, help="decisions; a quarter in TightlyCoupledNavigation"
     )
     parser.add_argument(
-        "--episodes", type=int, default=2000, help="of the test; a tenth in TightlyCoupledNavigation"
+        "--episodes", type=int, default=2000, help="of the test; a fifth in TightlyCoupledNavigation"
     )
     parser.add_argument("--out", type=Path, default=Path("plain_ppo.json"))
     parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
@@ -109,10 +109,10 @@ def main() -> None:
     ids = chosen.environment or sorted(i for i in gymnasium.registry if i.startswith("filtergym/"))
     for seed in range(chosen.seeds):
         for id in ids:
-            part, tenth = (4, 10) if id in LONG else (1, 1)
+            quarter, fifth = (4, 5) if id in LONG else (1, 1)
             if any((found["environment"], found["seed"]) == (id, seed) for found in runs):
                 continue
-            runs.append(run(id, seed, chosen.steps // part, chosen.episodes // tenth))
+            runs.append(run(id, seed, chosen.steps // quarter, chosen.episodes // fifth))
             chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
             console.print(
                 f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s"
