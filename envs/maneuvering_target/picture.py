@@ -98,6 +98,7 @@ class ManeuveringTargetPicture(Picture):
             mean, S = imm.combine(estimator.innovation, estimator.innovation_covariance, predicted)
             innovation, variance = mean[:, 0], numpy.diagonal(S[:, :, 0])
             values |= {f"weight.{j}": weight for j, weight in enumerate(estimator.probabilities[:, 0])}
+            values |= {f"alpha.{j}": alpha for j, alpha in enumerate(estimator.alpha[:, 0])}
         normalised = innovation / numpy.sqrt(variance)
         return {**values, "innovation_x": normalised[0], "innovation_y": normalised[1]}
 
@@ -124,6 +125,9 @@ class ManeuveringTargetPicture(Picture):
         """Innovation, what is steered, error."""
         if self.task.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
+        elif self.task.control == "gains":
+            each = {f"filter {j + 1}": f"alpha.{j}" for j in range(len(self.task.parameters.gains))}
+            steered = Strip("position gain alpha", each, (0.0, 1.0))
         else:
             gains = self.task.parameters.gains
             named = {f"filter {j + 1}, alpha {gain:g}": f"weight.{j}" for j, gain in enumerate(gains)}
