@@ -9,6 +9,8 @@ from pathlib import Path
 
 import gymnasium
 import numpy
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.tuning import tuned_names
 from filtergym.envs.catalogue import catalogue
 
 import filtergym
@@ -40,11 +42,13 @@ def check_source_distribution(archive: Path, source: Path) -> None:
 def check_installed() -> None:
     """Environments are made and stepped; shipped agents and tuned values are found and play, without torch."""
     assert importlib.util.find_spec("torch") is None
+    assert any(map(shipped_agents, catalogue()))
     for id in catalogue():
         env = gymnasium.make(id)
         env.reset(seed=0)
         assert numpy.isfinite(env.step(env.action_space.sample())[1]), id
-        results = filtergym.evaluate(id, ["bptt"], episodes=2)
+        agents, tuned = shipped_agents(id), tuned_names(id)
+        results = filtergym.evaluate(id, [*agents, *tuned], episodes=2)
         assert numpy.isfinite(results["error"]).all(), id
 
 
