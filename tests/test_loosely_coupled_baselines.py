@@ -87,7 +87,7 @@ def test_nobody_beats_the_optimal_filter_where_it_is_optimal(on_paper):
 @pytest.mark.parametrize("scenario", ["random", "quiet", "jamming", "outage", "spoof-ramp"])
 def test_matched_is_consistent_with_its_bound(scenario):
     names = ["matched", "matched-covariance", "augmented", "augmented-gain", "time-varying"]
-    dataset = evaluate(ID, names, scenario, episodes=400, seed=2)
+    dataset = evaluate(ID, names, scenario, episodes=240, seed=2)
     matched = dataset.sel(policy="matched")
     runs = math.sqrt(dataset.sizes["episode"])
     bound = dataset["mean_square"].sel(policy="matched-covariance").values[..., 0]
