@@ -263,7 +263,10 @@ def test_recovery_times_of_made_up_runs():
 
 
 def test_recovery_is_reported_for_outages_only(on_paper):
-    assert not {r.metric for r in tidy_records(on_paper.isel(policy=slice(3)))} & {"recovery_time", "not_recovered"}
+    assert not {r.metric for r in tidy_records(on_paper.isel(policy=slice(3)))} & {
+        "recovery_time",
+        "not_recovered",
+    }
     records = tidy_records(
         evaluate(ID, ["plain-white", "time-varying", "matched", "matched-covariance"], "outage", episodes=200)
     )
