@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
-from ..envs.environment import TaskVectorEnv
+from ..envs.environment import TaskEnv, TaskVectorEnv
 from .residual import check_residual
 
 
@@ -91,7 +91,7 @@ class TaskVecEnv(VecEnv):
             ValueError: for options that differ between environments, and others than "scenario" and "parameters".
         """
         options: dict[str, Any] = dict(self._options[0])
-        known = ("scenario", "parameters")
+        known = TaskEnv.reset_options
         if any(own != options for own in self._options) or not options.keys() <= set(known):
             raise ValueError(
                 f"options of a reset, {' and '.join(known)}, are the same for all environments here, got "

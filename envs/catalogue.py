@@ -195,13 +195,15 @@ def find_scenario(
 
     Args:
         cls: the environment.
-        scenario: a name, a trajectory (also as a dictionary of its fields, as it comes out of JSON), or the path of a
-            CSV or NetCDF file with one.
+        scenario: a name, a trajectory (also as a dictionary of its fields, as it comes out of JSON), the path of a
+            CSV or NetCDF file with one, or what was found before.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
         ValueError: for an unknown scenario or parameter, or a file that holds no trajectory.
     """
+    if isinstance(scenario, Scenario):
+        return scenario
     check_names(cls, keywords or ())
     if find_mixture(cls, scenario) is not None:
         raise ValueError(

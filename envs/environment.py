@@ -16,11 +16,11 @@ from gymnasium.vector.utils import batch_space
 from .backend import host_array, is_tensor, task_on, tensor_on
 from .catalogue import ScenarioChoice, check_names, find_mixture, find_scenario, nearest, task_class
 from .lanes import Lanes, mean_of
-from .mixture import Course, MixedLanes, check_alike
+from .mixture import Course, MixedLanes, check_alike, lanes_of
 from .observation import Array, Field
 from .parameters import Limits, check, frozen
 from .privileged import REPORTS, context_shapes, in_sigmas
-from .reward import REWARDS, paper_task, reward
+from .reward import REWARDS, reward
 from .specification import told
 from .task import Task
 
@@ -125,9 +125,10 @@ class _Face:
         names: Iterable[str],
     ) -> None:
         """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
-        check_names(task_class(task), names, inspect.signature(type(self)).parameters)
+        self._class = task_class(task)
+        check_names(self._class, names, inspect.signature(type(self)).parameters)
         if reward_kind is None:
-            reward_kind = task_class(task).reward
+            reward_kind = self._class.reward
         if reward_kind not in REWARDS:
             raise nearest("reward", reward_kind, REWARDS)
         if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
@@ -165,9 +166,7 @@ class _Face:
         if len(course.tasks) > 1:
             self.lanes = MixedLanes(count, course, beside_paper, longest)
         else:
-            self.lanes = Lanes(
-                self.task, count, paper_task(self.task) if beside_paper else None, longest=longest
-            )
+            self.lanes = lanes_of(self.task, count, beside_paper, longest)
         self.last_decision = self.lanes.decisions_per_episode
         self._wrong: Array = None
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
@@ -183,11 +182,11 @@ class _Face:
             ValueError: for an unknown name, a value out of its limits, or what would change the spaces.
         """
         keywords = {**self._keywords, **parameters}
-        cls = task_class(self._make.args[1])  # type: ignore[attr-defined]
-        mixture = find_mixture(cls, scenario)
+        mixture = find_mixture(self._class, scenario)
         choices = [scenario] if mixture is None else list(mixture)
-        tasks = tuple(self._make(choice, **keywords) for choice in choices)
-        names = tuple(find_scenario(cls, choice, keywords).name for choice in choices)
+        found = [find_scenario(self._class, choice, keywords) for choice in choices]
+        tasks = tuple(self._make(one, **keywords) for one in found)
+        names = tuple(one.name for one in found)
         first = getattr(self, "task", tasks[0])
         for task, name in zip(tasks, names, strict=True):
             check_alike(first, task, name)

@@ -72,6 +72,11 @@ def check_alike(task: Task, other: Task, name: str) -> None:
             )
 
 
+def lanes_of(task: Task, count: int, beside_paper: bool, longest: int | None) -> Lanes:
+    """Make lanes of a task, with the paper's algorithm beside every episode where it is wanted."""
+    return Lanes(task, count, paper_task(task) if beside_paper else None, longest=longest)
+
+
 class MixedLanes:
     """``count`` lanes, each with a :class:`Course` of its own; used like :class:`~.lanes.Lanes`.
 
@@ -130,7 +135,7 @@ class MixedLanes:
         return most if self._longest is None else min(most, self._longest)
 
     def _made(self, task: Task, count: int) -> Lanes:
-        return Lanes(task, count, paper_task(task) if self._beside_paper else None, longest=self._longest)
+        return lanes_of(task, count, self._beside_paper, self._longest)
 
     def _part_of(self, task: Task) -> Lanes:
         """Lanes of a task, made when they are first asked for."""

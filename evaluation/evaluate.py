@@ -49,12 +49,13 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     own = getattr(maker, "control", None)
     space = getattr(maker, "action_space", None)
     if own is None and space is not None:
-        fitting = [c for c in cls.controls if make_task(cls.id, c).action_space == space]
-        if not fitting:
+        tasks = [make_task(cls.id, c) for c in cls.controls]
+        acting = [task for task in tasks if task.action_space == space]
+        if not acting:
             raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
         # Controls may share an action space; what they show then tells them apart.
         shown = getattr(getattr(maker, "observation_space", None), "shape", None)
-        fitting = [c for c in fitting if shown == (len(make_task(cls.id, c).fields),)] or fitting
+        fitting = [t.control for t in acting if (len(t.fields),) == shown] or [t.control for t in acting]
         own = control if control in fitting else fitting[0]
     if own is None:
         return control or cls.controls[0]

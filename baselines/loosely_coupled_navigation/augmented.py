@@ -52,8 +52,7 @@ class AugmentedFilter:
             none: zeros, ``(A, N)``.
         """
         p, zero = self.parameters, none[0]
-        P = ins_gnss.AugmentedCovariance(zero, zero, zero, zero + p.drift**2, zero, zero + p.coloured**2)
-        return AugmentedMemory(none, none, P, zero, self.noise.start(zero))
+        return AugmentedMemory(none, none, p.modelled_prior(zero), zero, self.noise.start(zero))
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
         """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""

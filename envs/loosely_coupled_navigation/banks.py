@@ -254,7 +254,7 @@ class NoiseBank(_KalmanBucyBank):
     def start(self, initial: Initial) -> Augmented:
         """Start where INS and reference agree, with the modelled prior of the rate errors."""
         zero = 0.0 * initial.mean
-        covariance = modelled_prior(self.parameters, zero[0])
+        covariance = self.parameters.modelled_prior(zero[0])
         return Augmented(
             position=initial.mean,
             drift=zero,
@@ -319,11 +319,6 @@ class NoiseBank(_KalmanBucyBank):
             "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
             "nis_degrees": self.parameters.axes * measurement.available,
         }
-
-
-def modelled_prior(p: LooselyCoupledNavigationParameters, none: Array) -> ins_gnss.AugmentedCovariance:
-    """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
-    return ins_gnss.AugmentedCovariance(none, none, none, none + p.drift**2, none, none + p.coloured**2)
 
 
 class GainBank(_KalmanBucyBank):
@@ -445,7 +440,7 @@ class SchemeBank(_KalmanBucyBank):
             plain_variance=each[:2, :1],
             drift=zero,
             coloured=zero,
-            covariance=modelled_prior(p, zero[0]),
+            covariance=p.modelled_prior(zero[0]),
             seen=self.none_seen(each),
             weights=each[:, 0],
         )

@@ -4,6 +4,7 @@ import functools
 from dataclasses import dataclass
 
 from ...filters import loosely_coupled as ins_gnss
+from ...filters.array_namespace import Array
 from ..parameters import TaskParameters, check, declared, parameter
 
 AXES = ("x", "y", "z")
@@ -158,3 +159,8 @@ class LooselyCoupledNavigationParameters(TaskParameters):
             (self.coloured * self.sampling.coloured) ** 2,
             self.white_intensity * self.sampling_interval + self.coloured**2 * self.sampling.residual,
         )
+
+    def modelled_prior(self, none: Array) -> ins_gnss.AugmentedCovariance:
+        """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
+        drift, coloured = none + self.drift**2, none + self.coloured**2
+        return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)
