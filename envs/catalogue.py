@@ -11,7 +11,7 @@ import importlib
 import math
 import pkgutil
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,15 +19,16 @@ from typing import Any
 import gymnasium
 import numpy
 
+from .flights import FLIGHT_SUFFIXES, Flights, flights_from, names_flights, read_flights
 from .task import Scenario, Task
-from .trajectory import TRAJECTORY_SUFFIXES, Trajectory, read_trajectory, trajectory_of
+from .trajectory import Trajectory, trajectory_of
 
 ADDED: dict[str, type[Task]] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""
 
 
-ScenarioChoice = str | Path | Trajectory | Mapping[str, Any] | None
-"""What names a scenario: a name, the path of a file, a trajectory or its fields, or None for the environment's own."""
+ScenarioChoice = str | Path | Trajectory | Flights | Sequence[Any] | Mapping[str, Any] | None
+"""What names a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
 
 MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
 """A mixture in words: ``random:0.8,paper:0.2``."""
@@ -156,7 +157,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
             return None
     elif isinstance(scenario, str) and MIXTURE.fullmatch(scenario) and scenario not in cls.scenarios:
         pairs = [part.split(":") for part in scenario.split(",")]
-        if Path(pairs[-1][1]).suffix in TRAJECTORY_SUFFIXES:  # of a file on a drive with a letter
+        if Path(pairs[-1][1]).suffix in FLIGHT_SUFFIXES:  # of a file on a drive with a letter
             return None
         given = {}
         for name, weight in pairs:
@@ -186,6 +187,25 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
     return {name: weight / total for name, weight in weights.items() if weight > 0.0}
 
 
+def opened(cls: type[Task], scenario: Any) -> Any:
+    """Return flights in place of what names them, so that files are read once; anything else as it is.
+
+    Args:
+        cls: the environment.
+        scenario: as :func:`find_scenario` takes it; a name of one of the environment's own is no file.
+
+    Raises:
+        ValueError: if the files hold no flights.
+    """
+    if isinstance(scenario, Mapping):
+        if find_mixture(cls, scenario) is not None:
+            return scenario
+        return flights_from(scenario) if "trajectories" in scenario else trajectory_of(scenario)
+    if isinstance(scenario, str) and scenario in cls.scenarios:
+        return scenario
+    return read_flights(scenario) if names_flights(scenario) else scenario
+
+
 def find_scenario(
     cls: type[Task],
     scenario: ScenarioChoice,
@@ -195,8 +215,8 @@ def find_scenario(
 
     Args:
         cls: the environment.
-        scenario: a name, a trajectory (also as a dictionary of its fields, as it comes out of JSON), the path of a
-            CSV or NetCDF file with one, or what was found before.
+        scenario: a name; a trajectory (also as a dictionary of its fields, as it comes out of JSON); a set of
+            flights as :func:`~.flights.read_flights` takes it, or returns it; or what was found before.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
@@ -210,18 +230,15 @@ def find_scenario(
             "a mixture of scenarios is for gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
             f"got {scenario!r}"
         )
-    if isinstance(scenario, str | Path) and Path(scenario).suffix in TRAJECTORY_SUFFIXES:
-        scenario = read_trajectory(Path(scenario))
-    elif isinstance(scenario, Mapping):
-        scenario = trajectory_of(scenario)
+    scenario = opened(cls, scenario)
     if isinstance(scenario, Trajectory):
         return cls.scenario_from_trajectory(scenario, keywords or {})
+    if isinstance(scenario, Flights):
+        return cls.scenario_from_flights(scenario, keywords or {})
     name = cls.default_scenario if scenario is None else scenario
-    if isinstance(name, Path):
-        name = str(name)
     if not isinstance(name, str):
         raise ValueError(
-            f"a scenario is a name, a Trajectory or the path of a file with one, got {name!r}: choose from "
+            f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got {name!r}: choose from "
             f"{', '.join(cls.scenarios)}"
         )
     if name not in cls.scenarios:

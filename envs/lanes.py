@@ -63,7 +63,7 @@ def mean_of(rewards: Sequence[Array]) -> Array:
 
 _REPLACED = ("state", "paper_state", "_interval_mean", "_clock")
 """Attributes of lanes that a step replaces."""
-_REWRITTEN = ("generators", "decisions", "_ring", "_started", "_children")
+_REWRITTEN = ("generators", "decisions", "_lengths", "_ring", "_started", "_children")
 """Attributes that it changes in place."""
 
 
@@ -111,6 +111,8 @@ class Lanes:
         self.decisions = numpy.zeros(count, dtype=numpy.int64)
         horizon = task.horizon // task.decision_interval
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
+        self._lengths = numpy.full(count, self.decisions_per_episode)
+        """Decisions of each lane's episode."""
         rows = task.horizon + 1
         self._row_width = task.noise.normals + task.noise.row_uniforms
         self._in_blocks = rows > LONGEST_BLOCK
@@ -214,6 +216,9 @@ class Lanes:
         index = numpy.asarray(chosen)
         self._started[index] = self._clock
         self.decisions[index] = 0
+        if task.flights:
+            lengths = task.lengths(uniforms) // task.decision_interval
+            self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
         # The padding lanes fly an average episode without noise.
         scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
         if everyone and self._moving and self._begun is None:
@@ -426,6 +431,7 @@ class Lanes:
         self._episodes = list(states)
         added = count - self.count
         self.decisions = numpy.append(self.decisions, numpy.zeros(added, dtype=numpy.int64))
+        self._lengths = numpy.append(self._lengths, numpy.full(added, self.decisions_per_episode))
         self._started = numpy.append(self._started, numpy.repeat(self._started[:1], added))
         # None that belongs to another lane: long episodes draw from theirs as they go.
         self.generators += [numpy.random.default_rng(0) for _ in range(added)]
@@ -465,12 +471,12 @@ class Lanes:
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
         """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
-        self.decisions[list(lanes)] = numpy.minimum(decisions, self.decisions_per_episode - 1)
+        self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property
     def finished(self) -> numpy.ndarray:
         """Lanes whose episode is over, ``(count,)`` booleans."""
-        return self.decisions >= self.decisions_per_episode
+        return self.decisions >= self._lengths
 
     def observe(self) -> Array:
         """Observation of every lane, batch first: ``(count, len(task.fields))``; the caller may keep it."""

@@ -68,6 +68,11 @@ class Scenario:
     evaluation adds the window ``all``, the whole episode."""
     training: bool = False
     """Whether agents may be trained and policies tuned on it."""
+    flights: tuple[str, ...] = ()
+    """Where every episode flies one of several: name of each, and where pieces of one flight are flown, that several
+    times."""
+    notes: tuple[str, ...] = ()
+    """What is to be told of where it comes from, a line each."""
 
 
 class NoiseLayout(NamedTuple):
@@ -350,6 +355,9 @@ class Task(ABC):
     """Measurements acted on in one episode."""
     decision_interval: int
     """Measurements for which one action holds."""
+    flights: tuple[int, ...] = ()
+    """Where every episode flies one of several, measurements acted on in each of them, all multiples of
+    ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
     noise: NoiseLayout
     fields: tuple[Field, ...]
     action_space: gymnasium.Space
@@ -410,6 +418,29 @@ class Task(ABC):
     def scenario_from_trajectory(cls, trajectory: Any, keywords: Mapping[str, Any]) -> Scenario:
         """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""
         raise ValueError(f"{cls.id} does not take a trajectory as scenario")
+
+    @classmethod
+    def scenario_from_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario of a set of flights of which every episode flies one; see :attr:`flights`."""
+        raise ValueError(f"{cls.id} does not take flights as scenario")
+
+    def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
+        """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
+
+        Args:
+            uniforms: of the scenario, ``(noise.uniforms, N)``; the first row draws the flight.
+        """
+        return numpy.floor(len(self.flights) * uniforms[0]).astype(int)
+
+    def lengths(self, uniforms: numpy.ndarray) -> numpy.ndarray:
+        """Measurements acted on in each episode, ``(N,)``.
+
+        Args:
+            uniforms: of the scenario, ``(noise.uniforms, N)``.
+        """
+        if not self.flights:
+            return numpy.full(uniforms.shape[1], self.horizon)
+        return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
     def feedback(self, mean: Array, measurement: Any) -> Any:
         """Report what an estimate that was made outside the bank gives back to the world; None in an open loop.

@@ -1,10 +1,8 @@
 """A flight given as positions in time: a user's own, or one composed of straight legs and exact turns."""
 
 import dataclasses
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy
@@ -22,6 +20,7 @@ class Trajectory:
         position: x and y in metres, ``(n, 2)``.
         velocity: m/s, ``(n, 2)``; by default the slope of a cubic spline through the positions.
         name: what reports call it.
+        flight: name of the flight that it is a piece of; empty where it is a whole one.
 
     Raises:
         ValueError: if the times do not increase, a value is not finite, or shapes do not match.
@@ -31,6 +30,7 @@ class Trajectory:
     position: numpy.ndarray
     velocity: numpy.ndarray | None = None
     name: str = "trajectory"
+    flight: str = ""
 
     def __post_init__(self) -> None:
         time = numpy.asarray(self.time, dtype=float)
@@ -117,60 +117,10 @@ def trajectory_of(fields: Mapping[str, Any]) -> Trajectory:
     known = [field.name for field in dataclasses.fields(Trajectory)]
     if not {"time", "position"} <= set(fields) <= set(known):
         raise ValueError(
-            f"a trajectory as a dictionary has time, position and optionally velocity and name, got "
+            f"a trajectory as a dictionary has time, position and optionally velocity, name and flight, got "
             f"{', '.join(map(repr, fields)) or 'nothing'}"
         )
     try:
         return Trajectory(**fields)
     except (ValueError, TypeError) as error:  # rows of different lengths, words
         raise ValueError(f"scenario as a dictionary: {error}") from error
-
-
-TRAJECTORY_SUFFIXES = (".csv", ".nc")
-
-
-def read_trajectory(path: Path) -> Trajectory:
-    """Read a trajectory from a file.
-
-    Args:
-        path: CSV with a header line, or NetCDF with variables along one dimension: ``time`` (s), ``x``, ``y``
-            (m) and optionally ``vx``, ``vy`` (m/s).
-
-    Raises:
-        ValueError: if the file cannot be read, a column is missing, or a value is not a number.
-    """
-    columns: dict[str, numpy.ndarray]
-    try:
-        if path.suffix == ".nc":
-            import xarray
-
-            # From memory: a mapped file stays open where its reading fails.
-            content = io.BytesIO(path.read_bytes())
-            with xarray.open_dataset(content, engine="scipy", decode_times=False) as data:
-                columns = {str(name): data[name].values for name in data.variables}
-        else:
-            with path.open(encoding="utf-8-sig") as file:
-                names = [name.strip() for name in file.readline().split(",")]
-                values = numpy.loadtxt(file, delimiter=",", ndmin=2)
-            twice = {name for name in names if names.count(name) > 1}
-            if twice:
-                raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
-            if values.shape[1] != len(names):
-                raise ValueError(f"{len(names)} column names but {values.shape[1]} columns")
-            columns = dict(zip(names, values.T, strict=True))
-    except Exception as error:  # the reader of NetCDF raises whatever a broken file makes it stumble over
-        raise ValueError(f"cannot read trajectory {path}: {str(error) or type(error).__name__}") from error
-    missing = [name for name in ("time", "x", "y") if name not in columns]
-    if missing:
-        raise ValueError(
-            f"trajectory {path} lacks the column {', '.join(missing)}; it has {', '.join(columns)} and needs "
-            "time, x, y and optionally vx, vy"
-        )
-    try:
-        position = numpy.column_stack([columns["x"], columns["y"]])
-        velocity = (
-            numpy.column_stack([columns["vx"], columns["vy"]]) if {"vx", "vy"} <= set(columns) else None
-        )
-        return Trajectory(columns["time"], position, velocity, name=path.stem)
-    except (ValueError, TypeError) as error:  # columns of words, of other lengths, of more dimensions
-        raise ValueError(f"trajectory {path}: {error}") from error

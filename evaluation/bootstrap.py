@@ -1,13 +1,18 @@
-"""Bootstrap intervals over episodes, for many statistics at once.
+"""Bootstrap intervals over episodes, or over clusters of them, for many statistics at once.
 
 A bootstrap sample of M episodes is a vector of multinomial counts, and the mean of anything over the sample
 is a product with it. So one matrix of counts serves every statistic, and those computed from one sample are
 paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resamples by index for each statistic,
 which is a hundred times slower here.
+
+Episodes of one recorded flight are no independent samples of what there is to fly. Where episodes belong to flights,
+whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997, 3.8):
+the interval then says what other flights of the kind would give. It needs many flights: of fewer than ten it is too
+narrow.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -30,13 +35,24 @@ class Bootstrap:
         episodes: M.
         resamples: number of bootstrap samples.
         seed: of the resampling; fixed, so that a table can be made again.
+        clusters: what each episode belongs to, ``(episodes,)``; whole clusters are resampled then, unless all episodes
+            are of one. Values may be NaN then where an episode is over, and means are of those that are there.
     """
 
-    def __init__(self, episodes: int, resamples: int = RESAMPLES, seed: int = 0) -> None:
+    def __init__(
+        self, episodes: int, resamples: int = RESAMPLES, seed: int = 0, clusters: Sequence[Any] | None = None
+    ) -> None:
         generator = numpy.random.default_rng(seed)
-        counts = generator.multinomial(episodes, numpy.full(episodes, 1.0 / episodes), size=resamples)
+        self.ragged = clusters is not None
+        of = numpy.arange(episodes)
+        if clusters is not None and len(set(clusters)) > 1:
+            of = numpy.unique(numpy.asarray(clusters), return_inverse=True)[1]
+        number = int(of.max()) + 1
+        counts = generator.multinomial(number, numpy.full(number, 1.0 / number), size=resamples)[:, of]
         observed = numpy.ones((1, episodes))
-        self.weights = numpy.concatenate([observed, counts]) / episodes
+        weights = numpy.concatenate([observed, counts])
+        # Clusters may differ in size: the mean is over the episodes of those that were drawn.
+        self.weights = weights / weights.sum(axis=1, keepdims=True)
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
         """Means over the episodes and over every resample of them.
@@ -48,7 +64,14 @@ class Bootstrap:
             ``(1 + resamples, ...)``; the first row is the data's own.
         """
         flat = values.reshape(len(values), -1)
-        return (self.weights @ flat).reshape(-1, *values.shape[1:])
+        present = ~numpy.isnan(flat)
+        if self.ragged and not present.all():
+            sums, weights = self.weights @ numpy.where(present, flat, 0.0), self.weights @ present
+            nobody = numpy.full(sums.shape, numpy.nan)
+            means = numpy.divide(sums, weights, out=nobody, where=weights > 0.0)
+        else:
+            means = self.weights @ flat
+        return means.reshape(-1, *values.shape[1:])
 
     def medians(self, values: numpy.ndarray) -> numpy.ndarray:
         """Medians over the episodes and over every resample of them, ``(1 + resamples,)``.

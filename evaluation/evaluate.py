@@ -12,7 +12,7 @@ import numpy
 import xarray
 
 from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, make_task, nearest, task_class
+from ..envs.catalogue import find_scenario, make_task, nearest, opened, task_class
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
@@ -155,8 +155,9 @@ def evaluate(
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: by the name that stands in the tables: each a class or function that makes it for a task,
             or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
-        scenario: name of a scenario or a trajectory; default: the environment's training distribution.
-        episodes: Monte Carlo runs M.
+        scenario: name of a scenario, a trajectory, or a set of flights; default: the environment's training
+            distribution.
+        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.
@@ -171,13 +172,16 @@ def evaluate(
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
         truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
-        ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes.
+        ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes. Of a set of
+        flights the coordinates ``flight`` and ``length`` say which each episode flies and its measurements; what lies
+        beyond is NaN. The attribute ``notes`` tells what was left out.
 
     Raises:
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
             the control.
     """
     cls = task_class(env)
+    scenario = opened(cls, scenario)
     chosen = find_scenario(cls, scenario, keywords)
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
@@ -198,6 +202,11 @@ def evaluate(
         )
     for name, task in tasks.items():
         check_shown(task, competitors[name], name)
+    first = next(iter(tasks.values()))
+    flown, lengths = None, None
+    if first.flights:
+        seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
+        episodes = len(seeds)
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in competitors.items():
@@ -216,7 +225,39 @@ def evaluate(
         ]
         per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
     dataset = _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
-    return dataset.assign_attrs(paper=paper, reference=reference)
+    if flown is not None and lengths is not None:
+        there = xarray.DataArray(dataset["time"].values <= lengths[:, None], dims=("episode", "time"))
+        dataset = dataset.where(there).assign_coords(
+            flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths)
+        )
+    return dataset.assign_attrs(paper=paper, reference=reference, notes=list(chosen.notes))
+
+
+def _flights_in_turn(
+    task: Task, split: str, seed: int, episodes: int
+) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
+    """Seeds, in their order, of which every flight gets as many as any other; the flight and length of each.
+
+    An episode stays what its seed makes it. Who wants fewer episodes than there are flights gets one of each.
+    """
+    count = len(task.flights)
+    share = -(-episodes // count)
+    found: list[int] = []
+    flown: list[int] = []
+    lengths: list[int] = []
+    missing = numpy.full(count, share)
+    first = 0
+    while missing.any():
+        for candidate in episode_seeds(split, seed, share * count, first):
+            uniforms = numpy.random.default_rng(candidate).random((task.noise.uniforms, 1))
+            flight = int(task.flight_of(uniforms)[0])
+            if missing[flight]:
+                missing[flight] -= 1
+                found.append(candidate)
+                flown.append(flight)
+                lengths.append(int(task.lengths(uniforms)[0]))
+        first += share * count
+    return found, numpy.array(flown), numpy.array(lengths)
 
 
 def _further_dimensions(key: str, count: int) -> list[str]:

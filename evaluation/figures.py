@@ -7,9 +7,9 @@ from typing import Any
 import numpy
 import xarray
 
-from .bootstrap import Bootstrap
 from .files import whole_file
 from .metrics import (
+    bootstrap_of,
     chi_square_band,
     consistency_degrees,
     consistency_metrics,
@@ -89,7 +89,7 @@ def _shade_windows(axis: Any, dataset: xarray.Dataset) -> None:
 
 def draw_error_over_time(dataset: xarray.Dataset) -> Any:
     """RMSE over time of every group of components (or component), with 95 % bands over episodes."""
-    bootstrap = Bootstrap(dataset.sizes["episode"], resamples=200)
+    bootstrap = bootstrap_of(dataset, resamples=200)
     units = reported_components(dataset)
     shown = list(dataset.attrs["groups"]) or list(units)[:3]
     figure, axes = _axes(len(shown))
@@ -167,6 +167,7 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
                 numpy.sqrt(squared_errors(dataset.sel(policy=name), component, dataset.attrs["groups"])),
                 axis=None,
             )
+            error = error[: numpy.isfinite(error).sum()]  # what is missing, beyond the end of a flight, is sorted last
             # A few hundred quantiles draw the same curve as a million points.
             index = numpy.unique(numpy.geomspace(1, len(error), 400).astype(int))
             axis.plot(error[len(error) - index], index / len(error), label=name, **style)
@@ -184,7 +185,7 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
 
 def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
     """Mean over episodes of the mode probabilities of every policy that has them, with 95 % bands."""
-    bootstrap = Bootstrap(dataset.sizes["episode"], resamples=200)
+    bootstrap = bootstrap_of(dataset, resamples=200)
     present = [
         name
         for name in dataset["policy"].values.tolist()
@@ -207,7 +208,7 @@ def draw_mode_probabilities(dataset: xarray.Dataset) -> Any:
 
 def draw_true_class_probability(dataset: xarray.Dataset) -> Any:
     """Mean over episodes of the probability of the true class, with 95 % bands."""
-    bootstrap = Bootstrap(dataset.sizes["episode"], resamples=200)
+    bootstrap = bootstrap_of(dataset, resamples=200)
     figure, axes = _axes()
     _shade_windows(axes[0], dataset)
     for name, style in styles(dataset["policy"].values.tolist()).items():

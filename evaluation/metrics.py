@@ -1,7 +1,7 @@
 """From an evaluation to numbers: tidy records, every one derived from the dataset and nothing else.
 
-A record is one number with its 95 % bootstrap interval over episodes. Differences and ratios are paired:
-numerator and denominator are resampled together.
+A record is one number with its 95 % bootstrap interval over episodes, or over flights where episodes fly several.
+Differences and ratios are paired: numerator and denominator are resampled together.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy
 import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
-from .bootstrap import Bootstrap, Estimate
+from .bootstrap import RESAMPLES, Bootstrap, Estimate
 from .competitors import RANKED
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
@@ -83,6 +83,28 @@ def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
     return bootstrap.estimate(sums, ratio)
 
 
+def bootstrap_of(dataset: xarray.Dataset, resamples: int = RESAMPLES) -> Bootstrap:
+    """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
+    clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
+    return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
+
+
+def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
+    """Mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
+
+    Args:
+        run: that the values are of.
+        values: ``(episodes, time)``; NaN beyond the end of a flight, or of a window that it does not reach.
+    """
+    if "flight" not in run.coords:
+        return values.mean(axis=1)
+    present = ~numpy.isnan(values)
+    nothing = numpy.full(len(values), math.nan)
+    return numpy.divide(
+        numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1), out=nothing, where=present.any(axis=1)
+    )
+
+
 def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     run = dataset.sel(policy=name)
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
@@ -92,16 +114,15 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         squares = squared_errors(run, component, groups)
         over_time = numpy.sqrt(bootstrap.means(squares))
         for window, times in slices.items():
-            value = bootstrap.estimate(squares[:, times].mean(axis=1), numpy.sqrt)
+            value = bootstrap.estimate(mean_over_time(run, squares[:, times]), numpy.sqrt)
             yield Measure("rmse", component, window, value, unit)
-        peak = bootstrap.interval(over_time.max(axis=1))
+        peak = bootstrap.interval(numpy.fmax.reduce(over_time, axis=1))
         yield Measure("peak_rmse", component, "all", peak, unit)
         if not is_bound and component not in groups:
             signed = run["error"].sel(component=component).values
             for window, times in slices.items():
-                yield Measure(
-                    "mean_error", component, window, bootstrap.estimate(signed[:, times].mean(axis=1)), unit
-                )
+                value = bootstrap.estimate(mean_over_time(run, signed[:, times]))
+                yield Measure("mean_error", component, window, value, unit)
     for metric in ("nees", "nis"):
         if metric in consistency_metrics(run):
             for window, times in slices.items():
@@ -110,13 +131,16 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
         for mode in run["mode"].values.tolist():
             probability = run["mode_probability"].sel(mode=mode).values
             for window, times in slices.items():
-                value = bootstrap.estimate(probability[:, times].mean(axis=1))
+                value = bootstrap.estimate(mean_over_time(run, probability[:, times]))
                 yield Measure("mean_mode_probability", mode, window, value, "1")
     if not is_bound:
         cost = run["cost"].values
         for window, times in slices.items():
-            yield Measure("cost", "", window, bootstrap.estimate(cost[:, times].mean(axis=1)), "1")
-        yield Measure("return", "", "all", bootstrap.estimate(-run["charge"].values.sum(axis=1)), "1")
+            value = bootstrap.estimate(mean_over_time(run, cost[:, times]))
+            yield Measure("cost", "", window, value, "1")
+        charge = run["charge"].values
+        total = numpy.nansum(charge, axis=1) if bootstrap.ragged else charge.sum(axis=1)
+        yield Measure("return", "", "all", bootstrap.estimate(-total), "1")
 
 
 def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
@@ -170,14 +194,20 @@ def best_of(dataset: xarray.Dataset) -> str:
     ranked = dataset.isel(policy=numpy.isin(dataset["kind"].values, RANKED))
     if not ranked.sizes["policy"]:
         return ""
-    return str(ranked["policy"].values[ranked["cost"].mean(["episode", "time"]).values.argmin()])
+    costs = [mean_cost(ranked, name).mean() for name in ranked["policy"].values.tolist()]
+    return str(ranked["policy"].values[numpy.argmin(costs)])
+
+
+def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
+    """Mean cost of every episode of one competitor, ``(episodes,)``."""
+    return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
 def _behind_best(dataset: xarray.Dataset, name: str, best: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     """Paired relative difference of the cost to the best one's."""
     if not best or str(dataset["kind"].sel(policy=name).values) not in RANKED:
         return
-    own, lowest = (bootstrap.means(dataset["cost"].sel(policy=p).values.mean(axis=1)) for p in (name, best))
+    own, lowest = (bootstrap.means(mean_cost(dataset, p)) for p in (name, best))
     yield Measure("behind_best", best, "all", bootstrap.interval(own / lowest - 1.0), "1")
 
 
@@ -187,10 +217,7 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
     present = dataset["policy"].values.tolist()
     if paper_name not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
         return
-    each = {
-        p: dataset["cost"].sel(policy=p).values.mean(axis=1)
-        for p in {name, paper_name, reference_name} & set(present)
-    }
+    each = {p: mean_cost(dataset, p) for p in {name, paper_name, reference_name} & set(present)}
     cost = {p: bootstrap.means(values) for p, values in each.items()}
     paper = cost[paper_name]
     yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
@@ -223,7 +250,7 @@ def tidy_records(
         dataset: from an evaluation.
         metrics: the environment's own, from one policy's part of the dataset.
     """
-    bootstrap, best = Bootstrap(dataset.sizes["episode"]), best_of(dataset)
+    bootstrap, best = bootstrap_of(dataset), best_of(dataset)
     attrs = dataset.attrs
 
     def finite(value: float) -> float | None:

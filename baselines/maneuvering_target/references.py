@@ -1,6 +1,6 @@
 """Reference estimators and the bound of ManeuveringTarget."""
 
-from ...envs.maneuvering_target.world import Legs, Measurement, RadarWorld, Truth
+from ...envs.maneuvering_target.world import Legs, Measurement, RadarWorld, Tracks, Truth
 from ...envs.observation import Array
 from ...envs.task import Initial
 from ...filters import bounds, kalman, polar
@@ -28,6 +28,11 @@ class KnownTurn(KalmanModel):
             rate = world.table[2:, 1:] - world.table[2:, :-1]
             row = xp.clip(xp.astype(truth.scan, xp.int64) - 1, None, rate.shape[1] - 1)
             change = rate[:, row] / T
+            return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
+        if isinstance(truth.maneuvers, Tracks):
+            m = truth.maneuvers
+            before = xp.astype(xp.minimum(m.first + truth.scan, m.last) - 1.0, xp.int64)
+            change = (truth.velocity - world.table[2:, before]) / T
             return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
         if isinstance(truth.maneuvers, Legs):
             change = (truth.velocity - world.on_legs(truth.maneuvers, truth.scan - 1.0)[1]) / T

@@ -68,6 +68,9 @@ class ManeuveringTargetParameters(TaskParameters):
     """Probability that all of its turns go to the other side (ours)."""
     track: tuple[tuple[float, ...], ...] = ()
     """Rows x, y, vx, vy, each with horizon + 2 values one scan apart, of flight "track"."""
+    track_scans: tuple[int, ...] = parameter((), at_least=1)
+    """Scans of each of several flights, of which every episode flies one; ``track`` then holds them one after another,
+    each with two values more than scans. Empty: one flight."""
     start_range: tuple[float, float] = parameter((5e3, 60e3), above=0.0, ascending=True)
     """Limits of the range at the start of a random flight, m (ours)."""
     speed: tuple[float, float] = parameter((60.0, 300.0), above=0.0, ascending=True)
@@ -91,8 +94,14 @@ class ManeuveringTargetParameters(TaskParameters):
                 raise ValueError(f"legs[{i}][0] must be a duration above 0 s, got {leg[0]!r}")
         if self.flight == "legs" and not self.legs:
             raise ValueError('flight "legs" needs at least one leg (duration in s, turn rate in deg/s)')
+        if any(scans > self.horizon for scans in self.track_scans):
+            raise ValueError(f"track_scans must not exceed the horizon {self.horizon}, got {self.track_scans!r}")
+        if any(scans % self.decision_interval for scans in self.track_scans):
+            raise ValueError(
+                f"track_scans must be multiples of decision_interval {self.decision_interval}, got {self.track_scans!r}"
+            )
         if self.flight == "track":
             if len(self.track) != 4:
                 raise ValueError(f"track must have the four rows x, y, vx, vy, got {len(self.track)} rows")
             for row, name in zip(self.track, ("x", "y", "vx", "vy"), strict=True):
-                sized(f"track {name}", row, self.horizon + 2)
+                sized(f"track {name}", row, sum(scans + 2 for scans in self.track_scans or (self.horizon,)))

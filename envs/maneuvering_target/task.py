@@ -6,10 +6,12 @@ the mathematics stands in ``filters/alpha_beta.py``, ``filters/imm.py`` and ``fi
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy
 
+from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
@@ -20,6 +22,8 @@ from .world import RadarWorld
 
 FARTHEST_RANGE = 500e3
 """Metres; a user's trajectory beyond this is taken for a mistake of units."""
+MOST_SCANS = 100_000
+"""Of all flights of a set together: a week of flying at 6 s."""
 
 
 class ManeuveringTarget(Task):
@@ -115,6 +119,7 @@ class ManeuveringTarget(Task):
     def set_up(self) -> None:
         """Name the hypotheses and the paper's action."""
         count = len(self.parameters.gains)
+        self.flights = self.parameters.track_scans
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
@@ -127,11 +132,7 @@ class ManeuveringTarget(Task):
     @classmethod
     def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
         """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
-        keywords = {name: frozen(value) for name, value in keywords.items()}
-        for name in ("sampling_interval", "horizon"):
-            if name in keywords:
-                check(name, keywords[name], *declared(ManeuveringTargetParameters)[name])
-        interval = keywords.get("sampling_interval", ManeuveringTargetParameters.sampling_interval)
+        interval, _, horizon = cls._sampling(keywords)
         farthest = float(numpy.hypot(*trajectory.position.T).max())
         if farthest > FARTHEST_RANGE:
             raise ValueError(
@@ -144,12 +145,53 @@ class ManeuveringTarget(Task):
                 f"trajectory {trajectory.name!r} lasts {trajectory.duration:g} s, which is less than two scans "
                 f"of {interval:g} s: give a smaller sampling_interval"
             )
-        horizon = keywords.get("horizon", scans)
+        horizon = scans if horizon is None else horizon
         track = trajectory.resampled(interval, horizon + 2)
         return Scenario(
             trajectory.name,
             "A flight given by its positions.",
             {"flight": "track", "horizon": horizon, "track": tuple(map(tuple, track.tolist()))},
+        )
+
+    @classmethod
+    def _sampling(cls, keywords: Mapping[str, Any]) -> tuple[float, int, int | None]:
+        """Sampling interval (s), scans for which an action holds, and the horizon if it is among the keywords."""
+        found: dict[str, Any] = {}
+        for name in ("sampling_interval", "decision_interval", "horizon"):
+            found[name] = getattr(ManeuveringTargetParameters, name) if name != "horizon" else None
+            if name in keywords:
+                found[name] = frozen(keywords[name])
+                check(name, found[name], *declared(ManeuveringTargetParameters)[name])
+        return found["sampling_interval"], found["decision_interval"], found["horizon"]
+
+    @classmethod
+    def scenario_from_flights(cls, flights: Flights, keywords: Mapping[str, Any]) -> Scenario:
+        """Fly a user's flights, one in every episode, each to its end or for the horizon that is asked for."""
+        interval, held, horizon = cls._sampling(keywords)
+        used, notes = flights.flyable(interval, FARTHEST_RANGE)
+        if len(used) == 1:
+            return replace(cls.scenario_from_trajectory(used[0], keywords), notes=tuple(notes))
+        scans = [flight.intervals(interval) for flight in used]
+        if horizon is not None:
+            scans = [min(count, horizon) for count in scans]
+        scans = [max(count - count % held, held) for count in scans]
+        if sum(scans) > MOST_SCANS:
+            raise ValueError(
+                f"the flights of {flights.name!r} have {sum(scans):,} scans of {interval:g} s together, more than "
+                f"{MOST_SCANS:,}: fly fewer, or give a smaller horizon"
+            )
+        tracks = [flight.resampled(interval, count + 2) for flight, count in zip(used, scans, strict=True)]
+        return Scenario(
+            flights.name,
+            "Flights given by their positions.",
+            {
+                "flight": "track",
+                "horizon": max(scans),
+                "track": tuple(map(tuple, numpy.concatenate(tracks, axis=1).tolist())),
+                "track_scans": tuple(scans),
+            },
+            flights=tuple(map(flight_of, used)),
+            notes=tuple(notes),
         )
 
 

@@ -1,5 +1,6 @@
 """The flight of ManeuveringTarget, and the radar that measures it; equations in ``filters/polar.py``."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -61,6 +62,15 @@ class Legs(NamedTuple):
     """m/s, ``(legs + 1, 2, N)``."""
 
 
+class Tracks(NamedTuple):
+    """Which of several flights in a table is flown."""
+
+    number: Array
+    """``(N,)``, as a float; likewise the columns of its first and last state."""
+    first: Array
+    last: Array
+
+
 class Truth(NamedTuple):
     """The aircraft."""
 
@@ -70,8 +80,8 @@ class Truth(NamedTuple):
     """m, ``(2, N)``."""
     velocity: Array
     """m/s, ``(2, N)``."""
-    maneuvers: Maneuvers | Legs | None
-    """None where the flight is a table."""
+    maneuvers: Maneuvers | Legs | Tracks | None
+    """None where the flight is a table of one."""
 
 
 class Measurement(NamedTuple):
@@ -103,17 +113,25 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Rows x, y, vx, vy of a flight that is a table, ``(4, horizon + 2)``."""
         if p.flight == "track":
             self.table = task.constant(p.track)
+        self.track_ends = [0, *itertools.accumulate(scans + 2 for scans in p.track_scans)]
+        """Columns of the table at which flights begin, and its width."""
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw the flight; the track starts with errors of the measurement's size, equation (24)."""
         xp, p, constant = self.xp, self.parameters, self.task.constant
         ones = xp.ones_like(normals[0])
-        maneuvers: Maneuvers | Legs | None
+        maneuvers: Maneuvers | Legs | Tracks | None
         if p.flight == "random":
             position, velocity, maneuvers = self._random_flight(draws)
         elif p.flight == "legs":
             maneuvers = self._drawn_legs(draws, ones)
             position, velocity = maneuvers.position[0], maneuvers.velocity[0]
+        elif self.table is not None and p.track_scans:
+            number = draws.integer("flight", (0, len(p.track_scans) - 1))
+            row = xp.astype(number, xp.int64)
+            first, last = constant(self.track_ends[:-1])[row], constant(self.track_ends[1:])[row] - 1.0
+            position, velocity = self._states(first)
+            maneuvers = Tracks(number, first, last)
         elif self.table is not None:
             position = self.table[:2, 0, None] * ones
             velocity = self.table[2:, 0, None] * ones
@@ -234,15 +252,20 @@ class RadarWorld(World[Task, Truth, Measurement]):
             velocity = xp.where(there, legs.velocity[i], velocity)
         return self._after(now - time, turn, position, velocity)
 
+    def _states(self, column: Array) -> tuple[Array, Array]:
+        """Position and velocity in a column of the table, a float, ``(2, N)`` each."""
+        row = self.xp.astype(column, self.xp.int64)
+        return self.table[:2, row], self.table[2:, row]
+
     def _flown(self, truth: Truth, scan: Array) -> tuple[Array, Array]:
         """Position and velocity at the next scan."""
         xp, T, m = self.xp, self.parameters.sampling_interval, truth.maneuvers
         if isinstance(m, Legs):
             return self.on_legs(m, scan)
         if m is None:
-            last = int(self.table.shape[1]) - 1
-            row = xp.clip(xp.astype(scan, xp.int64), None, last)
-            return self.table[:2, row], self.table[2:, row]
+            return self._states(xp.clip(scan, None, float(self.table.shape[1]) - 1.0))
+        if isinstance(m, Tracks):
+            return self._states(xp.minimum(m.first + scan, m.last))
         position, velocity = truth.position + T * truth.velocity, truth.velocity
         if not self.slots:
             return position, velocity
@@ -285,7 +308,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Manoeuvres: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each, or where legs begin (s) and
-        their turn rates (rad/s); whether one is flown now. Empty where the flight is a table.
+        their turn rates (rad/s); whether one is flown now. Of flights that are a table the number; empty where there is
+        one.
         """
         xp, m = self.xp, truth.maneuvers
         if isinstance(m, Legs):
@@ -294,6 +318,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
             for i in range(1, int(m.time.shape[0])):
                 turn = xp.where(now >= m.time[i], m.turn[i], turn)
             return {"leg_time": m.time, "leg_turn_rate": m.turn, "maneuvering": turn != 0.0}
+        if isinstance(m, Tracks):
+            return {"flight": m.number}
         if m is None or not self.slots:
             return {}
         # A manoeuvre that is not flown lies beyond the end.
