@@ -284,7 +284,8 @@ def read_flights(
         except ValueError as error:
             if len(files) + len(sources) == 1:
                 raise
-            sources.append(Source(_short(file, files), (), wrong=str(error)))
+            reason = str(error).partition(f"trajectory {file}: ")[2]
+            sources.append(Source(_short(file, files), (), wrong=reason))
     trajectories = tuple(t for s in sources for t in s.trajectories)
     if not trajectories:
         raise ValueError(_nothing(name, [f"{s.name}: {s.wrong}" for s in sources]))
@@ -332,6 +333,8 @@ def _read(file: Path, label: str, limits: _Limits) -> list[Source]:
         table = _TABLES[file.suffix](file) if file.suffix in _TABLES else None
         if table is None:
             raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"cannot read trajectory {file}: it is no text in UTF-8") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         raise ValueError(f"cannot read trajectory {file}: {str(error) or type(error).__name__}") from error
     try:

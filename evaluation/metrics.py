@@ -232,6 +232,28 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
         yield Measure("score", "", "all", score(cost[name], paper, cost[reference_name], bootstrap), "1")
 
 
+def flight_records(dataset: xarray.Dataset) -> list[Record]:
+    """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
+
+    Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
+
+    Args:
+        dataset: from an evaluation of a set of flights.
+    """
+    records = []
+    for flight in sorted(set(dataset["flight"].values.tolist())):
+        part = dataset.isel(episode=numpy.flatnonzero(dataset["flight"].values == flight))
+        part = part.isel(time=slice(int(part["length"].max())))
+        windows = {name: (first, part.sizes["time"]) for name, (first, _) in part.attrs["windows"].items()}
+        part = part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}", windows=windows)
+        records += [r for r in tidy_records(part) if r.metric in PER_FLIGHT]
+    return records
+
+
+PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
+"""Metrics that are told of every flight."""
+
+
 def tidy_records(
     dataset: xarray.Dataset, metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None = None
 ) -> list[Record]:

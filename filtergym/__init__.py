@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from .baselines.catalogue import add_baselines
 from .baselines.table import Baselines
 from .envs.catalogue import register
+from .envs.flights import Flights, read_flights
 from .envs.registration import add_task
 from .envs.task import Task
 from .envs.trajectory import Trajectory
@@ -19,10 +20,12 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Flights",
     "FunctionPolicy",
     "Trajectory",
     "evaluate",
     "make_policy",
+    "read_flights",
     "register",
     "register_task",
     "tidy_records",

@@ -7,14 +7,15 @@ import typer
 
 from ..baselines.catalogue import baselines_of
 from ..envs.catalogue import catalogue, check_names, make_task, short_name, task_class
+from ..envs.flights import names_flights, read_flights
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import whole_files, writable_file, writable_folder
-from ..evaluation.metrics import Record
+from ..evaluation.metrics import Record, flight_records
 from ..names import competitor, evaluate, tidy_records
 from ..reports.benchmark import Cell, run_benchmark
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
-from ..reports.tables import results_table
+from ..reports.tables import flights_table, results_table
 from .terminal import (
     Backend,
     Environment,
@@ -25,6 +26,7 @@ from .terminal import (
     Threads,
     Trust,
     console,
+    pair,
     parsed_settings,
     progress_bar,
 )
@@ -69,12 +71,34 @@ def evaluate_policies(
     trust: Trust = False,
     backend: Backend = "auto",
     threads: Threads = 1,
+    site: Annotated[
+        str | None,
+        typer.Option(help="Of flights in latitude and longitude: those of the radar, degrees, such as 48.72,2.38."),
+    ] = None,
+    longest_gap: Annotated[float, typer.Option(help="Of flights: longest gap that is not cut, s.")] = 60.0,
+    speeds: Annotated[
+        str, typer.Option(help="Of flights: speeds that are possible, m/s, from the lowest to the highest.")
+    ] = "1,1000",
+    fewest_scans: Annotated[
+        int, typer.Option(help="Of flights: shorter pieces are dropped, in measurements.")
+    ] = 10,
 ) -> None:
     """Run policies over the same noise and compare them.
 
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     cls = task_class(environment)
+    scenario: Any = scenario
+    if scenario not in cls.scenarios and names_flights(scenario):
+        scenario = read_flights(
+            scenario,
+            None if site is None else pair("--site", site),
+            longest_gap=longest_gap,
+            speeds=pair("--speeds", speeds),
+            fewest_scans=fewest_scans,
+        )
+    elif site is not None:
+        raise ValueError(f"--site is for flights from files, and scenario {scenario!r} is none")
     known = baselines_of(cls.id)
     if out is not None:
         writable_folder(out)
@@ -101,14 +125,19 @@ def evaluate_policies(
             **keywords,
         )
     records = tidy_records(dataset)
+    of_flights = flight_records(dataset) if "flight" in dataset.coords else []
     if json is not None:
-        write_records(json, records)
+        write_records(json, [*records, *of_flights])
     if out is not None:
         with whole_files(out) as waiting:
-            write_records(waiting / "records.json", records)
+            write_records(waiting / "records.json", [*records, *of_flights])
             for name, figure in evaluation_figures(dataset):
                 save(figure, waiting / f"{name}.png")
+    if of_flights:
+        console.print(flights_table(dataset, of_flights, records))
     console.print(results_table(records))
+    for note in dataset.attrs["notes"]:
+        console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
         console.print(f"figures and records in {out}")
 

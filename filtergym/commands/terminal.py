@@ -16,7 +16,13 @@ Environment = Annotated[
         help="Environment id; `filtergym list` shows them. module:id for one that a module registers."
     ),
 ]
-ScenarioName = Annotated[str | None, typer.Option(help="Scenario; default: the training distribution.")]
+ScenarioName = Annotated[
+    str | None,
+    typer.Option(
+        help="Scenario; or flights of your own: a file (CSV, NetCDF, Parquet), a folder, or a pattern in quotes; default: "
+        "the training distribution."
+    ),
+]
 TrainingScenario = Annotated[str | None, typer.Option(help="A training scenario; held-out ones are refused.")]
 Episodes = Annotated[int, typer.Option(help="Monte Carlo runs.")]
 Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
@@ -94,6 +100,15 @@ def progress_bar() -> Progress:
         transient=True,
         disable=errors.quiet,
     )
+
+
+def pair(option: str, text: str) -> tuple[float, float]:
+    """Turn ``48.72,2.38`` into two numbers."""
+    try:
+        first, second = map(float, text.split(","))
+    except ValueError:
+        raise ValueError(f"{option} needs two numbers with a comma between them, got {text!r}") from None
+    return first, second
 
 
 def parsed_settings(settings: list[str]) -> dict[str, Any]:

@@ -140,6 +140,58 @@ def results_table(records: Sequence[Any]) -> Table:
     return table
 
 
+SHOWN_OF_FLIGHTS = 8
+"""Competitors in a table flight by flight: what fits beside each other."""
+
+
+def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any]) -> Table:
+    """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
+
+    Args:
+        dataset: from an evaluation of a set of flights.
+        records: of every flight.
+        over_all: records of all of them together, which rank the competitors.
+    """
+    found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
+    names = [name for name, kind, _ in ranked(over_all) if kind in RANKED]
+    shown, paper = main_components(over_all), dataset.attrs["paper"]
+    base = paper if paper in names else [*names, *dataset["policy"].values.tolist()][0]
+    others = [name for name in names if name != paper][:SHOWN_OF_FLIGHTS]
+    units = {r.component: r.unit for r in over_all if r.metric == "rmse"}
+    flights, lengths = dataset["flight"].values, dataset["length"].values
+    table = Table(title=f"{len(set(flights.tolist()))} flights", title_justify="left")
+    table.add_column("flight", no_wrap=True)
+    table.add_column("episodes", justify="right")
+    table.add_column("measurements", justify="right")
+    for component in shown:
+        table.add_column(f"RMSE {component.replace('_', ' ')} of {base}, {units[component]}", justify="right")
+    metric = "relative_cost_difference" if base == paper else "cost"
+    for name in others:
+        table.add_column(f"{name}, %" if base == paper else f"cost of {name}", justify="right")
+    for scenario in dict.fromkeys(r.scenario for r in records):
+        flight = scenario.removeprefix(f"{dataset.attrs['scenario']}: ")
+        mine = flights == flight
+        row = [flight, f"{mine.sum()}", f"{lengths[mine].sum():,}"]
+        for name, what, component in [*((base, "rmse", c) for c in shown), *((o, metric, "") for o in others)]:
+            record = found.get((scenario, name, what, component))
+            if record is None or record.value is None:
+                row.append("-")
+            elif what == "relative_cost_difference":
+                row.append(f"{100.0 * record.value:+.1f}")
+            else:
+                row.append(f"{record.value:.3g}")
+        table.add_row(*row)
+    notes = [f"%: cost against {base}."] if base == paper and others else []
+    if len(others) == SHOWN_OF_FLIGHTS:
+        notes.append(f"The {SHOWN_OF_FLIGHTS} best are shown; all stand in the records.")
+    notes.append(
+        "Intervals of the table over all flights resample whole flights; of fewer than ten they are too narrow."
+    )
+    table.caption = " ".join(notes)
+    table.caption_justify = "left"
+    return table
+
+
 def claims_table(result: Reproduction) -> Table:
     """Return the claims of a paper with what was measured and the verdicts."""
     table = Table("claim", "what was measured", "verdict", title=result.title, show_lines=True)
