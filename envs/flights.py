@@ -91,7 +91,9 @@ class Flights:
     def __post_init__(self) -> None:
         check("fewest_scans", self.fewest_scans, int, Limits(at_least=2))
         if not all(isinstance(flight, Trajectory) for flight in self.trajectories):
-            raise ValueError("trajectories of Flights are a sequence of Trajectory; filtergym.read_flights reads files")
+            raise ValueError(
+                "trajectories of Flights are a sequence of Trajectory; filtergym.read_flights reads files"
+            )
         if not self.trajectories:
             raise ValueError("a set of flights needs at least one trajectory")
         object.__setattr__(self, "trajectories", tuple(_told_apart(self.trajectories)))
@@ -184,8 +186,12 @@ def flights_from(fields: Mapping[str, Any]) -> Flights:
         )
     given = fields["trajectories"]
     if not isinstance(given, list | tuple) or not all(isinstance(item, Mapping) for item in given):
-        raise ValueError(f"trajectories of flights as a dictionary are a list of dictionaries, got {given!r:.80}")
-    return Flights(tuple(map(trajectory_of, given)), **{n: v for n, v in fields.items() if n != "trajectories"})
+        raise ValueError(
+            f"trajectories of flights as a dictionary are a list of dictionaries, got {given!r:.80}"
+        )
+    return Flights(
+        tuple(map(trajectory_of, given)), **{n: v for n, v in fields.items() if n != "trajectories"}
+    )
 
 
 # --- which files
@@ -213,10 +219,14 @@ def _files(source: str | Path) -> list[Path]:
     if _is_folder(path):
         found = sorted(file for file in path.iterdir() if file.suffix in FLIGHT_SUFFIXES)
         if not found:
-            raise ValueError(f"folder {path} holds no flights: files that end in {', '.join(FLIGHT_SUFFIXES)}")
+            raise ValueError(
+                f"folder {path} holds no flights: files that end in {', '.join(FLIGHT_SUFFIXES)}"
+            )
         return found
     if glob.has_magic(str(source)) and not path.exists():
-        found = sorted(Path(file) for file in glob.glob(str(source), recursive=True) if not _is_folder(Path(file)))
+        found = sorted(
+            Path(file) for file in glob.glob(str(source), recursive=True) if not _is_folder(Path(file))
+        )
         if not found:
             raise ValueError(f"no file matches {str(source)!r}")
         return found
@@ -377,6 +387,8 @@ def _netcdf(file: Path) -> dict[str, Any]:
     # From memory: a mapped file stays open where its reading fails.
     content = file.read_bytes()
     engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
+    if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
+        raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
     with xarray.open_dataset(io.BytesIO(content), engine=engine) as data:
         table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
         for name in table:
@@ -501,9 +513,13 @@ def _flights_of(
         if array.shape != time.shape:
             raise ValueError(f"{name} must have shape {time.shape} as time has, got {array.shape}")
         if numpy.isinf(array).any():
-            raise ValueError(f"{name} has a value that is not finite in row {int(numpy.isinf(array).argmax())}")
+            raise ValueError(
+                f"{name} has a value that is not finite in row {int(numpy.isinf(array).argmax())}"
+            )
     if not numpy.isfinite(time).all():
-        raise ValueError(f"time has a value that is not finite in row {int((~numpy.isfinite(time)).argmax())}")
+        raise ValueError(
+            f"time has a value that is not finite in row {int((~numpy.isfinite(time)).argmax())}"
+        )
     if not plane:
         values = _around(limits.site, values)
     groups = _groups(columns.get("flight"), len(time))
@@ -527,7 +543,9 @@ def _flights_of(
     if not good:
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
     said = [
-        f"{_counted(count, *words)}{tail(limits)}" for (words, tail), count in zip(_COUNTED.values(), counts.values(), strict=True) if count
+        f"{_counted(count, *words)}{tail(limits)}"
+        for (words, tail), count in zip(_COUNTED.values(), counts.values(), strict=True)
+        if count
     ]
     if len(groups) > 1 and said:
         said = [f"{len(groups) - len(bad)} flights", *said]
@@ -549,7 +567,9 @@ def _groups(flight: Any, rows: int) -> dict[str, Any]:
     """Rows of every flight of a file, by its name; one without a name where the file names none."""
     if flight is None:
         return {"": slice(None)}
-    names = numpy.array([str(value).strip() if value is not None else "" for value in numpy.asarray(flight).tolist()])
+    names = numpy.array(
+        [str(value).strip() if value is not None else "" for value in numpy.asarray(flight).tolist()]
+    )
     different, which = numpy.unique(names, return_inverse=True)
     if len(different) == 1:
         return {"": slice(None)}
@@ -558,7 +578,9 @@ def _groups(flight: Any, rows: int) -> dict[str, Any]:
     return dict(zip(different.tolist(), numpy.split(order, ends), strict=True))
 
 
-def _around(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]) -> dict[str, numpy.ndarray]:
+def _around(
+    site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]
+) -> dict[str, numpy.ndarray]:
     """Metres east and north of a site.
 
     Raises:
@@ -568,7 +590,9 @@ def _around(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray
     for name, array, most in (("latitude", latitude, 90.0), ("longitude", longitude, 360.0)):
         if (numpy.abs(array) > most).any():
             largest = float(numpy.nanmax(numpy.abs(array)))
-            raise ValueError(f"{name} reaches {largest:g}, and degrees are expected: are they metres, or radians?")
+            raise ValueError(
+                f"{name} reaches {largest:g}, and degrees are expected: are they metres, or radians?"
+            )
     if site is None:
         raise ValueError(
             "it has latitude and longitude: give the radar's, --site LATITUDE,LONGITUDE, or in Python "
@@ -579,7 +603,9 @@ def _around(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray
     if not known.all():
         # What lacks is a few rows, and a kilometre of height moves a target by 0.016 % of its range.
         rows = numpy.arange(len(altitude))
-        altitude = numpy.interp(rows, rows[known], altitude[known]) if known.any() else numpy.zeros_like(latitude)
+        altitude = (
+            numpy.interp(rows, rows[known], altitude[known]) if known.any() else numpy.zeros_like(latitude)
+        )
     return dict(zip("xy", east_north(numpy.stack([latitude, longitude]), altitude, site), strict=True))
 
 
@@ -683,7 +709,11 @@ def _check_units(
     if speed > highest:
         factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
         unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
-        cause = f"are the times {unit}?" if unit else "are x, y metres and the times seconds? else allow higher speeds"
+        cause = (
+            f"are the times {unit}?"
+            if unit
+            else "are x, y metres and the times seconds? else allow higher speeds"
+        )
         raise ValueError(f"median speed {speed:.4g} m/s: {cause}")
     if step > limits.longest_gap:
         raise ValueError(

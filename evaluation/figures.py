@@ -167,7 +167,9 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
                 numpy.sqrt(squared_errors(dataset.sel(policy=name), component, dataset.attrs["groups"])),
                 axis=None,
             )
-            error = error[: numpy.isfinite(error).sum()]  # what is missing, beyond the end of a flight, is sorted last
+            error = error[
+                : numpy.isfinite(error).sum()
+            ]  # what is missing, beyond the end of a flight, is sorted last
             # A few hundred quantiles draw the same curve as a million points.
             index = numpy.unique(numpy.geomspace(1, len(error), 400).astype(int))
             axis.plot(error[len(error) - index], index / len(error), label=name, **style)

@@ -54,8 +54,8 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
     """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
-        return run["mean_square"].sel(component=parts).sum("component").values
-    return (run["error"].sel(component=parts) ** 2).sum("component").values
+        return run["mean_square"].sel(component=parts).sum("component", skipna=False).values
+    return (run["error"].sel(component=parts) ** 2).sum("component", skipna=False).values
 
 
 def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
@@ -101,7 +101,10 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
     present = ~numpy.isnan(values)
     nothing = numpy.full(len(values), math.nan)
     return numpy.divide(
-        numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1), out=nothing, where=present.any(axis=1)
+        numpy.where(present, values, 0.0).sum(axis=1),
+        present.sum(axis=1),
+        out=nothing,
+        where=present.any(axis=1),
     )
 
 

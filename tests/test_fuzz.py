@@ -97,7 +97,7 @@ def broken_json(path, rng):
 
 
 def flight(path):
-    time = np.arange(0.0, 60.0, 2.0)
+    time = np.arange(0.0, 120.0, 2.0)
     columns = {"time": time, "x": 2e4 + 100.0 * time, "y": 1e4 - 50.0 * time}
     if path.suffix == ".csv":
         rows = np.column_stack(list(columns.values()))

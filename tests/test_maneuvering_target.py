@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.trajectory import Trajectory, read_trajectory
+from filtergym.envs.trajectory import Trajectory
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from scipy.stats import multivariate_normal
@@ -687,13 +687,6 @@ def test_resampled_trajectory_runs_through_positions_and_velocities():
 def test_bad_trajectories(time, position, velocity, message):
     with pytest.raises(ValueError, match=message):
         Trajectory(time, position, velocity)
-
-
-def test_a_column_that_comes_twice_is_refused(tmp_path):
-    file = tmp_path / "twice.csv"
-    file.write_text("time,x,x,y\n0,1,2,3\n6,2,3,4\n")
-    with pytest.raises(ValueError, match="it has the column x more than once"):
-        read_trajectory(file)
 
 
 @pytest.mark.parametrize(

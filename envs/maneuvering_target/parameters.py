@@ -95,7 +95,9 @@ class ManeuveringTargetParameters(TaskParameters):
         if self.flight == "legs" and not self.legs:
             raise ValueError('flight "legs" needs at least one leg (duration in s, turn rate in deg/s)')
         if any(scans > self.horizon for scans in self.track_scans):
-            raise ValueError(f"track_scans must not exceed the horizon {self.horizon}, got {self.track_scans!r}")
+            raise ValueError(
+                f"track_scans must not exceed the horizon {self.horizon}, got {self.track_scans!r}"
+            )
         if any(scans % self.decision_interval for scans in self.track_scans):
             raise ValueError(
                 f"track_scans must be multiples of decision_interval {self.decision_interval}, got {self.track_scans!r}"

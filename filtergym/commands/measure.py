@@ -73,7 +73,9 @@ def evaluate_policies(
     threads: Threads = 1,
     site: Annotated[
         str | None,
-        typer.Option(help="Of flights in latitude and longitude: those of the radar, degrees, such as 48.72,2.38."),
+        typer.Option(
+            help="Of flights in latitude and longitude: those of the radar, degrees, such as 48.72,2.38."
+        ),
     ] = None,
     longest_gap: Annotated[float, typer.Option(help="Of flights: longest gap that is not cut, s.")] = 60.0,
     speeds: Annotated[

@@ -172,7 +172,10 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
         flight = scenario.removeprefix(f"{dataset.attrs['scenario']}: ")
         mine = flights == flight
         row = [flight, f"{mine.sum()}", f"{lengths[mine].sum():,}"]
-        for name, what, component in [*((base, "rmse", c) for c in shown), *((o, metric, "") for o in others)]:
+        for name, what, component in [
+            *((base, "rmse", c) for c in shown),
+            *((o, metric, "") for o in others),
+        ]:
             record = found.get((scenario, name, what, component))
             if record is None or record.value is None:
                 row.append("-")

@@ -1,0 +1,551 @@
+"""Sets of recorded flights: reading, cleaning, what is refused, episodes, and intervals over flights."""
+
+import datetime
+import json
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pymap3d
+import pytest
+import xarray
+from filtergym.__main__ import main
+from filtergym.envs import flights as module
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.flights import east_north, read_flights
+from filtergym.evaluation.bootstrap import Bootstrap
+from filtergym.evaluation.metrics import flight_records
+from gymnasium.vector import AutoresetMode
+
+from filtergym import Flights, Trajectory, evaluate, make_policy, tidy_records
+
+ID = "filtergym/ManeuveringTarget-v0"
+FIVE = np.arange(0.0, 200.0, 5.0)
+"""Times of a flight, s."""
+
+
+def weave(time, start=(2e4, 1e4), speed=120.0):
+    """Position, m, ``(n, 2)``."""
+    return np.stack([start[0] + speed * time, start[1] + 500.0 * np.sin(time / 40.0)], axis=1)
+
+
+def table(file, **columns):
+    """Write a CSV file."""
+    rows = zip(*columns.values(), strict=True)
+    file.write_text("\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return file
+
+
+def flight_file(file, time=FIVE, **of_weave):
+    x, y = weave(time, **of_weave).T
+    return table(file, time=time, x=x, y=y)
+
+
+def three():
+    """Flights of 33, 16 and 24 scans of 6 s."""
+    return [
+        Trajectory(time, weave(time, (2e4, 1e4 * i)), name=f"flight {i}")
+        for i, time in enumerate((FIVE, FIVE[:21], FIVE[:30]))
+    ]
+
+
+# --- around the site
+
+
+def test_local_tangent_plane_is_that_of_a_geodesy_library():
+    rng = np.random.default_rng(0)
+    site = (48.72, 2.38)
+    degrees = np.array(site)[:, None] + rng.uniform(-4.0, 4.0, (2, 50))
+    altitude = rng.uniform(-100.0, 12e3, 50)
+    east, north, _ = pymap3d.geodetic2enu(*degrees, altitude, *site, 0.0)
+    # A nanometre on 450 km: what double precision leaves of coordinates of 6400 km.
+    np.testing.assert_allclose(east_north(degrees, altitude, site), [east, north], rtol=0, atol=1e-8)
+
+
+def test_local_tangent_plane_by_hand():
+    # On the equator east is the sine of the longitude times the semi-major axis, and height adds to it.
+    angle = np.radians(1.0)
+    found = east_north(np.array([[0.0], [1.0]]), np.array([1000.0]), (0.0, 0.0))
+    np.testing.assert_allclose(
+        found[:, 0], [(6378137.0 + 1000.0) * np.sin(angle), 0.0], rtol=1e-12, atol=1e-8
+    )
+
+
+# --- reading
+
+
+def test_every_form_of_time_and_file_is_the_same_flight(tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    start = datetime.datetime(2026, 5, 1, 12, tzinfo=datetime.UTC)
+    dates = [start + datetime.timedelta(seconds=s) for s in FIVE]
+    x, y = weave(FIVE).T
+    nanoseconds = np.array([d.replace(tzinfo=None) for d in dates], dtype="datetime64[ns]")
+    table(tmp_path / "iso.csv", time=[d.isoformat() for d in dates], x=x, y=y)
+    table(tmp_path / "zulu.csv", Timestamp=[f"{d:%Y-%m-%dT%H:%M:%SZ}" for d in dates], X=x, Y=y)
+    for unit in ("ns", "us", "ms", "s"):
+        columns = {"time": nanoseconds.astype(f"datetime64[{unit}]"), "x": x, "y": y}
+        parquet.write_table(pyarrow.table(columns), tmp_path / f"{unit}.parquet")
+    stamped = pyarrow.array(nanoseconds, pyarrow.timestamp("ns", tz="Europe/Paris"))
+    parquet.write_table(pyarrow.table({"time": stamped, "x": x, "y": y}), tmp_path / "zone.parquet")
+    data = {"x": ("time", x, {"units": "m"}), "y": ("time", y)}
+    xarray.Dataset(data, {"time": nanoseconds}).to_netcdf(tmp_path / "dates.nc", engine="scipy")
+    xarray.Dataset(data, {"time": FIVE}).to_netcdf(tmp_path / "seconds.nc", engine="scipy")
+    found = read_flights(tmp_path)
+    assert len(found.trajectories) == 9
+    for trajectory in found.trajectories:
+        np.testing.assert_allclose(trajectory.time - trajectory.time[0], FIVE, rtol=0, atol=1e-9)
+        np.testing.assert_array_equal(trajectory.position, weave(FIVE))
+
+
+def geodetic(site=(48.0, 2.0)):
+    """Latitude and longitude of a flight to the north, by the library; its position, m."""
+    position = weave(FIVE)
+    latitude, longitude, height = pymap3d.enu2geodetic(*position.T, np.full(len(FIVE), 3000.0), *site, 0.0)
+    return position, latitude, longitude, height
+
+
+def test_columns_of_opensky_and_traffic(tmp_path):
+    position, latitude, longitude, height = geodetic()
+    time = 1.7e9 + FIVE
+    ones = np.ones(len(FIVE))
+    table(
+        tmp_path / "opensky.csv", time=time, icao24=["3c6444"] * len(FIVE), lat=latitude, lon=longitude,
+        velocity=120.0 * ones, callsign=["DLH1  "] * len(FIVE), onground=["False"] * len(FIVE), baroaltitude=0.0 * ones,
+        geoaltitude=height,
+    )  # fmt: skip
+    stamps = [f"{datetime.datetime.fromtimestamp(t, datetime.UTC)}" for t in time]
+    table(
+        tmp_path / "traffic.csv", timestamp=stamps, latitude=latitude, longitude=longitude, altitude=height / 0.3048,
+        groundspeed=240.0 * ones,
+    )  # fmt: skip
+    for name in ("opensky", "traffic"):
+        (found,) = read_flights(tmp_path / f"{name}.csv", site=(48.0, 2.0)).trajectories
+        np.testing.assert_allclose(found.position, position, rtol=0, atol=1e-6)
+        assert found.name == name
+
+
+def test_flights_of_one_file_are_told_apart_and_stale_positions_go(tmp_path):
+    _, latitude, longitude, _ = geodetic()
+    latitude[7], longitude[7] = latitude[6], longitude[6]
+    latitude[9] = np.nan
+    aircraft = ["a", "b"] * (len(FIVE) // 2)
+    file = table(tmp_path / "two.csv", time=FIVE, latitude=latitude, longitude=longitude, icao24=aircraft)
+    found = read_flights(file, site=(48.0, 2.0))
+    assert [t.name for t in found.trajectories] == ["two:a", "two:b"]
+    np.testing.assert_array_equal(found.trajectories[0].time, FIVE[::2])
+    assert found.sources[0].said == ("2 flights", "1 row without position")
+    alone = table(tmp_path / "one.csv", time=FIVE, latitude=latitude, longitude=longitude)
+    found = read_flights(alone, site=(48.0, 2.0))
+    assert found.sources[0].said == ("1 row without position", "1 repeated position")
+    np.testing.assert_array_equal(found.trajectories[0].time, np.delete(FIVE, [7, 9]))
+
+
+def test_what_lies_beyond_the_reach_is_taken_out(tmp_path):
+    _, latitude, longitude, _ = geodetic()
+    latitude[30:] += 6.0  # degrees: 670 km
+    file = table(tmp_path / "far.csv", time=FIVE, latitude=latitude, longitude=longitude)
+    found = read_flights(file, site=(48.0, 2.0))
+    assert found.sources[0].said == ("10 rows beyond 500 km",)
+    assert len(found.trajectories[0].time) == 30
+
+
+# --- cutting
+
+
+def test_gaps_jumps_and_outliers_by_hand(tmp_path):
+    time = np.concatenate([np.arange(0.0, 100.0, 5.0), [300.0, 305.0, 400.0], np.arange(470.0, 570.0, 5.0)])
+    position = weave(time)
+    position[4] += 8e4  # there and back: one position
+    position[30:] += 5e4  # there to stay: a jump
+    file = table(tmp_path / "ory_07.csv", time=time, x=position[:, 0], y=position[:, 1])
+    found = read_flights(file)
+    assert found.sources[0].said == ("1 outlier over 1000 m/s", "3 gaps over 60 s", "1 jump over 1000 m/s")
+    times = [t.time for t in found.trajectories]
+    # 400 s stands alone: no piece.
+    kept = [np.delete(time[:20], 4), time[20:22], time[23:30], time[30:]]
+    for own, expected in zip(times, kept, strict=True):
+        np.testing.assert_array_equal(own, expected)
+    assert [t.name for t in found.trajectories] == [f"ory_07 {i}/4" for i in (1, 2, 3, 4)]
+    assert {t.flight for t in found.trajectories} == {"ory_07"}
+
+
+def test_the_line_about_a_file(tmp_path):
+    time = np.concatenate(
+        [np.arange(0.0, 100.0, 5.0), np.arange(200.0, 230.0, 5.0), np.arange(400.0, 500.0, 5.0)]
+    )
+    flight_file(tmp_path / "ory_07.csv", time)
+    flight_file(tmp_path / "plain.csv")
+    used, lines = read_flights(tmp_path).flyable(6.0, 5e5)
+    assert lines == ["ory_07.csv: 2 gaps over 60 s, 3 pieces, 1 dropped (shorter than 10 scans of 6 s)"]
+    assert [t.name for t in used] == ["ory_07 1/3", "ory_07 3/3", "plain"]
+    assert read_flights(tmp_path, longest_gap=180.0).flyable(6.0, 5e5)[1] == []
+
+
+# --- twenty wrong files, one sentence each
+
+ONE = {"time": FIVE, "x": weave(FIVE)[:, 0], "y": weave(FIVE)[:, 1]}
+DEGREES = {"time": FIVE, "latitude": 48.0 + FIVE * 1e-3, "longitude": 2.0 + 0.0 * FIVE}
+V = np.gradient(weave(FIVE), FIVE, axis=0).T
+WRONG = {
+    "kilometres": (
+        ONE | {"x": ONE["x"] / 1e3, "y": ONE["y"] / 1e3},
+        "median speed 0.12 m/s: are x, y kilometres",
+    ),
+    "degrees as metres": (
+        {"time": FIVE, "x": DEGREES["longitude"], "y": DEGREES["latitude"]},
+        "are x, y degrees. then call them longitude and latitude",
+    ),
+    "milliseconds": (ONE | {"time": 1e3 * FIVE}, "are the times milliseconds"),
+    "minutes": (ONE | {"time": FIVE / 60.0}, "median speed 7218 m/s: are the times minutes"),
+    "hours": (ONE | {"time": FIVE / 3600.0}, "are the times hours"),
+    "knots": (ONE | {"vx": 1.944 * V[0], "vy": 1.944 * V[1]}, "vx, vy are 1.94 times .* are they knots"),
+    "km/h": (ONE | {"vx": 3.6 * V[0], "vy": 3.6 * V[1]}, "are they km/h"),
+    "standing": (
+        ONE | {"x": 0.0 * FIVE + 9e3, "y": 0.0 * FIVE + 9e3},
+        "median speed 0 m/s: does it move at all",
+    ),
+    "decreasing": (ONE | {"time": FIVE[::-1]}, "times must increase, but row 1 has 190 s after 195 s"),
+    "duplicate": (
+        ONE | {"time": np.repeat(FIVE[::2], 2)},
+        "times must increase, but row 1 has 0 s after 0 s",
+    ),
+    "all empty": (ONE | {"x": [""] * len(FIVE)}, "at least two positions, got 0"),
+    "infinite": (ONE | {"x": [*ONE["x"][:-1], "inf"]}, "x has a value that is not finite in row 39"),
+    "no time": (ONE | {"time": ["", *FIVE[1:]]}, "time has a value that is not finite in row 0"),
+    "words": (
+        ONE | {"y": [*ONE["y"][:3], "lost", *ONE["y"][4:]]},
+        "y has 'lost' in row 3, which is no number",
+    ),
+    "strange dates": (
+        ONE | {"time": ["1 May", *FIVE[1:]]},
+        "time has '1 May' in row 0, .* neither seconds nor a date",
+    ),
+    "one row": ({n: v[:1] for n, v in ONE.items()}, "at least two positions, got 1"),
+    "other columns": (
+        {"time": FIVE, "speed": FIVE},
+        "lacks the column x, y; it has time, speed and needs time, x, y",
+    ),
+    "no longitude": ({"time": FIVE, "lat": FIVE}, "lacks the column longitude"),
+    "no site": (DEGREES, "give the radar's, --site LATITUDE,LONGITUDE"),
+    "metres as degrees": (
+        DEGREES | {"latitude": 1e3 * FIVE},
+        "latitude reaches 195000, and degrees are expected",
+    ),
+    "sparse": (ONE | {"time": 20.0 * FIVE}, "positions are 100 s apart, longer than the longest gap of 60 s"),
+    "too fast for any unit": (ONE | {"x": 1e9 * FIVE}, "median speed 1e.09 m/s: .* allow higher speeds"),
+    "short": ({n: v[:10] for n, v in ONE.items()}, "1 piece, 1 dropped .shorter than 10 scans of 6 s."),
+    "far": (ONE | {"x": ONE["x"] + 9e5}, "goes 943 km from the radar, whose range ends at 500 km"),
+}
+
+
+@pytest.mark.parametrize("columns, message", WRONG.values(), ids=WRONG)
+def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
+    file = table(tmp_path / "wrong.csv", **columns)
+    with pytest.raises(ValueError, match=message) as told:
+        make_task(ID, scenario=file)
+    assert "wrong.csv" in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("binary.csv", bytes(range(256)), "it is no text in UTF-8"),
+        ("binary.nc", bytes(range(256)), "cannot read trajectory .*binary.nc"),
+        ("binary.parquet", bytes(range(256)), "cannot read trajectory .*binary.parquet"),
+        ("empty.csv", b"", "lacks the column time, x, y"),
+        ("twice.csv", b"time,x,x,y\n0,1,2,3\n6,2,3,4\n", "it has the column x more than once"),
+        ("ragged.csv", b"time,x,y\n0,1,2\n6,2\n", "3 column names but 2 columns in row 1"),
+        ("comma.csv", b"time,x,y\n0,5,1,5,2,5\n", "3 column names but 6 columns in row 0"),
+        ("words.txt", b"time,x,y\n", "files of flights end in .csv, .nc, .parquet"),
+    ],
+)
+def test_what_is_no_table_is_refused(name, content, message, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_flights(tmp_path / name)
+
+
+def test_a_unit_that_a_file_names_itself_is_believed(tmp_path):
+    x, y = weave(FIVE).T
+    data = xarray.Dataset({"x": ("time", x / 1e3, {"units": "km"}), "y": ("time", y)}, {"time": FIVE})
+    data.to_netcdf(tmp_path / "km.nc", engine="scipy")
+    with pytest.raises(ValueError, match="x is in 'km', and 'm' is expected"):
+        read_flights(tmp_path / "km.nc")
+
+
+def test_millions_of_rows_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    monkeypatch.setattr(module, "MOST_ROWS", 30)
+    flight_file(tmp_path / "a.csv")
+    parquet.write_table(pyarrow.table(ONE), tmp_path / "a.parquet")
+    data = {name: ("time", values) for name, values in ONE.items()}
+    xarray.Dataset(data).to_netcdf(tmp_path / "a.nc", engine="scipy")
+    for suffix in module.FLIGHT_SUFFIXES:
+        with pytest.raises(ValueError, match="it has more than 30 rows"):
+            read_flights(tmp_path / f"a{suffix}")
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"longest_gap": 0.0}, "longest_gap must be a finite number above 0"),
+        ({"speeds": (5.0, 1.0)}, "speeds must be in ascending order"),
+        ({"fewest_scans": 1}, "fewest_scans must be an integer of at least 2"),
+        ({"site": (100.0, 0.0)}, "site is a latitude and a longitude in degrees"),
+        ({"site": 48.0}, "site must be 2 numbers"),
+    ],
+)
+def test_wrong_limits_are_refused(keywords, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read_flights(flight_file(tmp_path / "a.csv"), **keywords)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("nothing/*.csv", "no file matches 'nothing/"),
+        (["paper"], "cannot read trajectory paper: .*No such file"),
+        ([3], "a set of flights holds files and trajectories, got 3"),
+        ([{"time": [0, 1]}], "a trajectory as a dictionary has time"),
+        ({"trajectories": "mine"}, "are a list of dictionaries, got 'mine'"),
+        ({"trajectories": [], "site": 1}, "optionally name and fewest_scans, got 'trajectories', 'site'"),
+        ({"trajectories": []}, "at least one trajectory"),
+    ],
+)
+def test_what_is_no_set_is_refused(source, message):
+    with pytest.raises(ValueError, match=message):
+        make_task(ID, scenario=source)
+
+
+def test_environments_without_flights_say_so(tmp_path):
+    flight_file(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match="RadarEsmTracking-v0 does not take flights as scenario"):
+        make_task("RadarEsmTracking", scenario=tmp_path)
+
+
+def test_broken_files_are_left_out_and_named_and_a_set_of_them_is_refused(tmp_path):
+    (tmp_path / "binary.csv").write_bytes(bytes(range(256)))
+    flight_file(tmp_path / "minutes.csv", FIVE / 60.0, speed=7200.0)
+    with pytest.raises(
+        ValueError, match=r"nothing of .* can be flown: binary.csv: it is no text.*; minutes.csv: median"
+    ):
+        read_flights(tmp_path)
+    flight_file(tmp_path / "whole.csv")
+    used, lines = read_flights(str(tmp_path / "*.csv")).flyable(6.0, 5e5)
+    assert [t.name for t in used] == ["whole"]
+    assert lines == [
+        "binary.csv: left out: it is no text in UTF-8",
+        "minutes.csv: left out: median speed 7200 m/s: are the times minutes?",
+    ]
+
+
+# --- episodes
+
+
+def test_the_table_of_flights_is_every_flight_on_its_own():
+    task = make_task(ID, scenario=three())
+    alone = [make_task(ID, scenario=flight) for flight in three()]
+    assert task.flights == tuple(one.horizon for one in alone) == (32, 16, 24)
+    assert task.horizon == 32
+    drawn = np.array([[0.0, 0.34, 0.67, 0.999, 0.33, 0.66, 0.5, 0.1]])
+    np.testing.assert_array_equal(task.lengths(drawn), [32, 16, 24, 24, 32, 16, 16, 32])
+    nothing = np.zeros((4, 8))
+    episode = task.begin(drawn, nothing)
+    singles = [one.begin(np.empty((0, 8)), nothing) for one in alone]
+    for _ in range(16):
+        for lane, flight in enumerate(task.flight_of(drawn)):
+            np.testing.assert_array_equal(
+                task.world.state(episode.truth)[:, lane], task.world.state(singles[flight].truth)[:, 0]
+            )
+        noise = np.zeros((2, 8))
+        episode = task.measure(episode, noise)
+        singles = [one.measure(single, noise) for one, single in zip(alone, singles, strict=True)]
+    np.testing.assert_array_equal(task.context(episode)["flight"], [0, 1, 2, 2, 0, 1, 1, 0])
+
+
+@pytest.mark.parametrize("backend", ["compiled", "numpy"])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_vector_and_single_environments_agree_and_end_with_their_flight(backend, mode):
+    keywords = {"scenario": three(), "backend": backend, "control": "gain"}
+    vector = gym.make_vec(ID, num_envs=4, autoreset_mode=mode, **keywords)
+    singles = [gym.make(ID, **keywords) for _ in range(4)]
+    shown = vector.reset(seed=5)[0]
+    own = np.stack([env.reset(seed=5 + i)[0] for i, env in enumerate(singles)])
+    np.testing.assert_array_equal(shown, own)
+    waiting, taken, lengths = np.zeros(4, dtype=bool), np.zeros(4, dtype=int), set()
+    rng = np.random.default_rng(0)
+    for _ in range(80):
+        action = rng.uniform(-1.0, 1.0, (4, 1))
+        shown, _, _, truncated, _ = vector.step(action)
+        for i, env in enumerate(singles):
+            ended = False
+            if waiting[i]:
+                own[i], waiting[i], taken[i] = env.reset()[0], False, 0
+            else:
+                own[i], _, _, ended, _ = env.step(action[i])
+                taken[i] += 1
+            assert ended == truncated[i]
+            if ended:
+                lengths.add(int(taken[i]))
+                waiting[i] = mode is AutoresetMode.NEXT_STEP
+                if not waiting[i]:
+                    own[i], taken[i] = env.reset()[0], 0
+        np.testing.assert_array_equal(shown, own)
+    assert lengths == {32, 16, 24}
+
+
+def test_snapshots_and_shortened_episodes_know_the_flight():
+    env = gym.make_vec(ID, num_envs=6, scenario=three())
+    env.reset(seed=0)
+    lanes = env.unwrapped.lanes
+    kept, lengths = lanes.snapshot(), lanes._lengths.copy()
+    assert set(lengths.tolist()) == {32, 16, 24}
+    env.reset(seed=9)
+    lanes.restore(kept)
+    np.testing.assert_array_equal(lanes._lengths, lengths)
+    env.reset(seed=0, options={"shortened_by": np.full(6, 31)})
+    np.testing.assert_array_equal(env.step(env.action_space.sample())[3], True)
+
+
+def test_an_evaluation_flies_every_flight_as_often_and_what_environments_fly():
+    dataset = evaluate(ID, ["imm", "adaptive", "known-turn", "known-input-bound"], three(), episodes=7)
+    names, counts = np.unique(dataset["flight"].values, return_counts=True)
+    assert names.tolist() == ["flight 0", "flight 1", "flight 2"]
+    assert counts.tolist() == [3, 3, 3]
+    lengths = dict(zip(names.tolist(), (32, 16, 24), strict=True))
+    policy = make_policy(ID, "imm", scenario=three())
+    env = gym.make(ID, detailed_info=True, **policy.keywords)
+    for i in range(9):
+        last = lengths[str(dataset["flight"].values[i])]
+        assert dataset["length"].values[i] == last
+        cost = dataset["cost"].values[:3, i]
+        assert np.isfinite(cost[:, :last]).all()
+        assert np.isnan(cost[:, last:]).all()
+        observation, memory, own = env.reset(seed=int(dataset["episode_seed"].values[i]))[0], None, []
+        truncated = False
+        while not truncated:
+            action, memory = policy.predict(observation, memory, np.array([not own]), True)
+            observation, _, _, truncated, info = env.step(action)
+            own.append(info["cost"])
+        np.testing.assert_array_equal(own, cost[0, :last])
+
+
+def test_records_by_hand():
+    dataset = evaluate(ID, ["imm", "adaptive"], three(), episodes=6)
+    per_episode = np.nanmean(dataset["cost"].values, axis=-1)
+    found = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
+    assert found["imm", "cost", ""].value == pytest.approx(per_episode[0].mean(), rel=1e-12)
+    difference = per_episode[1].mean() / per_episode[0].mean() - 1.0
+    assert found["adaptive", "relative_cost_difference", ""].value == pytest.approx(difference, rel=1e-9)
+    squares = np.nansum(dataset["error"].values[0, ..., :2] ** 2, axis=-1)
+    there = ~np.isnan(dataset["error"].values[0, ..., 0])
+    peak = np.sqrt((squares.sum(axis=0) / there.sum(axis=0)).max())
+    assert found["imm", "peak_rmse", "position"].value == pytest.approx(peak, rel=1e-12)
+    assert all(r.low is not None and np.isfinite(r.low) for r in found.values() if r.metric != "score")
+    flown = {(r.scenario, r.policy, r.metric, r.component): r for r in flight_records(dataset)}
+    for flight in ("flight 0", "flight 1", "flight 2"):
+        mine = dataset["flight"].values == flight
+        record = flown[f"3 flights: {flight}", "imm", "cost", ""]
+        assert record.episodes == 2
+        assert record.value == pytest.approx(per_episode[0, mine].mean(), rel=1e-12)
+    assert dataset.attrs["scenario"] == "3 flights"
+
+
+def test_flights_of_the_same_name_are_not_pieces_of_one():
+    one, two, three_ = (Trajectory(FIVE, weave(FIVE, (2e4, 5e3 * i))) for i in range(3))
+    assert set(evaluate(ID, ["zero"], [one, two, three_], 3)["flight"].values) == {
+        f"trajectory {i}" for i in (1, 2, 3)
+    }
+
+
+def test_one_flight_of_a_file_is_the_trajectory_itself(tmp_path):
+    flight_file(tmp_path / "one.csv")
+    task = make_task(ID, scenario=tmp_path / "one.csv")
+    assert task.parameters == make_task(ID, scenario=Trajectory(FIVE, weave(FIVE))).parameters
+
+
+def test_a_horizon_ends_every_flight_and_decisions_that_hold_fit():
+    assert make_task(ID, scenario=three(), horizon=20).flights == (20, 16, 20)
+    assert make_task(ID, scenario=three(), horizon=50).flights == (32, 16, 24)
+    assert make_task(ID, scenario=three(), decision_interval=5, horizon=30).flights == (30, 15, 20)
+    assert make_task(ID, scenario=three(), sampling_interval=4.0).flights == (48, 25, 36)
+
+
+def test_too_many_scans_are_refused(monkeypatch):
+    monkeypatch.setattr("filtergym.envs.maneuvering_target.task.MOST_SCANS", 71)
+    with pytest.raises(ValueError, match="have 72 scans of 6 s together, more than 71: fly fewer"):
+        make_task(ID, scenario=three())
+
+
+def test_a_set_survives_json_and_a_reset_names_one(tmp_path):
+    given = Flights(tuple(three()), "mine", 12)
+    env = gym.make(ID, scenario=given)
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    assert env.spec.max_episode_steps == again.spec.max_episode_steps == 32
+    for seed in range(4):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], again.reset(seed=seed)[0])
+    other = gym.make(ID)
+    other.reset(seed=0)
+    np.testing.assert_array_equal(other.reset(seed=3, options={"scenario": given})[0], env.reset(seed=3)[0])
+
+
+# --- intervals
+
+
+def test_whole_clusters_are_resampled():
+    values = np.array([1.0, 4.0, -2.0, 7.0, 5.0])
+    plain = Bootstrap(5).estimate(values)
+    # Three episodes each that say the same are no more than one.
+    thrice = Bootstrap(15, clusters=np.repeat(list("abcde"), 3)).estimate(np.repeat(values, 3))
+    np.testing.assert_allclose(thrice, plain, rtol=1e-12)
+    unequal = Bootstrap(3, clusters=["a", "a", "b"])
+    # Both, a twice, or b twice: nothing else can be drawn.
+    found = {tuple(np.round(row, 12)) for row in unequal.weights}
+    assert found == {(round(1 / 3, 12),) * 3, (0.5, 0.5, 0.0), (0.0, 0.0, 1.0)}
+    one = Bootstrap(5, clusters=["a"] * 5).estimate(values)
+    assert one == plain
+
+
+def test_means_are_of_what_is_there_where_flights_end():
+    values = np.array([[1.0, 2.0], [3.0, np.nan]])
+    means = Bootstrap(2, clusters=["a", "b"]).means(values)
+    np.testing.assert_array_equal(means[0], [2.0, 2.0])
+    only_b = np.flatnonzero(means[1:, 0] == 3.0) + 1
+    assert np.isnan(means[only_b, 1]).all()
+    assert only_b.size > 100
+    # Elsewhere a value that is missing is an error that must be seen.
+    assert np.isnan(Bootstrap(2).means(values)[0, 1])
+
+
+# --- the command
+
+
+def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, capsys):
+    for i in range(18):
+        flight_file(tmp_path / f"ory_{i:02}.csv", FIVE[: 16 + i], start=(2e4, 1e3 * i))
+    (tmp_path / "ory_18.csv").write_bytes(bytes(range(256)))
+    flight_file(tmp_path / "ory_19.csv", FIVE / 60.0, speed=7200.0)
+    words = ["evaluate", ID, "--scenario", str(tmp_path / "*.csv"), "--policy", "imm", "--policy", "adaptive"]
+    monkeypatch.setattr(
+        sys, "argv", ["filtergym", *words, "--episodes", "36", "--json", str(tmp_path / "all.json")]
+    )
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 0
+    out = capsys.readouterr().out
+    assert "18 flights" in out
+    assert all(f"ory_{i:02} " in out for i in range(18))
+    assert "ory_18.csv: left out: it is no text in UTF-8\n" in out
+    assert "ory_19.csv: left out: median speed 7200 m/s: are the times minutes?\n" in out
+    records = json.loads((tmp_path / "all.json").read_text())
+    scenarios = {record["scenario"] for record in records}
+    assert len(scenarios) == 19
+
+
+def test_site_without_flights_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["filtergym", "evaluate", ID, "--policy", "imm", "--site", "48,2"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "--site is for flights from files" in capsys.readouterr().err
