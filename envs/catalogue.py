@@ -238,8 +238,8 @@ def find_scenario(
     name = cls.default_scenario if scenario is None else scenario
     if not isinstance(name, str):
         raise ValueError(
-            f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got {name!r}: choose from "
-            f"{', '.join(cls.scenarios)}"
+            f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got {name!r}: "
+            f"choose from {', '.join(cls.scenarios)}"
         )
     if name not in cls.scenarios:
         raise nearest("scenario", name, cls.scenarios)

@@ -1,64 +1,28 @@
 """Recorded flights from files: read by the names of their columns, put around the radar, cleaned and cut into pieces.
 
-What a file may hold stands in ``COLUMNS``. Latitude and longitude become metres east and north of the radar's site, in
-the plane that touches the ellipsoid there (:mod:`...filters.geodesy`). Own code, because it is a rotation of Earth-fixed
+What a file may hold stands in :mod:`.flight_tables`. Latitude and longitude become metres east and north of the
+radar's site, in the plane that touches the ellipsoid there. Own code, because it is a rotation of Earth-fixed
 coordinates that the satellites need anyway; a geodesy library is the oracle of its tests.
 
-A file is never believed: a flight whose speed cannot be that of a target is refused with the likely cause, a single
-position far off the track is taken out, and a track is cut where it jumps or where nothing was received for long.
-What was done is told in one line a file.
+A file is never believed (:mod:`.flight_cleaning`): a flight whose speed cannot be that of a target is refused with the
+likely cause, a single position far off the track is taken out, and a track is cut where it jumps or where nothing was
+received for long. What was done is told in one line a file.
 """
 
-import csv
 import glob
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 
-from ..filters.geodesy import earth_fixed, east_north_up
+from ..filters.geodesy import east_north
+from .flight_cleaning import COUNTED, Cleaning, cleaned
+from .flight_tables import FLIGHT_SUFFIXES, FOOT, known_columns, numbers, read_table, seconds
 from .parameters import Limits, check
 from .trajectory import Trajectory, trajectory_of
-
-FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet")
-"""Files that can be read."""
-MOST_ROWS = 1_000_000
-"""Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
-MOST_BYTES = 1_000_000_000
-"""Of a file."""
-
-COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "time": ("time", "timestamp"),
-    "x": ("x",),
-    "y": ("y",),
-    "vx": ("vx",),
-    "vy": ("vy",),
-    "latitude": ("latitude", "lat"),
-    "longitude": ("longitude", "lon"),
-    "altitude": ("geoaltitude", "altitude", "baroaltitude"),
-    "flight": ("flight_id", "icao24", "callsign"),
-}
-"""What is read, and the names under which it is known, the first one that a file has; upper and lower case are alike.
-
-``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or latitude
-and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Of the Python package
-``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of one ``flight`` belong together.
-"""
-FOOT = 0.3048
-UNITS: Mapping[str, tuple[str, ...]] = {
-    "time": ("s", "second", "seconds", "sec"),
-    "x": ("m", "metre", "metres", "meter", "meters"),
-    "y": ("m", "metre", "metres", "meter", "meters"),
-    "vx": ("m/s", "m s-1", "m s^-1", "m s**-1"),
-    "vy": ("m/s", "m s-1", "m s^-1", "m s**-1"),
-    "altitude": ("m", "metre", "metres", "meter", "meters"),
-}
-"""Units that a NetCDF variable may say it has."""
 
 
 class Source(NamedTuple):
@@ -198,7 +162,7 @@ def flights_from(fields: Mapping[str, Any]) -> Flights:
 
 
 def names_flights(source: Any) -> bool:
-    """Whether a scenario is the path of a file or folder of flights, a pattern of such paths, or a sequence of flights."""
+    """Whether a scenario is the path of a file or folder of flights, a pattern of such, or a sequence of flights."""
     if isinstance(source, Path):
         return True
     if isinstance(source, str):
@@ -261,8 +225,9 @@ def read_flights(
         ValueError: if nothing can be used, or an argument is out of its limits. One broken file of several is left out
             and named in the notes.
     """
-    limits = _Limits(_checked_site(site), longest_gap, speeds, reach)
+    limits = Cleaning(_checked_site(site), longest_gap, speeds, reach)
     limits.check()
+    given: list[Any]
     if isinstance(source, str | Path):
         name, given = str(source), [source]
     elif isinstance(source, Trajectory):
@@ -275,17 +240,17 @@ def read_flights(
         )
     sources: list[Source] = []
     files: list[Path] = []
-    own = [trajectory_of(item) if isinstance(item, Mapping) else item for item in given]
-    own = [item for item in own if isinstance(item, Trajectory)]
-    for trajectory in _told_apart(own):
-        sources.append(Source(trajectory.name, (trajectory,)))
+    own: list[Trajectory] = []
     for item in given:
-        if isinstance(item, Trajectory | Mapping):
-            continue
-        if isinstance(item, str | Path):
+        if isinstance(item, Trajectory):
+            own.append(item)
+        elif isinstance(item, Mapping):
+            own.append(trajectory_of(item))
+        elif isinstance(item, str | Path):
             files += _files(item)
         else:
             raise ValueError(f"a set of flights holds files and trajectories, got {item!r}")
+    sources += [Source(trajectory.name, (trajectory,)) for trajectory in _told_apart(own)]
     stems = [file.stem for file in files]
     for file in files:
         label = file.stem if stems.count(file.stem) == 1 else str(file)
@@ -306,18 +271,6 @@ def _short(file: Path, files: Sequence[Path]) -> str:
     return file.name if [f.name for f in files].count(file.name) == 1 else str(file)
 
 
-class _Limits(NamedTuple):
-    site: tuple[float, float] | None
-    longest_gap: float
-    speeds: tuple[float, float]
-    reach: float
-
-    def check(self) -> None:
-        check("longest_gap", self.longest_gap, float, Limits(above=0.0))
-        check("speeds", tuple(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
-        check("reach", self.reach, float, Limits(above=0.0))
-
-
 def _checked_site(site: Any) -> tuple[float, float] | None:
     if site is None:
         return None
@@ -331,184 +284,35 @@ def _checked_site(site: Any) -> tuple[float, float] | None:
 # --- one file
 
 
-def _read(file: Path, label: str, limits: _Limits) -> list[Source]:
+def _read(file: Path, label: str, limits: Cleaning) -> list[Source]:
     """Read one file: a source for it, and one more for every flight in it that cannot be used.
 
     Raises:
         ValueError: if nothing of it can be used.
     """
     try:
-        if file.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        table = _TABLES[file.suffix](file) if file.suffix in _TABLES else None
-        if table is None:
-            raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"cannot read trajectory {file}: it is no text in UTF-8") from error
-    except Exception as error:  # readers raise whatever a broken file makes them stumble over
-        raise ValueError(f"cannot read trajectory {file}: {str(error) or type(error).__name__}") from error
+        table = read_table(file)
+    except ValueError as error:
+        raise ValueError(f"cannot read trajectory {file}: {error}") from error
     try:
-        columns, feet = _known(table)
+        columns, feet = known_columns(table)
         return _flights_of(file, label, columns, feet, limits)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"trajectory {file}: {error}") from error
 
 
-def _rows_refused(rows: int) -> ValueError:
-    return ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
-
-
-def _csv(file: Path) -> dict[str, Any]:
-    with file.open(encoding="utf-8-sig", newline="") as lines:
-        header = lines.readline()
-        delimiter = next((d for d in ",;\t" if d in header), ",")
-        names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
-        wanted = [i for i, name in enumerate(names) if name.lower() in _WANTED]
-        rows: list[list[str]] = []
-        for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
-            if not row:
-                continue
-            if len(row) != len(names):
-                raise ValueError(f"{len(names)} column names but {len(row)} columns in row {number}")
-            if number >= MOST_ROWS:
-                raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
-            rows.append([row[i] for i in wanted])
-    table: dict[str, Any] = dict.fromkeys(names)
-    table |= {names[i]: numpy.array([row[k] for row in rows], dtype=object) for k, i in enumerate(wanted)}
-    return table
-
-
-def _netcdf(file: Path) -> dict[str, Any]:
-    import xarray
-
-    # From memory: a mapped file stays open where its reading fails.
-    content = file.read_bytes()
-    engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
-    if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
-        raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
-    with xarray.open_dataset(io.BytesIO(content), engine=engine) as data:
-        table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
-        for name in table:
-            known = _WANTED.get(name.lower())
-            if known is None:
-                continue
-            if data[name].size > MOST_ROWS:
-                raise _rows_refused(data[name].size)
-            unit = str(data[name].attrs.get("units", ""))
-            if unit and known in UNITS and unit not in UNITS[known]:
-                raise ValueError(f"{name} is in {unit!r}, and {UNITS[known][0]!r} is expected")
-            table[name] = data[name].values
-    return table
-
-
-def _parquet(file: Path) -> dict[str, Any]:
-    try:
-        from pyarrow import parquet
-    except ImportError as error:
-        raise ValueError("Parquet needs one more package: pip install 'filtergym[flights]'") from error
-    with parquet.ParquetFile(file) as data:
-        table: dict[str, Any] = dict.fromkeys(data.schema_arrow.names)
-        if data.metadata.num_rows > MOST_ROWS:
-            raise _rows_refused(data.metadata.num_rows)
-        wanted = [name for name in table if name.lower() in _WANTED]
-        found = data.read(columns=wanted)
-    return table | {name: found.column(name).to_numpy() for name in wanted}
-
-
-_TABLES = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet}
-_WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
-
-
-def _known(table: Mapping[str, Any]) -> tuple[dict[str, numpy.ndarray], bool]:
-    """Columns by what they are, and whether altitudes are feet."""
-    lower = {name.lower(): name for name in table}
-    columns = {}
-    for known, aliases in COLUMNS.items():
-        name = next((lower[alias] for alias in aliases if alias in lower), None)
-        if name is not None:
-            columns[known] = table[name]
-    position = [("x", "y"), ("latitude", "longitude")]
-    missing = [] if "time" in columns else ["time"]
-    if not any(set(pair) <= columns.keys() for pair in position):
-        geodetic = {"latitude", "longitude"} & columns.keys()
-        missing += [name for name in position[bool(geodetic)] if name not in columns]
-    if missing:
-        raise ValueError(
-            f"it lacks the column {', '.join(missing)}; it has {', '.join(table)} and needs time, x, y (m) and "
-            "optionally vx, vy (m/s), or time, latitude, longitude (degrees)"
-        )
-    return columns, "groundspeed" in lower
-
-
-def _numbers(name: str, values: Any) -> numpy.ndarray:
-    """Column of numbers; what is empty is NaN.
-
-    Raises:
-        ValueError: for words.
-    """
-    array = numpy.asarray(values)
-    if array.ndim != 1:
-        raise ValueError(f"{name} must be one row of numbers, got shape {array.shape}")
-    if array.dtype.kind in "mM":
-        raise ValueError(f"{name} must be numbers, got {array.dtype}")
-    if array.dtype == object:
-        try:
-            return numpy.array([math.nan if v is None or v == "" else float(v) for v in array.tolist()])
-        except (ValueError, TypeError):
-            row = next(i for i, v in enumerate(array.tolist()) if not _is_number(v))
-            raise ValueError(f"{name} has {array[row]!r} in row {row}, which is no number") from None
-    return array.astype(float)
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        float(value or math.nan)
-    except (ValueError, TypeError):
-        return False
-    return True
-
-
-def _seconds(values: Any) -> numpy.ndarray:
-    """Times in seconds: numbers as they are, dates since the first of them.
-
-    Raises:
-        ValueError: for what is neither.
-    """
-    array = numpy.asarray(values)
-    if array.dtype == object and len(array) and isinstance(array[0], str) and not _is_number(array[0]):
-        dates = []
-        for row, text in enumerate(array.tolist()):
-            try:
-                date = datetime.fromisoformat(text.strip())
-            except (ValueError, AttributeError):
-                raise ValueError(
-                    f"time has {text!r} in row {row}, which is neither seconds nor a date such as 2026-05-01T12:00:00Z"
-                ) from None
-            dates.append(date.replace(tzinfo=UTC) if date.tzinfo is None else date)
-        return numpy.array([(date - dates[0]).total_seconds() for date in dates])
-    if array.dtype.kind in "mM" and array.ndim == 1:
-        missing = numpy.isnat(array)
-        if missing.any():
-            raise ValueError(f"time has no value in row {int(missing.argmax())}")
-        return (array - array[:1]) / numpy.timedelta64(1, "s")
-    return _numbers("time", array)
-
-
 def _flights_of(
-    file: Path, label: str, columns: Mapping[str, Any], feet: bool, limits: _Limits
+    file: Path, label: str, columns: Mapping[str, Any], feet: bool, limits: Cleaning
 ) -> list[Source]:
-    time = _seconds(columns["time"])
+    time = seconds(columns["time"])
     plane = "x" in columns and "y" in columns and not (limits.site and "latitude" in columns)
     pair = ("x", "y") if plane else ("latitude", "longitude")
-    values = {name: _numbers(name, columns[name]) for name in pair}
+    values = {name: numbers(name, columns[name]) for name in pair}
     velocity = plane and {"vx", "vy"} <= columns.keys()
     if velocity:
-        values |= {name: _numbers(name, columns[name]) for name in ("vx", "vy")}
+        values |= {name: numbers(name, columns[name]) for name in ("vx", "vy")}
     if not plane and "altitude" in columns:
-        values["altitude"] = _numbers("altitude", columns["altitude"]) * (FOOT if feet else 1.0)
+        values["altitude"] = numbers("altitude", columns["altitude"]) * (FOOT if feet else 1.0)
     for name, array in values.items():
         if array.shape != time.shape:
             raise ValueError(f"{name} must have shape {time.shape} as time has, got {array.shape}")
@@ -521,17 +325,18 @@ def _flights_of(
             f"time has a value that is not finite in row {int((~numpy.isfinite(time)).argmax())}"
         )
     if not plane:
-        values = _around(limits.site, values)
-    groups = _groups(columns.get("flight"), len(time))
+        _check_degrees(limits.site, values)
+    groups = _groups(columns.get("flight"))
     good: list[Trajectory] = []
-    counts = dict.fromkeys(_COUNTED, 0)
+    counts = dict.fromkeys(COUNTED, 0)
     bad: list[Source] = []
     for flight, rows in groups.items():
         name = f"{label}:{flight}" if flight else label
         try:
-            pieces, found = _cleaned(
-                name, time[rows], {n: v[rows] for n, v in values.items()}, limits, geodetic=not plane
-            )
+            own = {column: array[rows] for column, array in values.items()}
+            if not plane and limits.site:
+                own = _around(limits.site, own)
+            pieces, found = cleaned(name, time[rows], own, limits)
         except ValueError as error:
             if len(groups) == 1:
                 raise
@@ -544,7 +349,7 @@ def _flights_of(
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
     said = [
         f"{_counted(count, *words)}{tail(limits)}"
-        for (words, tail), count in zip(_COUNTED.values(), counts.values(), strict=True)
+        for (words, tail), count in zip(COUNTED.values(), counts.values(), strict=True)
         if count
     ]
     if len(groups) > 1 and said:
@@ -552,18 +357,7 @@ def _flights_of(
     return [Source(file.name, tuple(good), tuple(said)), *bad]
 
 
-_COUNTED: dict[str, Any] = {
-    "missing": (("row without position", "rows without position"), lambda limits: ""),
-    "repeated": (("repeated position",), lambda limits: ""),
-    "far": (("row", "rows"), lambda limits: f" beyond {limits.reach / 1e3:g} km"),
-    "outliers": (("outlier",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
-    "gaps": (("gap",), lambda limits: f" over {limits.longest_gap:g} s"),
-    "jumps": (("jump",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
-}
-"""What is counted while a flight is cleaned, and how it is told."""
-
-
-def _groups(flight: Any, rows: int) -> dict[str, Any]:
+def _groups(flight: Any) -> dict[str, Any]:
     """Rows of every flight of a file, by its name; one without a name where the file names none."""
     if flight is None:
         return {"": slice(None)}
@@ -578,154 +372,28 @@ def _groups(flight: Any, rows: int) -> dict[str, Any]:
     return dict(zip(different.tolist(), numpy.split(order, ends), strict=True))
 
 
-def _around(
-    site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]
-) -> dict[str, numpy.ndarray]:
-    """Metres east and north of a site.
-
-    Raises:
-        ValueError: without a site, and for what are no degrees.
-    """
-    latitude, longitude = values["latitude"], values["longitude"]
-    for name, array, most in (("latitude", latitude, 90.0), ("longitude", longitude, 360.0)):
-        if (numpy.abs(array) > most).any():
-            largest = float(numpy.nanmax(numpy.abs(array)))
-            raise ValueError(
-                f"{name} reaches {largest:g}, and degrees are expected: are they metres, or radians?"
-            )
+def _check_degrees(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]) -> None:
+    """Raise ValueError without a site, and for what are no degrees."""
+    for name, most in (("latitude", 90.0), ("longitude", 360.0)):
+        if (numpy.abs(values[name]) > most).any():
+            largest = float(numpy.nanmax(numpy.abs(values[name])))
+            raise ValueError(f"{name} reaches {largest:g}, and degrees are expected: is it metres?")
     if site is None:
         raise ValueError(
             "it has latitude and longitude: give the radar's, --site LATITUDE,LONGITUDE, or in Python "
             "filtergym.read_flights(..., site=(latitude, longitude))"
         )
+
+
+def _around(site: tuple[float, float], values: Mapping[str, numpy.ndarray]) -> dict[str, numpy.ndarray]:
+    """Add metres east and north of a site to the degrees of one flight."""
+    latitude, longitude = numpy.radians(values["latitude"]), numpy.radians(values["longitude"])
     altitude = values.get("altitude", numpy.zeros_like(latitude))
     known = numpy.isfinite(altitude)
     if not known.all():
-        # What lacks is a few rows, and a kilometre of height moves a target by 0.016 % of its range.
+        # A few rows lack it, and a kilometre of height moves a target by 0.016 % of its range.
         rows = numpy.arange(len(altitude))
-        altitude = (
-            numpy.interp(rows, rows[known], altitude[known]) if known.any() else numpy.zeros_like(latitude)
-        )
-    return dict(zip("xy", east_north(numpy.stack([latitude, longitude]), altitude, site), strict=True))
-
-
-def east_north(degrees: numpy.ndarray, altitude: numpy.ndarray, site: tuple[float, float]) -> numpy.ndarray:
-    """Metres east and north of a site on the ellipsoid, in the plane that touches it there, ``(2, n)``.
-
-    Args:
-        degrees: latitude and longitude, ``(2, n)``.
-        altitude: above the ellipsoid, m, ``(n,)``.
-        site: latitude and longitude, degrees.
-    """
-    origin = numpy.radians(site)
-    away = earth_fixed(*numpy.radians(degrees), altitude) - earth_fixed(*origin, 0.0)[:, None]
-    return (east_north_up(*origin) @ away)[:2]
-
-
-def _cleaned(
-    name: str, time: numpy.ndarray, values: Mapping[str, numpy.ndarray], limits: _Limits, geodetic: bool
-) -> tuple[list[Trajectory], dict[str, int]]:
-    """Cut one flight into pieces.
-
-    Returns:
-        The pieces, and how much of what ``_COUNTED`` names there was.
-
-    Raises:
-        ValueError: if it cannot be a flight, with the likely cause.
-    """
-    counts = dict.fromkeys(_COUNTED, 0)
-    position = numpy.stack([values["x"], values["y"]], axis=1)
-    velocity = numpy.stack([values["vx"], values["vy"]], axis=1) if "vx" in values else None
-
-    def keep(there: numpy.ndarray, what: str) -> None:
-        nonlocal time, position, velocity
-        counts[what] += int((~there).sum())
-        time, position = time[there], position[there]
-        velocity = None if velocity is None else velocity[there]
-
-    keep(numpy.isfinite(position).all(axis=1), "missing")
-    if velocity is not None:
-        keep(numpy.isfinite(velocity).all(axis=1), "missing")
-    steps = numpy.diff(time)
-    if (steps <= 0.0).any():
-        row = int((steps <= 0.0).argmax()) + 1
-        raise ValueError(f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s")
-    if geodetic:
-        # A receiver repeats the last position where it has no new one.
-        repeated = numpy.zeros(len(time), dtype=bool)
-        repeated[1:] = (numpy.diff(position, axis=0) == 0.0).all(axis=1)
-        keep(~repeated, "repeated")
-        keep(numpy.hypot(*position.T) <= limits.reach, "far")
-        if not len(time):
-            raise ValueError(f"it never comes within {limits.reach / 1e3:g} km of the site")
-    if len(time) < 2:
-        raise ValueError(f"a flight needs at least two positions, got {len(time)}")
-    _check_units(time, position, velocity, limits)
-    lowest, highest = limits.speeds
-
-    def pace(apart: int) -> numpy.ndarray:
-        moved = numpy.hypot(*(position[apart:] - position[:-apart]).T)
-        return numpy.asarray(moved / (time[apart:] - time[:-apart]))
-
-    too_fast = pace(1) > highest
-    if len(time) > 2:
-        alone = numpy.zeros(len(time), dtype=bool)
-        alone[1:-1] = too_fast[:-1] & too_fast[1:] & (pace(2) <= highest)
-        keep(~alone, "outliers")
-    gaps, jumps = numpy.diff(time) > limits.longest_gap, pace(1) > highest
-    counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
-    ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
-    parts = [slice(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True)]
-    long = [part for part in parts if part.stop - part.start > 1]
-    return [
-        Trajectory(
-            time[part],
-            position[part],
-            None if velocity is None else velocity[part],
-            name if len(parts) == 1 else f"{name} {i}/{len(long)}",
-            name,
-        )
-        for i, part in enumerate(long, 1)
-    ], counts
-
-
-def _check_units(
-    time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: _Limits
-) -> None:
-    """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
-    steps = numpy.diff(time)
-    speed = float(numpy.median(numpy.hypot(*numpy.diff(position, axis=0).T) / steps))
-    step = float(numpy.median(steps))
-    lowest, highest = limits.speeds
-    if speed < lowest:
-        inside = (numpy.abs(position) <= (360.0, 90.0)).all() or (numpy.abs(position) <= (90.0, 360.0)).all()
-        if inside and 10.0 <= 111e3 * speed <= 400.0:
-            cause = "are x, y degrees? then call them longitude and latitude"
-        elif lowest <= 1e3 * speed <= highest:
-            cause = "are the times milliseconds?" if step >= 100.0 else "are x, y kilometres?"
-        else:
-            cause = "does it move at all? else allow lower speeds"
-        raise ValueError(f"median speed {speed:.2g} m/s: {cause}")
-    if speed > highest:
-        factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
-        unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
-        cause = (
-            f"are the times {unit}?"
-            if unit
-            else "are x, y metres and the times seconds? else allow higher speeds"
-        )
-        raise ValueError(f"median speed {speed:.4g} m/s: {cause}")
-    if step > limits.longest_gap:
-        raise ValueError(
-            f"its positions are {step:g} s apart, longer than the longest gap of {limits.longest_gap:g} s: allow a "
-            "longer gap"
-        )
-    if velocity is not None:
-        ratio = float(numpy.median(numpy.hypot(*velocity.T))) / speed
-        if not 0.8 <= ratio <= 1.25:
-            usual = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
-            unit = next((unit for unit, factor in usual.items() if abs(ratio / factor - 1.0) < 0.05), None)
-            raise ValueError(
-                f"vx, vy are {ratio:.3g} times what the positions say: "
-                + (f"are they {unit}?" if unit else "are they m/s, and x and y metres?")
-            )
+        altitude = numpy.interp(rows, rows[known], altitude[known]) if known.any() else 0.0 * latitude
+    origin = (math.radians(site[0]), math.radians(site[1]))
+    plane = zip("xy", east_north(latitude, longitude, altitude, origin), strict=True)
+    return {**dict(plane), "latitude": latitude, "longitude": longitude}

@@ -6,9 +6,9 @@ paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resample
 which is a hundred times slower here.
 
 Episodes of one recorded flight are no independent samples of what there is to fly. Where episodes belong to flights,
-whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997, 3.8):
-the interval then says what other flights of the kind would give. It needs many flights: of fewer than ten it is too
-narrow.
+whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997,
+3.8): the interval then says what other flights of the kind would give. It needs many flights: of fewer than ten it is
+too narrow.
 """
 
 from collections.abc import Callable, Sequence

@@ -7,7 +7,7 @@ with latitude B, longitude L and ellipsoidal height h; a and f are the defining 
 (NIMA TR8350.2, 2000). A vector d of the Earth-fixed frame has east, north and up components
 ``E d`` with the rotation E of :func:`east_north_up`.
 
-Plain NumPy on angles in radians: sites are constants of an experiment.
+Plain NumPy on angles in radians: sites are constants of an experiment, and recorded positions are read once.
 """
 
 import numpy
@@ -26,11 +26,11 @@ GRAVITATIONAL_PARAMETER = 3.986004418e14
 """Geocentric gravitational constant, m^3/s^2."""
 
 
-def earth_fixed(latitude: float, longitude: float, height: float) -> Array:
-    """Earth-fixed Cartesian coordinates of a site, ``(3,)``, m.
+def earth_fixed(latitude: Array, longitude: Array, height: Array) -> Array:
+    """Earth-fixed Cartesian coordinates of a site, ``(3,)``, m; of many ``(3, n)``.
 
     Args:
-        latitude: geodetic latitude, rad.
+        latitude: geodetic latitude, rad; a number or ``(n,)``, likewise the others.
         longitude: rad, positive to the east.
         height: above the ellipsoid, m.
     """
@@ -62,3 +62,16 @@ def east_north_up(latitude: float, longitude: float) -> Array:
             [cos_b * cos_l, cos_b * sin_l, sin_b],
         ]
     )
+
+
+def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[float, float]) -> Array:
+    """Coordinates east and north of a site on the ellipsoid, in the plane that touches it there, ``(2, n)``, m.
+
+    Args:
+        latitude: geodetic latitude, rad, ``(n,)``.
+        longitude: rad, ``(n,)``.
+        height: above the ellipsoid, m, ``(n,)``.
+        site: latitude and longitude, rad.
+    """
+    away = earth_fixed(latitude, longitude, height) - earth_fixed(*site, 0.0)[:, None]
+    return (east_north_up(*site) @ away)[:2]

@@ -30,8 +30,8 @@ class KnownTurn(KalmanModel):
             change = rate[:, row] / T
             return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
         if isinstance(truth.maneuvers, Tracks):
-            m = truth.maneuvers
-            before = xp.astype(xp.minimum(m.first + truth.scan, m.last) - 1.0, xp.int64)
+            tracks = truth.maneuvers
+            before = xp.astype(xp.minimum(tracks.first + truth.scan, tracks.last) - 1.0, xp.int64)
             change = (truth.velocity - world.table[2:, before]) / T
             return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
         if isinstance(truth.maneuvers, Legs):

@@ -90,9 +90,9 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     cls = task_class(environment)
-    scenario: Any = scenario
+    flown: Any = scenario
     if scenario not in cls.scenarios and names_flights(scenario):
-        scenario = read_flights(
+        flown = read_flights(
             scenario,
             None if site is None else pair("--site", site),
             longest_gap=longest_gap,
@@ -109,13 +109,13 @@ def evaluate_policies(
     names = policy or list(known.benchmark or known.names)
     keywords = parsed_settings(settings or [])
     check_names(cls, keywords)
-    measurements = len(set(names)) * episodes * make_task(cls.id, control, scenario, **keywords).horizon
+    measurements = len(set(names)) * episodes * make_task(cls.id, control, flown, **keywords).horizon
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
         dataset = evaluate(
             cls.id,
             names,
-            scenario,
+            flown,
             episodes,
             seed,
             split,

@@ -19,8 +19,8 @@ Environment = Annotated[
 ScenarioName = Annotated[
     str | None,
     typer.Option(
-        help="Scenario; or flights of your own: a file (CSV, NetCDF, Parquet), a folder, or a pattern in quotes; default: "
-        "the training distribution."
+        help="Scenario; or flights of your own: a file (CSV, NetCDF, Parquet), a folder, or a pattern in quotes; "
+        "default: the training distribution."
     ),
 ]
 TrainingScenario = Annotated[str | None, typer.Option(help="A training scenario; held-out ones are refused.")]

@@ -1,0 +1,155 @@
+"""Cleaning of one recorded flight: units that cannot be, positions far off the track, gaps and jumps."""
+
+import itertools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy
+
+from .parameters import Limits, check
+from .trajectory import Trajectory
+
+
+class Cleaning(NamedTuple):
+    """Where the radar is, and what a flight may look like; see :func:`~.flights.read_flights`."""
+
+    site: tuple[float, float] | None
+    longest_gap: float
+    speeds: tuple[float, float]
+    reach: float
+
+    def check(self) -> None:
+        """Raise ValueError if a limit cannot be."""
+        check("longest_gap", self.longest_gap, float, Limits(above=0.0))
+        check("speeds", tuple(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
+        check("reach", self.reach, float, Limits(above=0.0))
+
+
+COUNTED: dict[str, Any] = {
+    "missing": (("row without position", "rows without position"), lambda limits: ""),
+    "repeated": (("repeated position",), lambda limits: ""),
+    "far": (("row", "rows"), lambda limits: f" beyond {limits.reach / 1e3:g} km"),
+    "outliers": (("outlier",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
+    "gaps": (("gap",), lambda limits: f" over {limits.longest_gap:g} s"),
+    "jumps": (("jump",), lambda limits: f" over {limits.speeds[1]:g} m/s"),
+}
+"""What is counted while a flight is cleaned, and how it is told."""
+
+
+def cleaned(
+    name: str, time: numpy.ndarray, values: Mapping[str, numpy.ndarray], limits: Cleaning
+) -> tuple[list[Trajectory], dict[str, int]]:
+    """Cut one flight into pieces.
+
+    Args:
+        name: of the flight.
+        time: s, ``(n,)``.
+        values: by name, ``(n,)`` each: x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
+            longitude these too.
+        limits: what it may look like.
+
+    Returns:
+        The pieces, and how much of what ``COUNTED`` names there was.
+
+    Raises:
+        ValueError: if it cannot be a flight, with the likely cause.
+    """
+    counts = dict.fromkeys(COUNTED, 0)
+    position = numpy.stack([values["x"], values["y"]], axis=1)
+    velocity = numpy.stack([values["vx"], values["vy"]], axis=1) if "vx" in values else None
+
+    if "latitude" in values:
+        # A receiver repeats the last position where it has no new one, and the altitude goes on.
+        still = [numpy.diff(values[axis], prepend=numpy.nan) == 0.0 for axis in ("latitude", "longitude")]
+        repeated = still[0] & still[1]
+
+    def keep(there: numpy.ndarray, what: str) -> None:
+        nonlocal time, position, velocity
+        counts[what] += int((~there).sum())
+        time, position = time[there], position[there]
+        velocity = None if velocity is None else velocity[there]
+
+    there = numpy.isfinite(position).all(axis=1)
+    keep(there, "missing")
+    if velocity is not None:
+        keep(numpy.isfinite(velocity).all(axis=1), "missing")
+    steps = numpy.diff(time)
+    if (steps <= 0.0).any():
+        row = int((steps <= 0.0).argmax()) + 1
+        raise ValueError(f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s")
+    if "latitude" in values:
+        keep(~repeated[there], "repeated")
+        keep(numpy.hypot(*position.T) <= limits.reach, "far")
+        if not len(time):
+            raise ValueError(f"it never comes within {limits.reach / 1e3:g} km of the site")
+    if len(time) < 2:
+        raise ValueError(f"a flight needs at least two positions, got {len(time)}")
+    _check_units(time, position, velocity, limits)
+    highest = limits.speeds[1]
+
+    def pace(apart: int) -> numpy.ndarray:
+        moved = numpy.hypot(*(position[apart:] - position[:-apart]).T)
+        return numpy.asarray(moved / (time[apart:] - time[:-apart]))
+
+    too_fast = pace(1) > highest
+    if len(time) > 2:
+        alone = numpy.zeros(len(time), dtype=bool)
+        alone[1:-1] = too_fast[:-1] & too_fast[1:] & (pace(2) <= highest)
+        keep(~alone, "outliers")
+    gaps, jumps = numpy.diff(time) > limits.longest_gap, pace(1) > highest
+    counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
+    ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
+    parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
+    long = [part for part in parts if part.stop - part.start > 1]
+    return [
+        Trajectory(
+            time[part],
+            position[part],
+            None if velocity is None else velocity[part],
+            name if len(parts) == 1 else f"{name} {i}/{len(long)}",
+            name,
+        )
+        for i, part in enumerate(long, 1)
+    ], counts
+
+
+def _check_units(
+    time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: Cleaning
+) -> None:
+    """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
+    steps = numpy.diff(time)
+    speed = float(numpy.median(numpy.hypot(*numpy.diff(position, axis=0).T) / steps))
+    step = float(numpy.median(steps))
+    lowest, highest = limits.speeds
+    if speed < lowest:
+        inside = (numpy.abs(position) <= (360.0, 90.0)).all() or (numpy.abs(position) <= (90.0, 360.0)).all()
+        if inside and 10.0 <= 111e3 * speed <= 400.0:
+            cause = "are x, y degrees? then call them longitude and latitude"
+        elif lowest <= 1e3 * speed <= highest:
+            cause = "are the times milliseconds?" if step >= 100.0 else "are x, y kilometres?"
+        else:
+            cause = "does it move at all? else allow lower speeds"
+        raise ValueError(f"median speed {speed:.2g} m/s: {cause}")
+    if speed > highest:
+        factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
+        unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
+        cause = (
+            f"are the times {unit}?"
+            if unit
+            else "are x, y metres and the times seconds? else allow higher speeds"
+        )
+        raise ValueError(f"median speed {speed:.4g} m/s: {cause}")
+    if step > limits.longest_gap:
+        raise ValueError(
+            f"its positions are {step:g} s apart, longer than the longest gap of {limits.longest_gap:g} s: allow a "
+            "longer gap"
+        )
+    if velocity is not None:
+        ratio = float(numpy.median(numpy.hypot(*velocity.T))) / speed
+        if not 0.8 <= ratio <= 1.25:
+            usual = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
+            unit = next((unit for unit, factor in usual.items() if abs(ratio / factor - 1.0) < 0.05), None)
+            raise ValueError(
+                f"vx, vy are {ratio:.3g} times what the positions say: "
+                + (f"are they {unit}?" if unit else "are they m/s, and x and y metres?")
+            )

@@ -1,0 +1,210 @@
+"""Tables of recorded flights in files, read by the names of their columns.
+
+Read whole or not at all: more rows than ``MOST_ROWS`` are refused before they fill the memory.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy
+
+FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet")
+"""Files that can be read."""
+MOST_ROWS = 1_000_000
+"""Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
+MOST_BYTES = 1_000_000_000
+"""Of a file."""
+
+COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "time": ("time", "timestamp"),
+    "x": ("x",),
+    "y": ("y",),
+    "vx": ("vx",),
+    "vy": ("vy",),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon"),
+    "altitude": ("geoaltitude", "altitude", "baroaltitude"),
+    "flight": ("flight_id", "icao24", "callsign"),
+}
+"""What is read, and the names under which it is known, the first one that a file has; upper and lower case are alike.
+
+``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
+latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Of the Python
+package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of one ``flight`` belong together.
+"""
+FOOT = 0.3048
+UNITS: Mapping[str, tuple[str, ...]] = {
+    "time": ("s", "second", "seconds", "sec"),
+    "x": ("m", "metre", "metres", "meter", "meters"),
+    "y": ("m", "metre", "metres", "meter", "meters"),
+    "vx": ("m/s", "m s-1", "m s^-1", "m s**-1"),
+    "vy": ("m/s", "m s-1", "m s^-1", "m s**-1"),
+    "altitude": ("m", "metre", "metres", "meter", "meters"),
+}
+"""Units that a NetCDF variable may say it has."""
+
+
+def _rows_refused(rows: int) -> ValueError:
+    return ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
+
+
+def _csv(file: Path) -> dict[str, Any]:
+    with file.open(encoding="utf-8-sig", newline="") as lines:
+        header = lines.readline()
+        delimiter = next((d for d in ",;\t" if d in header), ",")
+        names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
+        wanted = [i for i, name in enumerate(names) if name.lower() in _WANTED]
+        rows: list[list[str]] = []
+        for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
+            if not row:
+                continue
+            if len(row) != len(names):
+                raise ValueError(f"{len(names)} column names but {len(row)} columns in row {number}")
+            if number >= MOST_ROWS:
+                raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
+            rows.append([row[i] for i in wanted])
+    table: dict[str, Any] = dict.fromkeys(names)
+    table |= {names[i]: numpy.array([row[k] for row in rows], dtype=object) for k, i in enumerate(wanted)}
+    return table
+
+
+def _netcdf(file: Path) -> dict[str, Any]:
+    import xarray
+
+    # From memory: a mapped file stays open where its reading fails.
+    content = file.read_bytes()
+    engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
+    if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
+        raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
+    with xarray.open_dataset(io.BytesIO(content), engine=engine, decode_timedelta=False) as data:
+        table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
+        for name in table:
+            known = _WANTED.get(name.lower())
+            if known is None:
+                continue
+            if data[name].size > MOST_ROWS:
+                raise _rows_refused(data[name].size)
+            unit = str(data[name].attrs.get("units", ""))
+            if unit and known in UNITS and unit not in UNITS[known]:
+                raise ValueError(f"{name} is in {unit!r}, and {UNITS[known][0]!r} is expected")
+            table[name] = data[name].values
+    return table
+
+
+def _parquet(file: Path) -> dict[str, Any]:
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ValueError("Parquet needs one more package: pip install 'filtergym[flights]'") from error
+    with parquet.ParquetFile(file) as data:
+        table: dict[str, Any] = dict.fromkeys(data.schema_arrow.names)
+        if data.metadata.num_rows > MOST_ROWS:
+            raise _rows_refused(data.metadata.num_rows)
+        wanted = [name for name in table if name.lower() in _WANTED]
+        found = data.read(columns=wanted)
+    return table | {name: found.column(name).to_numpy() for name in wanted}
+
+
+_TABLES = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet}
+_WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
+
+
+def read_table(file: Path) -> dict[str, Any]:
+    """Return all columns of a file by their names; those that are not known are None.
+
+    Raises:
+        ValueError: if it cannot be read, or is too large.
+    """
+    try:
+        if file.suffix not in _TABLES:
+            raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
+        if file.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
+        return _TABLES[file.suffix](file)
+    except UnicodeDecodeError as error:
+        raise ValueError("it is no text in UTF-8") from error
+    except Exception as error:  # readers raise whatever a broken file makes them stumble over
+        raise ValueError(str(error) or type(error).__name__) from error
+
+
+def known_columns(table: Mapping[str, Any]) -> tuple[dict[str, numpy.ndarray], bool]:
+    """Columns by what they are, and whether altitudes are feet."""
+    lower = {name.lower(): name for name in table}
+    columns = {}
+    for known, aliases in COLUMNS.items():
+        name = next((lower[alias] for alias in aliases if alias in lower), None)
+        if name is not None:
+            columns[known] = table[name]
+    position = [("x", "y"), ("latitude", "longitude")]
+    missing = [] if "time" in columns else ["time"]
+    if not any(set(pair) <= columns.keys() for pair in position):
+        geodetic = {"latitude", "longitude"} & columns.keys()
+        missing += [name for name in position[bool(geodetic)] if name not in columns]
+    if missing:
+        raise ValueError(
+            f"it lacks the column {', '.join(missing)}; it has {', '.join(table)} and needs time, x, y (m) and "
+            "optionally vx, vy (m/s), or time, latitude, longitude (degrees)"
+        )
+    return columns, "groundspeed" in lower
+
+
+def numbers(name: str, values: Any) -> numpy.ndarray:
+    """Column of numbers; what is empty is NaN.
+
+    Raises:
+        ValueError: for words.
+    """
+    array = numpy.asarray(values)
+    if array.ndim != 1:
+        raise ValueError(f"{name} must be one row of numbers, got shape {array.shape}")
+    if array.dtype.kind in "mM":
+        raise ValueError(f"{name} must be numbers, got {array.dtype}")
+    if array.dtype == object:
+        try:
+            return numpy.array([math.nan if v is None or v == "" else float(v) for v in array.tolist()])
+        except (ValueError, TypeError):
+            row = next(i for i, v in enumerate(array.tolist()) if not _is_number(v))
+            raise ValueError(f"{name} has {array[row]!r} in row {row}, which is no number") from None
+    return array.astype(float)
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value or math.nan)
+    except (ValueError, TypeError):
+        return False
+    return True
+
+
+def seconds(values: Any) -> numpy.ndarray:
+    """Times in seconds: numbers as they are, dates since the first of them.
+
+    Raises:
+        ValueError: for what is neither.
+    """
+    array = numpy.asarray(values)
+    if array.dtype == object and len(array) and isinstance(array[0], str) and not _is_number(array[0]):
+        dates = []
+        for row, text in enumerate(array.tolist()):
+            try:
+                date = datetime.fromisoformat(text.strip())
+            except (ValueError, AttributeError):
+                raise ValueError(
+                    f"time has {text!r} in row {row}, which is neither seconds nor a date such as 2026-05-01T12:00:00Z"
+                ) from None
+            dates.append(date.replace(tzinfo=UTC) if date.tzinfo is None else date)
+        return numpy.array([(date - dates[0]).total_seconds() for date in dates])
+    if array.dtype.kind in "mM" and array.ndim == 1:
+        missing = numpy.isnat(array)
+        if missing.any():
+            raise ValueError(f"time has no value in row {int(missing.argmax())}")
+        return (array - array[:1]) / numpy.timedelta64(1, "s")
+    return numbers("time", array)
