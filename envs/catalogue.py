@@ -201,7 +201,8 @@ def opened(cls: type[Task], scenario: Any) -> Any:
         if find_mixture(cls, scenario) is not None:
             return scenario
         return flights_from(scenario) if "trajectories" in scenario else trajectory_of(scenario)
-    if isinstance(scenario, str) and scenario in cls.scenarios:
+    items = scenario if isinstance(scenario, list | tuple) else [scenario]
+    if any(isinstance(item, str) and item in cls.scenarios for item in items):
         return scenario
     return read_flights(scenario) if names_flights(scenario) else scenario
 
@@ -239,7 +240,7 @@ def find_scenario(
     if not isinstance(name, str):
         raise ValueError(
             f"a scenario is a name, a Trajectory or the path of a file with one, or a sequence of these, got {name!r}: "
-            f"choose from {', '.join(cls.scenarios)}"
+            f"choose from {', '.join(cls.scenarios)}; a mixture of scenarios is a dictionary of weights"
         )
     if name not in cls.scenarios:
         raise nearest("scenario", name, cls.scenarios)

@@ -166,7 +166,8 @@ def names_flights(source: Any) -> bool:
     if isinstance(source, Path):
         return True
     if isinstance(source, str):
-        return Path(source).suffix in FLIGHT_SUFFIXES or glob.has_magic(source) or _is_folder(Path(source))
+        is_path = Path(source).suffix in FLIGHT_SUFFIXES or glob.has_magic(source) or _is_folder(Path(source))
+        return bool(source) and is_path
     return isinstance(source, list | tuple) and len(source) > 0
 
 

@@ -308,7 +308,8 @@ def test_wrong_limits_are_refused(keywords, message, tmp_path):
     ("source", "message"),
     [
         ("nothing/*.csv", "no file matches 'nothing/"),
-        (["paper"], "cannot read trajectory paper: files of flights end in"),
+        (["random.csv", "paper"], "a mixture of scenarios is a dictionary of weights"),
+        (["sheet"], "cannot read trajectory sheet: files of flights end in"),
         ([3], "a set of flights holds files and trajectories, got 3"),
         ([{"time": [0, 1]}], "a trajectory as a dictionary has time"),
         ({"trajectories": "mine"}, "are a list of dictionaries, got 'mine'"),
