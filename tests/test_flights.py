@@ -2,7 +2,9 @@
 
 import datetime
 import json
+import runpy
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +23,7 @@ from filtergym import Flights, Trajectory, evaluate, make_policy, tidy_records
 from filtergym.__main__ import main
 
 ID = "filtergym/ManeuveringTarget-v0"
+DOCS = Path(__file__).parent.parent / "docs"
 FIVE = np.arange(0.0, 200.0, 5.0)
 """Times of a flight, s."""
 
@@ -526,25 +529,29 @@ def test_means_are_of_what_is_there_where_flights_end():
 
 
 def test_one_command_on_a_folder_with_two_broken_files(tmp_path, monkeypatch, capsys):
-    for i in range(18):
-        flight_file(tmp_path / f"ory_{i:02}.csv", FIVE[: 16 + i], start=(2e4, 1e3 * i))
-    (tmp_path / "ory_18.csv").write_bytes(bytes(range(256)))
-    flight_file(tmp_path / "ory_19.csv", FIVE / 60.0, speed=7200.0)
+    runpy.run_path(str(DOCS / "examples" / "flights.py"))["write_flights"](tmp_path)
     words = ["evaluate", ID, "--scenario", str(tmp_path / "*.csv"), "--policy", "imm", "--policy", "adaptive"]
     monkeypatch.setattr(
-        sys, "argv", ["filtergym", *words, "--episodes", "36", "--json", str(tmp_path / "all.json")]
+        sys, "argv", ["filtergym", *words, "--episodes", "19", "--json", str(tmp_path / "all.json")]
     )
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 0
     out = capsys.readouterr().out
+    told = (DOCS / "own_data.md").read_text(encoding="utf-8")
+    assert out[out.index("ory_07.csv:") :] in told
+    left_out = (11, 15)
     assert "18 flights" in out
-    assert all(f"ory_{i:02} " in out for i in range(18))
-    assert "ory_18.csv: left out: it is no text in UTF-8\n" in out
-    assert "ory_19.csv: left out: median speed 7200 m/s: are the times minutes?\n" in out
-    records = json.loads((tmp_path / "all.json").read_text())
-    scenarios = {record["scenario"] for record in records}
+    assert all((f"ory_{i:02} " in out) is (i not in left_out) for i in range(20))
+    scenarios = {record["scenario"] for record in json.loads((tmp_path / "all.json").read_text())}
     assert len(scenarios) == 19
+
+
+def test_the_example_of_the_page_prints_what_it_says(capsys):
+    page = (DOCS / "own_data.md").read_text(encoding="utf-8")
+    code = page.partition("```python\n")[2].partition("```")[0]
+    exec(code, {})
+    assert capsys.readouterr().out.strip() == code.strip().rpartition("# ")[2]
 
 
 def test_site_without_flights_is_refused(monkeypatch, capsys):
