@@ -159,7 +159,8 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
     others = [name for name in names if name != paper][:SHOWN_OF_FLIGHTS]
     units = {r.component: r.unit for r in over_all if r.metric == "rmse"}
     flights, lengths = dataset["flight"].values, dataset["length"].values
-    table = Table(title=f"{len(set(flights.tolist()))} flights", title_justify="left")
+    several = len(set(flights.tolist())) > 1
+    table = Table(title=f"{len(set(flights.tolist()))} flight{'s' * several}", title_justify="left")
     table.add_column("flight", no_wrap=True)
     table.add_column("episodes", justify="right")
     table.add_column("measurements", justify="right")
@@ -189,6 +190,8 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
         notes.append(f"The {SHOWN_OF_FLIGHTS} best are shown; all stand in the records.")
     notes.append(
         "Intervals of the table over all flights resample whole flights; of fewer than ten they are too narrow."
+        if several
+        else "Intervals below are over the episodes of this one flight."
     )
     table.caption = " ".join(notes)
     table.caption_justify = "left"
