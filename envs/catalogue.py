@@ -19,7 +19,8 @@ from typing import Any
 import gymnasium
 import numpy
 
-from .flights import FLIGHT_SUFFIXES, Flights, flights_from, names_flights, read_flights
+from .flight_tables import FLIGHT_SUFFIXES
+from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
 
@@ -140,6 +141,10 @@ def check_names(cls: type[Task], keywords: Iterable[str], others: Iterable[str] 
             raise UnknownKeyword(f"unexpected keyword argument {name!r}, no parameter of {cls.id}: {hint}")
 
 
+def _is_name(cls: type[Task], scenario: str) -> bool:
+    return scenario in cls.scenarios or (scenario.startswith(TRAFFIC) and "traffic" not in cls.scenarios)
+
+
 def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
     """Return the weights of a mixture of scenarios, which sum to one; None for a choice that is no mixture.
 
@@ -155,7 +160,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
         given = dict(scenario)
         if not given or not all(isinstance(weight, int | float | numpy.number) for weight in given.values()):
             return None
-    elif isinstance(scenario, str) and MIXTURE.fullmatch(scenario) and scenario not in cls.scenarios:
+    elif isinstance(scenario, str) and MIXTURE.fullmatch(scenario) and not _is_name(cls, scenario):
         pairs = [part.split(":") for part in scenario.split(",")]
         if Path(pairs[-1][1]).suffix in FLIGHT_SUFFIXES:  # of a file on a drive with a letter
             return None

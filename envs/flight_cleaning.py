@@ -26,6 +26,7 @@ class Cleaning(NamedTuple):
 
 
 COUNTED: dict[str, Any] = {
+    "ground": (("row on the ground", "rows on the ground"), lambda limits: ""),
     "missing": (("row without position", "rows without position"), lambda limits: ""),
     "repeated": (("repeated position",), lambda limits: ""),
     "far": (("row", "rows"), lambda limits: f" beyond {limits.reach / 1e3:g} km"),
@@ -45,7 +46,7 @@ def cleaned(
         name: of the flight.
         time: s, ``(n,)``.
         values: by name, ``(n,)`` each: x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
-            longitude these too.
+            longitude these too; perhaps ground, whether it is on the ground.
         limits: what it may look like.
 
     Returns:
@@ -58,27 +59,28 @@ def cleaned(
     position = numpy.stack([values["x"], values["y"]], axis=1)
     velocity = numpy.stack([values["vx"], values["vy"]], axis=1) if "vx" in values else None
 
+    repeated = numpy.zeros(len(time), dtype=bool)
     if "latitude" in values:
         # A receiver repeats the last position where it has no new one, and the altitude goes on.
         still = [numpy.diff(values[axis], prepend=numpy.nan) == 0.0 for axis in ("latitude", "longitude")]
         repeated = still[0] & still[1]
 
     def keep(there: numpy.ndarray, what: str) -> None:
-        nonlocal time, position, velocity
+        nonlocal time, position, velocity, repeated
         counts[what] += int((~there).sum())
-        time, position = time[there], position[there]
+        time, position, repeated = time[there], position[there], repeated[there]
         velocity = None if velocity is None else velocity[there]
 
-    there = numpy.isfinite(position).all(axis=1)
-    keep(there, "missing")
+    keep(~values.get("ground", numpy.zeros(len(time), dtype=bool)), "ground")
+    keep(numpy.isfinite(position).all(axis=1), "missing")
     if velocity is not None:
         keep(numpy.isfinite(velocity).all(axis=1), "missing")
     steps = numpy.diff(time)
     if (steps <= 0.0).any():
         row = int((steps <= 0.0).argmax()) + 1
         raise ValueError(f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s")
+    keep(~repeated, "repeated")
     if "latitude" in values:
-        keep(~repeated[there], "repeated")
         keep(numpy.hypot(*position.T) <= limits.reach, "far")
         if not len(time):
             raise ValueError(f"it never comes within {limits.reach / 1e3:g} km of the site")

@@ -4,7 +4,9 @@ Read whole or not at all: more rows than ``MOST_ROWS`` are refused before they f
 """
 
 import csv
+import gzip
 import io
+import json
 import math
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -13,7 +15,7 @@ from typing import Any
 
 import numpy
 
-FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet")
+FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz")
 """Files that can be read."""
 MOST_ROWS = 1_000_000
 """Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
@@ -30,12 +32,14 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     "longitude": ("longitude", "lon"),
     "altitude": ("geoaltitude", "altitude", "baroaltitude"),
     "flight": ("flight_id", "icao24", "callsign"),
+    "ground": ("onground", "on_ground"),
 }
 """What is read, and the names under which it is known, the first one that a file has; upper and lower case are alike.
 
 ``time`` in seconds, in ISO 8601 or as dates of any resolution; ``x``, ``y`` in metres, ``vx``, ``vy`` in m/s; or
 latitude and longitude in degrees, altitude in metres. The state vectors of OpenSky are of this form. Of the Python
-package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of one ``flight`` belong together.
+package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of one ``flight`` belong together, in the
+order of their times; rows on the ``ground`` are not flown.
 """
 FOOT = 0.3048
 UNITS: Mapping[str, tuple[str, ...]] = {
@@ -113,8 +117,36 @@ def _parquet(file: Path) -> dict[str, Any]:
     return table | {name: found.column(name).to_numpy() for name in wanted}
 
 
-_TABLES = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet}
+def _json(file: Path) -> dict[str, Any]:
+    with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as content:
+        text = content.read(MOST_BYTES + 1)
+    if len(text) > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
+    rows = json.loads(text)
+    if isinstance(rows, dict) and all(isinstance(column, dict) for column in rows.values()):
+        # By columns, each with the numbers of its rows.
+        rows = [
+            dict(zip(rows, row, strict=True))
+            for row in zip(*(c.values() for c in rows.values()), strict=True)
+        ]
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+        raise ValueError("JSON of flights is a list of rows, each with the names of its columns")
+    if len(rows) > MOST_ROWS:
+        raise _rows_refused(len(rows))
+    table: dict[str, Any] = dict.fromkeys(name for row in rows for name in row)
+    for name in table:
+        if name.lower() in _WANTED:
+            table[name] = numpy.array([row.get(name) for row in rows], dtype=object)
+    return table
+
+
+_TABLES = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
 _WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
+
+
+def suffix_of(file: Path) -> str:
+    """Last part of a file's name, ``.json.gz`` for one; empty if it is not of a file of flights."""
+    return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
 def read_table(file: Path) -> dict[str, Any]:
@@ -124,11 +156,11 @@ def read_table(file: Path) -> dict[str, Any]:
         ValueError: if it cannot be read, or is too large.
     """
     try:
-        if file.suffix not in _TABLES:
+        if not suffix_of(file):
             raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
         if file.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        return _TABLES[file.suffix](file)
+        return _TABLES[suffix_of(file)](file)
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
@@ -184,8 +216,17 @@ def _is_number(value: Any) -> bool:
     return True
 
 
+def on_ground(values: Any) -> numpy.ndarray:
+    """Whether each row says that the aircraft is on the ground; what says nothing is in the air."""
+    return numpy.array(
+        [str(value).strip().lower() in ("true", "1", "1.0") for value in numpy.asarray(values).tolist()]
+    )
+
+
 def seconds(values: Any) -> numpy.ndarray:
     """Times in seconds: numbers as they are, dates since the first of them.
+
+    Numbers too large for seconds since 1970 are milli-, micro- or nanoseconds since then.
 
     Raises:
         ValueError: for what is neither.
@@ -207,4 +248,8 @@ def seconds(values: Any) -> numpy.ndarray:
         if missing.any():
             raise ValueError(f"time has no value in row {int(missing.argmax())}")
         return (array - array[:1]) / numpy.timedelta64(1, "s")
-    return numbers("time", array)
+    found = numbers("time", array)
+    first = found[0] if len(found) else 0.0
+    # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
+    unit = next((unit for unit in (1e9, 1e6, 1e3) if first > 1e8 * unit), 1.0)
+    return found if unit == 1.0 else (found - first) / unit

@@ -9,7 +9,9 @@ likely cause, a single position far off the track is taken out, and a track is c
 received for long. What was done is told in one line a file.
 """
 
+import difflib
 import glob
+import importlib.util
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +22,16 @@ import numpy
 
 from ..filters.geodesy import east_north
 from .flight_cleaning import COUNTED, Cleaning, cleaned
-from .flight_tables import FLIGHT_SUFFIXES, FOOT, known_columns, numbers, read_table, seconds
+from .flight_tables import (
+    FLIGHT_SUFFIXES,
+    FOOT,
+    known_columns,
+    numbers,
+    on_ground,
+    read_table,
+    seconds,
+    suffix_of,
+)
 from .parameters import Limits, check
 from .trajectory import Trajectory, trajectory_of
 
@@ -166,7 +177,9 @@ def names_flights(source: Any) -> bool:
     if isinstance(source, Path):
         return True
     if isinstance(source, str):
-        is_path = Path(source).suffix in FLIGHT_SUFFIXES or glob.has_magic(source) or _is_folder(Path(source))
+        if source.startswith(TRAFFIC):
+            return True
+        is_path = bool(suffix_of(Path(source))) or glob.has_magic(source) or _is_folder(Path(source))
         return bool(source) and is_path
     return isinstance(source, list | tuple) and len(source) > 0
 
@@ -178,11 +191,43 @@ def _is_folder(path: Path) -> bool:
         return False
 
 
+TRAFFIC = "traffic:"
+"""Before the name of a sample of the Python package ``traffic``."""
+
+
+def _traffic_sample(name: str) -> Path:
+    """File of a sample in the package ``traffic``, which is installed but not imported: it would bring a long chain of
+    libraries, and the samples are JSON.
+
+    Raises:
+        ValueError: if there is no such sample, or no such package.
+    """
+    found = importlib.util.find_spec("traffic")
+    folders = list(found.submodule_search_locations or ()) if found else []
+    samples = {
+        file.name.removesuffix(".json.gz"): file
+        for folder in folders
+        for file in sorted(Path(folder, "data", "samples").glob("*/*.json.gz"))
+    }
+    if not samples:
+        raise ValueError(
+            f"scenario {TRAFFIC + name!r} is in the Python package traffic, which is not installed; its samples need "
+            "nothing else: pip install --no-deps traffic"
+        )
+    if name not in samples:
+        close = difflib.get_close_matches(name, samples, n=3, cutoff=0.5)
+        meant = f"did you mean {' or '.join(close)}?" if close else f"choose from {', '.join(samples)}"
+        raise ValueError(f"the package traffic has no sample {name!r}: {meant}")
+    return samples[name]
+
+
 def _files(source: str | Path) -> list[Path]:
     """Files that a path or a pattern stands for, in the order of their names."""
+    if isinstance(source, str) and source.startswith(TRAFFIC):
+        return [_traffic_sample(source.removeprefix(TRAFFIC))]
     path = Path(source)
     if _is_folder(path):
-        found = sorted(file for file in path.iterdir() if file.suffix in FLIGHT_SUFFIXES)
+        found = sorted(file for file in path.iterdir() if suffix_of(file))
         if not found:
             raise ValueError(
                 f"folder {path} holds no flights: files that end in {', '.join(FLIGHT_SUFFIXES)}"
@@ -212,7 +257,9 @@ def read_flights(
     Args:
         source: a file (CSV, NetCDF, Parquet), a folder of such, a pattern such as ``"flights/*.csv"``, a
             :class:`~.trajectory.Trajectory`, or a sequence of these. Trajectories are taken as they are.
-        site: latitude and longitude of the radar, degrees; needed where files hold these and not x and y.
+            ``"traffic:quickstart"`` is a sample of the Python package ``traffic``.
+        site: latitude and longitude of the radar, degrees; needed where files hold these and not x and y. That of a
+            sample is the median of its positions by default.
         longest_gap: s; a track is cut where two positions are farther apart in time.
         speeds: m/s; a flight whose median speed is outside is refused, and where it is faster from one position to
             the next, the one position is taken out, or the track is cut.
@@ -228,6 +275,7 @@ def read_flights(
     """
     limits = Cleaning(_checked_site(site), longest_gap, speeds, reach)
     limits.check()
+    at_median = isinstance(source, str) and source.startswith(TRAFFIC)
     given: list[Any]
     if isinstance(source, str | Path):
         name, given = str(source), [source]
@@ -252,11 +300,11 @@ def read_flights(
         else:
             raise ValueError(f"a set of flights holds files and trajectories, got {item!r}")
     sources += [Source(trajectory.name, (trajectory,)) for trajectory in _told_apart(own)]
-    stems = [file.stem for file in files]
-    for file in files:
-        label = file.stem if stems.count(file.stem) == 1 else str(file)
+    stems = [file.name.removesuffix(suffix_of(file)) for file in files]
+    for file, stem in zip(files, stems, strict=True):
+        label = stem if stems.count(stem) == 1 else str(file)
         try:
-            sources += _read(file, label, limits)
+            sources += _read(file, label, limits, at_median)
         except ValueError as error:
             if len(files) + len(sources) == 1:
                 raise
@@ -285,7 +333,7 @@ def _checked_site(site: Any) -> tuple[float, float] | None:
 # --- one file
 
 
-def _read(file: Path, label: str, limits: Cleaning) -> list[Source]:
+def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[Source]:
     """Read one file: a source for it, and one more for every flight in it that cannot be used.
 
     Raises:
@@ -297,13 +345,13 @@ def _read(file: Path, label: str, limits: Cleaning) -> list[Source]:
         raise ValueError(f"cannot read trajectory {file}: {error}") from error
     try:
         columns, feet = known_columns(table)
-        return _flights_of(file, label, columns, feet, limits)
+        return _flights_of(file, label, columns, feet, limits, at_median)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"trajectory {file}: {error}") from error
 
 
 def _flights_of(
-    file: Path, label: str, columns: Mapping[str, Any], feet: bool, limits: Cleaning
+    file: Path, label: str, columns: Mapping[str, Any], feet: bool, limits: Cleaning, at_median: bool
 ) -> list[Source]:
     time = seconds(columns["time"])
     plane = "x" in columns and "y" in columns and not (limits.site and "latitude" in columns)
@@ -325,9 +373,14 @@ def _flights_of(
         raise ValueError(
             f"time has a value that is not finite in row {int((~numpy.isfinite(time)).argmax())}"
         )
+    placed = ""
     if not plane:
+        if limits.site is None and at_median:
+            limits = limits._replace(site=_median_site(values))
+            placed = "radar at {:.2f}, {:.2f}".format(*limits.site or ())
         _check_degrees(limits.site, values)
-    groups = _groups(columns.get("flight"))
+    ground = on_ground(columns["ground"]) if "ground" in columns else numpy.zeros(len(time), dtype=bool)
+    groups = _groups(columns.get("flight"), time)
     good: list[Trajectory] = []
     counts = dict.fromkeys(COUNTED, 0)
     bad: list[Source] = []
@@ -337,7 +390,7 @@ def _flights_of(
             own = {column: array[rows] for column, array in values.items()}
             if not plane and limits.site:
                 own = _around(limits.site, own)
-            pieces, found = cleaned(name, time[rows], own, limits)
+            pieces, found = cleaned(name, time[rows], own | {"ground": ground[rows]}, limits)
         except ValueError as error:
             if len(groups) == 1:
                 raise
@@ -355,22 +408,30 @@ def _flights_of(
     ]
     if len(groups) > 1 and said:
         said = [f"{len(groups) - len(bad)} flights", *said]
+    if placed:
+        said = [placed, *said]
     return [Source(file.name, tuple(good), tuple(said)), *bad]
 
 
-def _groups(flight: Any) -> dict[str, Any]:
-    """Rows of every flight of a file, by its name; one without a name where the file names none."""
+def _median_site(values: Mapping[str, numpy.ndarray]) -> tuple[float, float]:
+    """Latitude and longitude in the middle of all positions, to a hundredth of a degree."""
+    return tuple(round(float(numpy.nanmedian(values[name])), 2) for name in ("latitude", "longitude"))  # type: ignore[return-value]
+
+
+def _groups(flight: Any, time: numpy.ndarray) -> dict[str, Any]:
+    """Rows of every flight of a file, by its name, in the order of their times; one without a name, and as they stand,
+    where the file names none.
+    """
     if flight is None:
         return {"": slice(None)}
     names = numpy.array(
         [str(value).strip() if value is not None else "" for value in numpy.asarray(flight).tolist()]
     )
     different, which = numpy.unique(names, return_inverse=True)
-    if len(different) == 1:
-        return {"": slice(None)}
-    order = numpy.argsort(which, kind="stable")
+    order = numpy.lexsort((time, which))
     ends = numpy.cumsum(numpy.bincount(which))[:-1]
-    return dict(zip(different.tolist(), numpy.split(order, ends), strict=True))
+    names_of = different.tolist() if len(different) > 1 else [""]
+    return dict(zip(names_of, numpy.split(order, ends), strict=True))
 
 
 def _check_degrees(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]) -> None:

@@ -1,6 +1,8 @@
 """Sets of recorded flights: reading, cleaning, what is refused, episodes, and intervals over flights."""
 
 import datetime
+import gzip
+import importlib
 import json
 import runpy
 import sys
@@ -43,6 +45,15 @@ def table(file, **columns):
 def flight_file(file, time=FIVE, **of_weave):
     x, y = weave(time, **of_weave).T
     return table(file, time=time, x=x, y=y)
+
+
+def as_json(file, **columns):
+    """Write a list of rows."""
+    rows = [
+        dict(zip(columns, row, strict=True)) for row in zip(*(np.array(c).tolist() for c in columns.values()))
+    ]
+    text = json.dumps(rows).encode()
+    file.write_bytes(gzip.compress(text) if file.suffix == ".gz" else text)
 
 
 def three():
@@ -95,8 +106,12 @@ def test_every_form_of_time_and_file_is_the_same_flight(tmp_path):
     data = {"x": ("time", x, {"units": "m"}), "y": ("time", y)}
     xarray.Dataset(data, {"time": nanoseconds}).to_netcdf(tmp_path / "dates.nc", engine="scipy")
     xarray.Dataset(data, {"time": FIVE}).to_netcdf(tmp_path / "seconds.nc", engine="scipy")
+    as_json(tmp_path / "rows.json", timestamp=(1000 * (1_700_000_000 + FIVE)).astype(int), x=x, y=y)
+    by_columns = {"time": FIVE + 1.7e9, "x": x, "y": y}
+    text = json.dumps({name: dict(enumerate(values.tolist())) for name, values in by_columns.items()})
+    (tmp_path / "columns.json").write_text(text)
     found = read_flights(tmp_path)
-    assert len(found.trajectories) == 9
+    assert len(found.trajectories) == 11
     for trajectory in found.trajectories:
         np.testing.assert_allclose(trajectory.time - trajectory.time[0], FIVE, rtol=0, atol=1e-9)
         np.testing.assert_array_equal(trajectory.position, weave(FIVE))
@@ -144,6 +159,63 @@ def test_flights_of_one_file_are_told_apart_and_stale_positions_go(tmp_path):
     found = read_flights(alone, site=(48.0, 2.0))
     assert found.sources[0].said == ("1 row without position", "1 repeated position")
     np.testing.assert_array_equal(found.trajectories[0].time, np.delete(FIVE, [7, 9]))
+
+
+def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flown(tmp_path):
+    _, latitude, longitude, _ = geodetic()
+    mixed = np.random.default_rng(0).permutation(len(FIVE))
+    columns = {"time": FIVE, "lat": latitude, "lon": longitude}
+    ground = np.where(FIVE < 20.0, "True", "False")
+    file = table(
+        tmp_path / "one.csv",
+        **{n: v[mixed] for n, v in columns.items()},
+        icao24=["a"] * len(FIVE),
+        onground=ground[mixed],
+    )
+    found = read_flights(file, site=(48.0, 2.0))
+    assert found.sources[0].said == ("4 rows on the ground",)
+    np.testing.assert_array_equal(found.trajectories[0].time, FIVE[4:])
+
+
+def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        ValueError, match="is not installed; its samples need nothing else: pip install --no-deps"
+    ):
+        make_task(ID, scenario="traffic:quickstart")
+    folder = tmp_path / "traffic" / "data" / "samples" / "collections"
+    folder.mkdir(parents=True)
+    (tmp_path / "traffic" / "__init__.py").write_text("raise ImportError('of a long chain of libraries')")
+    _, latitude, longitude, height = geodetic()
+    columns = {
+        "timestamp": (1000 * (1_700_000_000 + FIVE)).astype(int),
+        "latitude": latitude,
+        "longitude": longitude,
+    }
+    as_json(
+        folder / "quickstart.json.gz", **columns, altitude=height / 0.3048, groundspeed=240.0 + 0.0 * FIVE
+    )
+    importlib.invalidate_caches()
+    found = read_flights("traffic:quickstart")
+    site = (round(float(np.median(latitude)), 2), round(float(np.median(longitude)), 2))
+    assert found.sources[0].said == (f"radar at {site[0]:.2f}, {site[1]:.2f}",)
+    origin = tuple(np.radians(site))
+    expected = east_north(np.radians(latitude), np.radians(longitude), height, origin).T
+    np.testing.assert_allclose(found.trajectories[0].position, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.diff(found.trajectories[0].time), 5.0, rtol=1e-9)
+    assert make_task(ID, scenario="traffic:quickstart").parameters.flight == "track"
+    with pytest.raises(
+        ValueError, match="the package traffic has no sample 'quikstart': did you mean quickstart"
+    ):
+        read_flights("traffic:quikstart")
+
+
+def test_rows_that_lack_a_velocity_are_taken_out(tmp_path):
+    x, y = weave(FIVE).T
+    vx, vy = np.gradient(weave(FIVE), FIVE, axis=0).T
+    vx[3] = np.nan
+    (found,) = read_flights(table(tmp_path / "v.csv", time=FIVE, x=x, y=y, vx=vx, vy=vy)).trajectories
+    np.testing.assert_array_equal(found.velocity, np.delete(np.stack([vx, vy], axis=1), 3, axis=0))
 
 
 def test_what_lies_beyond_the_reach_is_taken_out(tmp_path):
@@ -263,7 +335,9 @@ def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
         ("twice.csv", b"time,x,x,y\n0,1,2,3\n6,2,3,4\n", "it has the column x more than once"),
         ("ragged.csv", b"time,x,y\n0,1,2\n6,2\n", "3 column names but 2 columns in row 1"),
         ("comma.csv", b"time,x,y\n0,5,1,5,2,5\n", "3 column names but 6 columns in row 0"),
-        ("words.txt", b"time,x,y\n", "files of flights end in .csv, .nc, .parquet"),
+        ("words.txt", b"time,x,y\n", "files of flights end in .csv, .nc, .parquet, .json, .json.gz"),
+        ("number.json", b"3", "JSON of flights is a list of rows"),
+        ("cut.json.gz", gzip.compress(b"[{}]")[:-9], "cannot read trajectory .*cut.json.gz"),
     ],
 )
 def test_what_is_no_table_is_refused(name, content, message, tmp_path):
@@ -284,11 +358,17 @@ def test_millions_of_rows_are_refused_before_they_are_read(tmp_path, monkeypatch
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     monkeypatch.setattr(flight_tables, "MOST_ROWS", 30)
     flight_file(tmp_path / "a.csv")
+    as_json(tmp_path / "a.json", **ONE)
+    as_json(tmp_path / "a.json.gz", **ONE)
     parquet.write_table(pyarrow.table(ONE), tmp_path / "a.parquet")
     data = {name: ("time", values) for name, values in ONE.items()}
     xarray.Dataset(data).to_netcdf(tmp_path / "a.nc", engine="scipy")
     for suffix in flight_tables.FLIGHT_SUFFIXES:
         with pytest.raises(ValueError, match="it has more than 30 rows"):
+            read_flights(tmp_path / f"a{suffix}")
+    monkeypatch.setattr(flight_tables, "MOST_BYTES", 300)
+    for suffix in (".csv", ".json.gz"):
+        with pytest.raises(ValueError, match="it is larger than 3e-07 GB: split it"):
             read_flights(tmp_path / f"a{suffix}")
 
 
