@@ -17,12 +17,14 @@ class Cleaning(NamedTuple):
     longest_gap: float
     speeds: tuple[float, float]
     reach: float
+    smoothing: float
 
     def check(self) -> None:
         """Raise ValueError if a limit cannot be."""
         check("longest_gap", self.longest_gap, float, Limits(above=0.0))
         check("speeds", tuple(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
         check("reach", self.reach, float, Limits(above=0.0))
+        check("smoothing", self.smoothing, float, Limits(at_least=0.0))
 
 
 COUNTED: dict[str, Any] = {
@@ -103,16 +105,48 @@ def cleaned(
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
     long = [part for part in parts if part.stop - part.start > 1]
-    return [
-        Trajectory(
-            time[part],
-            position[part],
-            None if velocity is None else velocity[part],
-            name if len(parts) == 1 else f"{name} {i}/{len(long)}",
-            name,
-        )
-        for i, part in enumerate(long, 1)
-    ], counts
+    pieces = []
+    for number, part in enumerate(long, 1):
+        flown, moving = position[part], None if velocity is None else velocity[part]
+        if limits.smoothing and len(flown) >= FEWEST_IN_WINDOW:
+            flown, moving = smoothed(time[part], flown, limits.smoothing)
+        own = name if len(parts) == 1 else f"{name} {number}/{len(long)}"
+        pieces.append(Trajectory(time[part], flown, moving, own, name))
+    return pieces, counts
+
+
+FEWEST_IN_WINDOW = 5
+"""Positions that a parabola is fitted to at least."""
+
+
+def smoothed(
+    time: numpy.ndarray, position: numpy.ndarray, half_width: float
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Position and velocity of the parabolas that fit best around each time.
+
+    Args:
+        time: s, ``(n,)``, n >= ``FEWEST_IN_WINDOW``.
+        position: m, ``(n, 2)``.
+        half_width: of the window on either side, s; where it holds few positions it is as wide as it takes.
+    """
+    count = len(time)
+    row = numpy.arange(count)
+    first = numpy.minimum(numpy.searchsorted(time, time - half_width), row - FEWEST_IN_WINDOW // 2)
+    first = first.clip(0, count - FEWEST_IN_WINDOW)
+    last = numpy.maximum(numpy.searchsorted(time, time + half_width, side="right"), first + FEWEST_IN_WINDOW)
+    widest = int((last - first).max())
+    found = numpy.empty((count, 3, 2))
+    portion = max(1_000_000 // widest, 1)  # bounded memory
+    for begin in range(0, count, portion):
+        some = slice(begin, begin + portion)
+        index = first[some, None] + numpy.arange(widest)
+        inside = (index < last[some, None]).astype(float)
+        index = index.clip(None, count - 1)
+        away = (time[index] - time[some, None]) / half_width
+        powers = inside[..., None] * numpy.stack([away**0, away, away**2], axis=-1)
+        turned = powers.swapaxes(-1, -2)
+        found[some] = numpy.linalg.solve(turned @ powers, turned @ position[index])
+    return found[:, 0], found[:, 1] / half_width
 
 
 def _check_units(

@@ -250,6 +250,7 @@ def read_flights(
     longest_gap: float = 60.0,
     speeds: tuple[float, float] = (1.0, 1000.0),
     reach: float = 500e3,
+    smoothing: float = 0.0,
     fewest_scans: int = 10,
 ) -> Flights:
     """Read recorded flights, clean them and cut them into pieces without gaps.
@@ -264,6 +265,8 @@ def read_flights(
         speeds: m/s; a flight whose median speed is outside is refused, and where it is faster from one position to
             the next, the one position is taken out, or the track is cut.
         reach: m; latitudes and longitudes farther from the site are taken out.
+        smoothing: s; positions and velocities are those of parabolas fitted to what lies this far on either side. Zero
+            takes positions as they are.
         fewest_scans: pieces that last fewer sampling intervals of the environment are dropped.
 
     Returns:
@@ -273,7 +276,7 @@ def read_flights(
         ValueError: if nothing can be used, or an argument is out of its limits. One broken file of several is left out
             and named in the notes.
     """
-    limits = Cleaning(_checked_site(site), longest_gap, speeds, reach)
+    limits = Cleaning(_checked_site(site), longest_gap, speeds, reach, smoothing)
     limits.check()
     at_median = isinstance(source, str) and source.startswith(TRAFFIC)
     given: list[Any]

@@ -15,6 +15,7 @@ import pytest
 import xarray
 from filtergym.envs import flight_tables
 from filtergym.envs.catalogue import make_task
+from filtergym.envs.flight_cleaning import smoothed
 from filtergym.envs.flights import read_flights
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import flight_records
@@ -49,9 +50,8 @@ def flight_file(file, time=FIVE, **of_weave):
 
 def as_json(file, **columns):
     """Write a list of rows."""
-    rows = [
-        dict(zip(columns, row, strict=True)) for row in zip(*(np.array(c).tolist() for c in columns.values()))
-    ]
+    values = [np.array(column).tolist() for column in columns.values()]
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)]
     text = json.dumps(rows).encode()
     file.write_bytes(gzip.compress(text) if file.suffix == ".gz" else text)
 
@@ -165,13 +165,8 @@ def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flo
     _, latitude, longitude, _ = geodetic()
     mixed = np.random.default_rng(0).permutation(len(FIVE))
     columns = {"time": FIVE, "lat": latitude, "lon": longitude}
-    ground = np.where(FIVE < 20.0, "True", "False")
-    file = table(
-        tmp_path / "one.csv",
-        **{n: v[mixed] for n, v in columns.items()},
-        icao24=["a"] * len(FIVE),
-        onground=ground[mixed],
-    )
+    columns |= {"icao24": np.repeat("a", len(FIVE)), "onground": np.where(FIVE < 20.0, "True", "False")}
+    file = table(tmp_path / "one.csv", **{name: values[mixed] for name, values in columns.items()})
     found = read_flights(file, site=(48.0, 2.0))
     assert found.sources[0].said == ("4 rows on the ground",)
     np.testing.assert_array_equal(found.trajectories[0].time, FIVE[4:])
@@ -245,6 +240,28 @@ def test_gaps_jumps_and_outliers_by_hand(tmp_path):
         np.testing.assert_array_equal(own, expected)
     assert [t.name for t in found.trajectories] == [f"ory_07 {i}/4" for i in (1, 2, 3, 4)]
     assert {t.flight for t in found.trajectories} == {"ory_07"}
+
+
+def test_smoothing_is_a_parabola_around_each_position(tmp_path):
+    rng = np.random.default_rng(0)
+    time = np.cumsum(rng.uniform(0.5, 2.0, 60))
+    parabola = np.stack([1e4 + 90.0 * time + 0.8 * time**2, 2e4 - 70.0 * time], axis=1)
+    position, velocity = smoothed(time, parabola, 10.0)
+    np.testing.assert_allclose(position, parabola, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        velocity, np.stack([90.0 + 1.6 * time, -70.0 + 0.0 * time], axis=1), rtol=0, atol=1e-8
+    )
+    noisy = parabola + rng.normal(0.0, 30.0, parabola.shape)
+    position, velocity = smoothed(time, noisy, 7.0)
+    for i in (0, 1, 30, 59):
+        near = np.abs(time - time[i]) <= 7.0
+        naive = np.polynomial.polynomial.polyfit(time[near] - time[i], noisy[near], 2)
+        np.testing.assert_allclose(position[i], naive[0], rtol=1e-9)
+        np.testing.assert_allclose(velocity[i], naive[1], rtol=1e-6, atol=1e-6)
+    few = smoothed(time[::10], parabola[::10], 1.0)[0]
+    np.testing.assert_allclose(few, parabola[::10], rtol=0, atol=1e-6)
+    (found,) = read_flights(flight_file(tmp_path / "a.csv"), smoothing=20.0).trajectories
+    np.testing.assert_array_equal(found.velocity, smoothed(FIVE, weave(FIVE), 20.0)[1])
 
 
 def test_the_line_about_a_file(tmp_path):

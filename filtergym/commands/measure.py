@@ -81,6 +81,12 @@ def evaluate_policies(
     speeds: Annotated[
         str, typer.Option(help="Of flights: speeds that are possible, m/s, from the lowest to the highest.")
     ] = "1,1000",
+    smoothing: Annotated[
+        float,
+        typer.Option(
+            help="Of flights: parabolas are fitted to what lies this far on either side, s; 0: none."
+        ),
+    ] = 0.0,
     fewest_scans: Annotated[
         int, typer.Option(help="Of flights: shorter pieces are dropped, in measurements.")
     ] = 10,
@@ -98,6 +104,7 @@ def evaluate_policies(
             longest_gap=longest_gap,
             speeds=pair("--speeds", speeds),
             fewest_scans=fewest_scans,
+            smoothing=smoothing,
         )
     elif site is not None:
         raise ValueError(f"--site is for flights from files, and scenario {scenario!r} is none")
