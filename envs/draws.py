@@ -6,7 +6,7 @@ kinds are its context.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
 
 from .observation import Array
@@ -91,6 +91,11 @@ class Draws:
             thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
         """
         return self._kept(name, category(self._rows(None), thresholds, self.xp))
+
+
+def between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
+    """Draw between two limits; where they are one it is that, a float, and no number is used."""
+    return limits[0] if limits[0] == limits[1] else draw(name, limits)
 
 
 def category(uniform: Array, thresholds: Sequence[Array], xp: ModuleType) -> Array:

@@ -73,8 +73,9 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """Interval of the start of the jamming, s."""
     jamming_duration: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, ascending=True)
     """Interval of its length, s."""
-    jamming_factor: float = parameter(100.0, above=0.0)
-    """Intensity under jamming over intensity without; ours: ten times the noise."""
+    jamming_factor: tuple[float, float] = parameter((100.0, 100.0), above=0.0, ascending=True)
+    """Intensity under jamming over intensity without, drawn log-uniformly in this interval; ours: ten times the
+    noise."""
 
     spoofing_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
     """That the measurement is pulled off once in the episode."""
@@ -82,8 +83,16 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """Interval of the start of the spoofing, s."""
     spoofing_duration: tuple[float, float] = parameter((1.5, 1.5), at_least=0.0, ascending=True)
     """Interval of its length, s; after it the measurement is true again."""
-    spoofing_rate: float = 2.0
-    """Rate at which every axis is pulled off, m/s; ours: twice the noise of a sample at the end."""
+    spoofing_rate: tuple[float, float] = parameter((2.0, 2.0), ascending=True)
+    """Interval of the rate at which every axis is pulled off, m/s; ours: twice the noise of a sample at the end."""
+
+    outlier_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That a measurement is an outlier, each one on its own; nobody says so."""
+    outlier_factor: float = parameter(100.0, above=0.0)
+    """Intensity of the noise of an outlier over that of the others; ours: ten times the noise."""
+
+    undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability of an episode in which nothing fails and all noises are as modelled."""
 
     averaging_measurements: float = parameter(25.0, above=0.0)
     """Time constant of the averages of innovations shown, measurements; ours: 0.25 s, the time constant of the

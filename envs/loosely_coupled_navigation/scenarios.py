@@ -10,6 +10,10 @@ from ..task import Scenario
 
 DECADE = (10**-0.5, 10**0.5)
 """A decade around the modelled value."""
+DOWN_TO_QUIET = (0.05, 10**0.5)
+"""The same, and on to half of the least drift of ``quiet``."""
+DOWN_TO_SILENT = (0.005, 10**0.5)
+"""The same for its intensities."""
 
 _LATE = {"late": (250, 500)}
 
@@ -19,18 +23,28 @@ SCENARIOS: Mapping[str, Scenario] = {
         Scenario("paper", "The fusion example: noises as modelled, no disturbance.", {}, _LATE),
         Scenario(
             "random",
-            "Drift, coloured, white and receiver noise over a decade each; the receiver noise changes once "
-            "or twice, unreported half of the time; outages.",
+            "Training distribution: drift, coloured and white noise from far less than modelled to three times it; "
+            "receiver noise over a decade, with up to two changes, unreported half of the time; outages, jamming and "
+            "spoofing in some episodes each; in one of six nothing fails.",
             {
-                "drift_factor": DECADE,
-                "coloured_factor": DECADE,
-                "white_factor": DECADE,
+                "drift_factor": DOWN_TO_QUIET,
+                "coloured_factor": DOWN_TO_SILENT,
+                "white_factor": DOWN_TO_SILENT,
                 "receiver_factor": DECADE,
-                "noise_changes": (1, 2),
+                "noise_changes": (0, 2),
                 "unreported": 0.5,
-                "outage_probability": 0.5,
+                "outage_probability": 0.4,
                 "outage_start": (0.5, 4.0),
-                "outage_duration": (0.2, 1.0),
+                "outage_duration": (0.2, 2.0),
+                "jamming_probability": 0.25,
+                "jamming_start": (0.5, 4.0),
+                "jamming_duration": (0.2, 1.5),
+                "jamming_factor": (3.0, 300.0),
+                "spoofing_probability": 0.25,
+                "spoofing_start": (0.5, 3.5),
+                "spoofing_duration": (0.5, 2.0),
+                "spoofing_rate": (-3.0, 3.0),
+                "undisturbed": 1.0 / 6.0,
             },
             _LATE,
             training=True,
@@ -48,7 +62,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "jamming_probability": 1.0,
                 "jamming_start": (0.5, 4.0),
                 "jamming_duration": (0.9, 1.1),
-                "jamming_factor": 100.0,
+                "jamming_factor": (100.0, 100.0),
             },
             _LATE,
         ),
@@ -59,7 +73,7 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "spoofing_probability": 1.0,
                 "spoofing_start": (0.5, 3.5),
                 "spoofing_duration": (1.25, 1.75),
-                "spoofing_rate": 2.0,
+                "spoofing_rate": (2.0, 2.0),
             },
             _LATE,
         ),
@@ -72,6 +86,12 @@ SCENARIOS: Mapping[str, Scenario] = {
                 "coloured_factor": (0.01, 1.0),
                 "white_factor": (0.01, 1.0),
             },
+            _LATE,
+        ),
+        Scenario(
+            "outliers",
+            "Every twentieth fix on average has ten times the noise; no training episode holds any.",
+            {"outlier_probability": 0.05},
             _LATE,
         ),
     )

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy
 
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws
+from ..draws import Draws, between
 from ..observation import Array
 from ..task import Initial, Task, World
 from .parameters import LooselyCoupledNavigationParameters
@@ -46,6 +46,10 @@ class Truth(NamedTuple):
     """Likewise, ``(2, N)``."""
     spoofing: Array
     """Likewise, ``(2, N)``."""
+    jamming_gain: Array
+    """Standard deviation of the receiver noise under jamming over that without, ``(N,)``."""
+    spoofing_rate: Array
+    """Rate at which every axis is pulled off, m/s, ``(N,)``."""
     deviation: Array
     """True standard deviation of this measurement, m, ``(N,)``."""
     reported_deviation: Array
@@ -82,20 +86,32 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         super().__init__(task)
         axes = self.parameters.axes
         self.initial_normals, self.normals = 2 * axes, 3 * axes
+        self.row_uniforms = 1 if self.parameters.outlier_probability else 0
         self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
         self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Initial]:
         """Draw noise levels, disturbances and rate errors; at the start INS and reference agree."""
         xp, p = self.xp, self.parameters
-        drift_deviation = p.drift * draws.log_uniform("drift_factor", p.drift_factor)
-        coloured_deviation = p.coloured * xp.sqrt(draws.log_uniform("coloured_factor", p.coloured_factor))
-        white_intensity = p.white_intensity * draws.log_uniform("white_factor", p.white_factor)
-        factors = [draws.log_uniform("receiver_factor", p.receiver_factor)]
-        changes = draws.integer("noise_changes", p.noise_changes)
+        calm = draws.event("undisturbed", p.undisturbed) if p.undisturbed else None
+
+        def unless_calm(drawn: Array, otherwise: float) -> Array:
+            return drawn if calm is None else xp.where(calm, otherwise, drawn)
+
+        def factor(name: str, limits: tuple[float, float]) -> Array:
+            return unless_calm(draws.log_uniform(name, limits), 1.0)
+
+        drift_deviation = p.drift * factor("drift_factor", p.drift_factor)
+        coloured_deviation = p.coloured * xp.sqrt(factor("coloured_factor", p.coloured_factor))
+        white_intensity = p.white_intensity * factor("white_factor", p.white_factor)
+        factors = [factor("receiver_factor", p.receiver_factor)]
+        changes = unless_calm(draws.integer("noise_changes", p.noise_changes), 0.0)
         first, second = self._number_at(draws.uniform("change_start", p.change_start, 2))
         factors += list(draws.log_uniform("changed_receiver_factor", p.receiver_factor, 2))
         unreported = draws.event("unreported", p.unreported, 2)
+        windows = {
+            name: unless_calm(self._window(name, draws), NEVER) for name in ("outage", "jamming", "spoofing")
+        }
 
         both = changes == 2
         earlier = xp.where(changes == 0, NEVER, xp.where(both, xp.minimum(first, second), first))
@@ -122,9 +138,9 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             receiver_levels=xp.stack(levels),
             reported_levels=xp.stack(reported),
             change=xp.stack([earlier, later]),
-            outage=self._window("outage", draws),
-            jamming=self._window("jamming", draws),
-            spoofing=self._window("spoofing", draws),
+            **windows,
+            jamming_gain=xp.sqrt(zeros[0] + between(draws.log_uniform, "jamming_factor", p.jamming_factor)),
+            spoofing_rate=zeros[0] + between(draws.uniform, "spoofing_rate", p.spoofing_rate),
             deviation=levels[0],
             reported_deviation=reported[0],
             available=zeros[0] + 1.0,
@@ -144,7 +160,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         return xp.stack([xp.where(happens, first, NEVER), xp.where(happens, beyond, NEVER)])
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
-        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver."""
+        """Move on by one sampling interval and read INS and receiver; noise: coloured, white, receiver, outliers."""
         xp, p, s, n = self.xp, self.parameters, self.parameters.sampling, self.parameters.axes
         number = truth.number + 1.0
         kick = truth.coloured_step * noise[:n]
@@ -163,11 +179,13 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
                 for levels in (truth.receiver_levels, truth.reported_levels)
             )
         if p.jamming_probability:
-            louder = math.sqrt(p.jamming_factor) * deviation
-            deviation = xp.where(within(number, truth.jamming), louder, deviation)
+            deviation = xp.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
+        if p.outlier_probability:
+            louder = math.sqrt(p.outlier_factor) * deviation
+            deviation = xp.where(noise[3 * n] < p.outlier_probability, louder, deviation)
         fix = reference + deviation * noise[2 * n : 3 * n]
         if p.spoofing_probability:
-            pull = (p.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
+            pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
             fix = fix + xp.where(within(number, truth.spoofing), pull, 0.0)
         if p.outage_probability:
             available = xp.where(within(number, truth.outage), 0.0, xp.ones_like(number))
@@ -221,6 +239,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             "receiver_levels": truth.receiver_levels,
             "reported_levels": truth.reported_levels,
             **windows,
+            "jamming_gain": truth.jamming_gain,
+            "spoofing_rate": truth.spoofing_rate,
             "drift": truth.drift,
             "receiver_deviation": truth.deviation,
             "available": truth.available,

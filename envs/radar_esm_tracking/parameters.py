@@ -83,16 +83,28 @@ class RadarEsmTrackingParameters(TaskParameters):
     """"redrawn": the type is drawn anew for every decision, as (8) assumes. "fixed": one type a target."""
     class_change: tuple[float, float] | None = parameter(None, ascending=True)
     """Limits of the time at which the class changes once, s, later than the first scan; None: never (ours)."""
-    silence_start: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability, at each ESM look, that a radiating target falls silent (ours)."""
-    silence_end: float = parameter(1.0, at_least=0.0, at_most=1.0)
-    """Probability, at each ESM look, that a silent target radiates again (ours)."""
-    second_emitter_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
-    """Probability that the ESM hears a second emitter, of another class, instead of the target (ours)."""
+    class_change_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
+    """That it changes in an episode, where there are such limits (ours)."""
+    silence_start: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, at_most=1.0, ascending=True)
+    """Limits of the probability, at each ESM look, that a radiating target falls silent; drawn for each episode
+    (ours)."""
+    silence_end: tuple[float, float] = parameter((1.0, 1.0), at_least=0.0, at_most=1.0, ascending=True)
+    """Limits of the probability, at each ESM look, that a silent target radiates again; likewise (ours)."""
+    second_emitter_probability: tuple[float, float] = parameter(
+        (0.0, 0.0), at_least=0.0, at_most=1.0, ascending=True
+    )
+    """Limits of the probability that the ESM hears a second emitter, of another class, instead of the target;
+    likewise (ours)."""
     second_emitter_separation: tuple[float, float] = parameter(
         (2.0, 20.0), above=0.0, at_most=180.0, ascending=True
     )
     """Limits of its distance in bearing, degrees, to either side (ours)."""
+    glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That both radar errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
+    glint_factor: float = parameter(5.0, above=0.0)
+    """Their standard deviation over that of the others (ours)."""
+    undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability of an episode without silence, second emitter and change of class (ours)."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -117,7 +129,7 @@ class RadarEsmTrackingParameters(TaskParameters):
         # The class at scan 0 must have governed one motion before it can change.
         after_a_scan = Limits(above=self.sampling_interval)
         check("class_change", self.class_change, tuple[float, float] | None, after_a_scan)
-        if self.silence_start + self.silence_end == 0.0:
+        if self.silence_start[0] + self.silence_end[0] == 0.0:
             raise ValueError(
                 "silence_start and silence_end must not both be 0: who radiates would be undefined"
             )

@@ -6,7 +6,7 @@ import numpy
 
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, category
+from ..draws import Draws, between, category
 from ..observation import Array
 from ..task import World
 from .parameters import RadarEsmTrackingParameters
@@ -40,6 +40,12 @@ class Truth(NamedTuple):
     """``(N,)``."""
     separation: Array
     """Its bearing minus the target's, degrees, ``(N,)``."""
+    silence_start: Array
+    """Probability at each look that the target falls silent, ``(N,)``."""
+    silence_end: Array
+    """Probability at each look that a silent target radiates again, ``(N,)``."""
+    second_emitter: Array
+    """Probability that the second emitter is heard instead of the target, ``(N,)``."""
 
 
 class Measurement(NamedTuple):
@@ -76,11 +82,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     parameters: RadarEsmTrackingParameters
     initial_normals = 5
     normals = 7
-    row_uniforms = 4
 
     def __init__(self, task: "RadarEsmTracking") -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
+        self.row_uniforms = 5 if p.glint_probability else 4
         models, start = task.design_models(p)
         # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
         root = numpy.sqrt if p.process_noise == "acceleration" else numpy.linalg.cholesky
@@ -99,8 +105,9 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         self.class_thresholds = _thresholds([share])[:, 0].tolist()
         self.type_thresholds = constant(_thresholds(p.composition))
         self.decision_thresholds = constant(_thresholds(p.recognition))
-        never = (p.horizon + 2) * p.sampling_interval
-        self.class_change = p.class_change or (never, never)
+        self.never = (p.horizon + 2) * p.sampling_interval
+        """Time of a change that does not happen, s."""
+        self.class_change = p.class_change or (self.never, self.never)
 
     # --- the target and its emissions
 
@@ -118,7 +125,20 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         other_type = draws.category("other_type", self._types_of(other_class))
         separation = draws.uniform("separation", p.second_emitter_separation)
         side = xp.where(draws.event("other_side", 0.5), -1.0, 1.0)
-        radiating = draws.unit("radiating") * (p.silence_start + p.silence_end) < p.silence_end
+        radiating = draws.unit("radiating")
+        zero = 0.0 * distance
+        silence_start = zero + between(draws.uniform, "silence_start", p.silence_start)
+        silence_end = zero + between(draws.uniform, "silence_end", p.silence_end)
+        second_emitter = zero + between(
+            draws.uniform, "second_emitter_probability", p.second_emitter_probability
+        )
+        if p.class_change_probability < 1.0:
+            changes = draws.event("class_changes", p.class_change_probability)
+            change = xp.where(changes, change, self.never)
+        if p.undisturbed:
+            calm = draws.event("undisturbed", p.undisturbed)
+            silence_start, second_emitter = (xp.where(calm, 0.0, x) for x in (silence_start, second_emitter))
+            silence_end, change = xp.where(calm, 1.0, silence_end), xp.where(calm, self.never, change)
         acceleration = xp.take(self.acceleration_sigma, target_class, axis=0) * normals[0]
         truth = Truth(
             scan=xp.zeros_like(target_class),
@@ -128,13 +148,15 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             change_scan=xp.astype(xp.ceil(change / p.sampling_interval), xp.int64),
             next_class=next_class,
             next_type=next_type,
-            radiating=radiating,
+            radiating=radiating * (silence_start + silence_end) < silence_end,
             other_class=other_class,
             other_type=other_type,
             separation=side * separation,
+            silence_start=silence_start,
+            silence_end=silence_end,
+            second_emitter=second_emitter,
         )
         first = self._measured(truth, normals[1:], draws.unit("first_intercept", 3))
-        zero = 0.0 * distance
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
 
@@ -151,7 +173,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Fly one scan under the class at the previous one, let the class change and fall silent, and measure.
 
         A row of noise: 3 normal numbers for the motion, 2 for the radar, 2 for the bearings; uniform ones for
-        the type, the decision, the source, and falling silent.
+        the type, the decision, the source, falling silent, and glint where there is any.
         """
         xp, p = self.xp, self.parameters
         scan = truth.scan + 1
@@ -171,10 +193,14 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
                 target_class=xp.where(changed, truth.next_class, truth.target_class),
                 emitter_type=xp.where(changed, truth.next_type, truth.emitter_type),
             )
-        if p.silence_start > 0.0:
-            on = xp.where(truth.radiating, noise[10] >= p.silence_start, noise[10] < p.silence_end)
+        if p.silence_start[1] > 0.0:
+            on = xp.where(truth.radiating, noise[10] >= truth.silence_start, noise[10] < truth.silence_end)
             truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
-        return truth, self._measured(truth, noise[3:7], noise[7:10])
+        measured = noise[3:7]
+        if p.glint_probability:
+            louder = xp.where(noise[11] < p.glint_probability, p.glint_factor, xp.ones_like(noise[11]))
+            measured = xp.concat([louder * noise[3:5], noise[5:7]])
+        return truth, self._measured(truth, measured, noise[7:10])
 
     # --- the sensors
 
@@ -195,8 +221,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         )
         heard_class, heard_type, heard = truth.target_class, truth.emitter_type, truth.radiating
         esm_bearing = p.esm_bearing_sigma * normals[3]
-        if p.second_emitter_probability > 0.0:
-            other = uniforms[2] < p.second_emitter_probability
+        if p.second_emitter_probability[1] > 0.0:
+            other = uniforms[2] < truth.second_emitter
             heard_class = xp.where(other, truth.other_class, heard_class)
             heard_type = xp.where(other, truth.other_type, heard_type)
             heard = other | heard
@@ -239,18 +265,21 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Class and type of the target now, when they change (scan) and to what, the second emitter, and whether the
         target is silent now.
         """
-        changes = self.parameters.class_change is not None
-        xp = self.xp
+        p, xp = self.parameters, self.xp
         never = 0 * truth.change_scan - 1
+        changes = (p.class_change is not None) & (truth.change_scan <= p.horizon + 1)
         return {
             "target_class": truth.target_class,
             "emitter_type": truth.emitter_type,
-            "change_scan": truth.change_scan if changes else never,
-            "next_class": truth.next_class if changes else never,
-            "next_type": truth.next_type if changes else never,
+            "change_scan": xp.where(changes, truth.change_scan, never),
+            "next_class": xp.where(changes, truth.next_class, never),
+            "next_type": xp.where(changes, truth.next_type, never),
             "other_class": truth.other_class,
             "other_type": truth.other_type,
             "separation": truth.separation,
+            "silence_start": truth.silence_start,
+            "silence_end": truth.silence_end,
+            "second_emitter": truth.second_emitter,
             "radiating": xp.astype(truth.radiating, xp.float64),
         }
 

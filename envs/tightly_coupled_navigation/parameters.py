@@ -128,14 +128,17 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Limits of the speed of a random course that does not start at rest, m/s. Ours."""
     rest_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
     """That a random course starts at rest. Ours."""
+    manoeuvre_throughout: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability that a random course is one manoeuvre from its start to its end, with the strength that its second
+    leg would have. Ours."""
     true_increment_sigma: float = parameter(0.02, at_least=0.0, at_most=100.0)
     """True random velocity increment on legs of constant velocity of the random course, m/s per step. Ours:
     that of hypothesis 2, so that the known mode is the optimum."""
 
     rate_fault_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
     """That one satellite's rate channel is noisy for a while. Ours."""
-    rate_fault_factor: float = parameter(5.0, above=0.0)
-    """How much noisier. Ours."""
+    rate_fault_factor: tuple[float, float] = parameter((5.0, 5.0), above=0.0, ascending=True)
+    """Limits of how much noisier. Ours."""
     rate_fault_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
     """s. Ours."""
     stick_probability: float = parameter(0.5, at_least=0.0, at_most=1.0)
@@ -150,9 +153,19 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """That two satellites drop out for a while. Ours."""
     satellites_outage_duration: tuple[float, float] = parameter((2.0, 2.0), at_least=0.0, ascending=True)
     """s. Ours."""
+    ramp_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That one satellite's pseudorange drifts off from some time to the end, as one with a failing clock does. Ours."""
+    ramp_start: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
+    """Limits of that time, s. Ours."""
+    ramp_rate: float = 10.0
+    """m/s; the rate channel does not show it. Ours."""
+    undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability of an episode in which no sensor fails, with neither reception between houses nor apertures. Ours."""
     urban: bool = False
     """Whether pseudoranges have the positive, heavy-tailed errors of reception between houses. Ours: medians
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""
+    urban_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
+    """Share of the episodes that are between houses, where there are any. Ours."""
     urban_hold: tuple[float, float] = parameter((0.5, 2.0), at_least=0.0, ascending=True)
     """Limits of the time for which such an error holds, s. Ours."""
     urban_cn0_walk: float = parameter(0.5, at_least=0.0)
@@ -164,6 +177,8 @@ class TightlyCoupledNavigationParameters(TaskParameters):
 
     aperture: bool = False
     """Whether the tracking loops, steered by the combined prediction, lose what they do not expect."""
+    aperture_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
+    """Share of the episodes in which they do, where they do at all. Ours."""
     rate_aperture: float = parameter(9.36, above=0.0)
     """m/s: wavelength of L1 over four times a coherent time of 5 ms. Ours."""
     range_aperture: float = parameter(293.0, above=0.0)

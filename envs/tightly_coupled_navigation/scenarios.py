@@ -50,32 +50,43 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 "random",
-                "Legs of rest, constant velocity and manoeuvre at random; a noisy rate channel, stuck accelerometers, "
-                "lost rates or hidden satellites for a while: the training distribution.",
+                "Training distribution: legs of rest, constant velocity and manoeuvre at random, or one manoeuvre "
+                "throughout, gentle to hard; a noisy rate channel, stuck accelerometers, lost rates or hidden "
+                "satellites for a while, reception between houses, tracking loops steered by the filter, each in some "
+                "episodes; in one of six nothing of these.",
                 {
-                    "rates_outage_probability": 0.2,
-                    "rates_outage_duration": (0.1, 1.0),
-                    "satellites_outage_probability": 0.2,
-                    "satellites_outage_duration": (0.5, 3.0),
+                    "strength": (0.5, 40.0),
+                    "manoeuvre_throughout": 0.15,
+                    "rate_fault_factor": (2.0, 10.0),
+                    "stick_duration": (0.3, 5.0),
+                    "rates_outage_probability": 0.25,
+                    "rates_outage_duration": (0.1, 3.0),
+                    "satellites_outage_probability": 0.25,
+                    "satellites_outage_duration": (0.1, 3.0),
+                    "urban": True,
+                    "urban_probability": 0.2,
+                    "aperture": True,
+                    "aperture_probability": 0.2,
+                    "undisturbed": 1.0 / 6.0,
                 },
                 RANDOM_WINDOWS,
                 training=True,
             ),
             Scenario(
                 "rates-lost",
-                "As random without faults; all pseudorange rates are lost for 2 s.",
+                "Legs as in random, without faults; all pseudorange rates are lost for 2 s.",
                 {**HEALTHY, "rates_outage_probability": 1.0},
                 RANDOM_WINDOWS,
             ),
             Scenario(
                 "two-satellites",
-                "As random without faults; two of the satellites drop out for 2 s.",
+                "Legs as in random, without faults; two of the satellites drop out for 2 s.",
                 {**HEALTHY, "satellites_outage_probability": 1.0},
                 RANDOM_WINDOWS,
             ),
             Scenario(
                 "accelerometer-failure",
-                "As random; the accelerometers stick at their last reading for 2 to 4 s.",
+                "Legs as in random; the accelerometers stick at their last reading for 2 to 4 s.",
                 {"rate_fault_probability": 0.0, "stick_probability": 1.0, "stick_duration": (2.0, 4.0)},
                 RANDOM_WINDOWS,
             ),
@@ -84,6 +95,13 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
                 "A vehicle between houses: slow, gentle; pseudoranges with positive heavy-tailed errors by "
                 "C/N0.",
                 {**HEALTHY, "urban": True, "strength": (0.5, 4.0), "initial_speed": (0.0, 15.0)},
+                RANDOM_WINDOWS,
+            ),
+            Scenario(
+                "satellite-ramp",
+                "Legs as in random, without faults; one satellite's pseudorange drifts off at 10 m/s, from a time "
+                "between 1 and 3 s to the end. No training episode holds any.",
+                {**HEALTHY, "ramp_probability": 1.0},
                 RANDOM_WINDOWS,
             ),
         )

@@ -13,7 +13,7 @@ import numpy
 
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws
+from ..draws import Draws, between
 from ..observation import Array
 from ..task import Initial, Task, World
 from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
@@ -58,6 +58,20 @@ class Faults(NamedTuple):
     """Two satellites are gone."""
     hidden_satellites: Array
     """Places of those two, ``(2, N)``."""
+    rate_factor: Array
+    """How much noisier the noisy rate is, ``(N,)``."""
+    ramp: Array
+    """First step at which a pseudorange is off, and the last step of all."""
+    ramp_satellite: Array
+    """Place of that satellite, ``(N,)``."""
+    urban: Array
+    """One between houses, else zero, ``(N,)``."""
+    aperture: Array
+    """One where the tracking loops lose what they do not expect, else zero, ``(N,)``."""
+
+
+FAULT_WINDOWS = ("noisy", "stuck", "no_rates", "hidden", "ramp")
+"""Which of these are first and last steps."""
 
 
 class Truth(NamedTuple):
@@ -141,8 +155,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         faults = self._faults(draws)
         # Drawn in open country too: every scenario takes the same numbers.
         cn0 = draws.uniform("cn0", p.cn0_limits, S)
-        if not p.urban:
-            cn0 = p.clear_cn0 + 0.0 * cn0
+        faults = self._further_faults(draws, faults)
+        cn0 = xp.where(faults.urban > 0.0, cn0, p.clear_cn0)
         none = zeros[None]
         moving = xp.concat([none] * 4 + [velocity, none, legs.acceleration[:, 0]] + [none] * 6)
         spread = self.initial_sigma * normals
@@ -213,7 +227,18 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             direction = xp.stack([xp.sin(turn) * cosine, xp.cos(turn) * cosine, sine])
             columns.append((start, kind, size * direction))
             start = start + xp.clip(xp.round(seconds / p.sampling_interval), 1.0, None)
-        return Legs(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))), velocity
+        legs = Legs(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True)))
+        if p.manoeuvre_throughout and p.legs > 1:
+            # The second leg is a manoeuvre: it begins at once and the others never.
+            throughout = draws.event("manoeuvre_throughout", p.manoeuvre_throughout)
+            later = [0.0 * start] + [0.0 * start + (p.horizon + 2.0)] * (p.legs - 1)
+            second = xp.stack([legs.acceleration[:, 1]] * p.legs, axis=1)
+            legs = Legs(
+                xp.where(throughout, xp.stack(later), legs.start),
+                xp.where(throughout, float(SINGER), legs.kind),
+                xp.where(throughout, second, legs.acceleration),
+            )
+        return legs, velocity
 
     def _faults(self, draws: Draws) -> Faults:
         """Draw what goes wrong, and when."""
@@ -235,7 +260,44 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         hidden = sometimes("hidden", p.satellites_outage_probability, p.satellites_outage_duration)
         first = draws.integer("hidden_satellite", (0, S - 1))
         second = (first + 1.0 + draws.integer("other_hidden_satellite", (0, max(S - 2, 0)))) % S
-        return Faults(noisy, noisy_satellite, stuck, no_rates, hidden, xp.stack([first, second]))
+        zero = 0.0 * first
+        return Faults(
+            noisy=noisy,
+            noisy_satellite=noisy_satellite,
+            stuck=stuck,
+            no_rates=no_rates,
+            hidden=hidden,
+            hidden_satellites=xp.stack([first, second]),
+            rate_factor=zero + p.rate_fault_factor[0],
+            ramp=xp.stack([zero, zero]) - 1.0,
+            ramp_satellite=zero,
+            urban=zero + float(p.urban),
+            aperture=zero + float(p.aperture),
+        )
+
+    def _further_faults(self, draws: Draws, faults: Faults) -> Faults:
+        """Draw what only some scenarios draw: the others take as many numbers as ever."""
+        xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
+        zero = 0.0 * faults.rate_factor
+        factor = zero + between(draws.log_uniform, "rate_fault_factor", p.rate_fault_factor)
+        faults = faults._replace(rate_factor=factor)
+        if p.ramp_probability:
+            happens = draws.event("ramp", p.ramp_probability)
+            first = 1.0 + xp.round(draws.uniform("ramp_start", p.ramp_start) / T)
+            ramp = xp.where(happens, xp.stack([first, zero + p.horizon + 1.0]), -1.0)
+            satellite = draws.integer("ramp_satellite", (0, self.task.satellites - 1))
+            faults = faults._replace(ramp=ramp, ramp_satellite=satellite)
+        for name in ("urban", "aperture"):
+            share = getattr(p, f"{name}_probability")
+            if getattr(p, name) and share < 1.0:
+                here = xp.astype(draws.event(name, share), zero.dtype)
+                faults = faults._replace(**{name: here})
+        if p.undisturbed:
+            calm = draws.event("undisturbed", p.undisturbed)
+            windows = {name: xp.where(calm, -1.0, getattr(faults, name)) for name in FAULT_WINDOWS}
+            places = {name: xp.where(calm, 0.0, getattr(faults, name)) for name in ("urban", "aperture")}
+            faults = faults._replace(**windows, **places)
+        return faults
 
     # --- one measurement
 
@@ -261,7 +323,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         gone = faults.hidden_satellites
         hidden = self._during(faults.hidden, k) & ((self.places == gone[0]) | (self.places == gone[1]))
         seen = xp.where(hidden, 0.0, ones[: task.satellites])
-        factor = self._each(ones, rates=xp.where(noisy, p.rate_fault_factor, ones[: task.satellites]))
+        factor = self._each(ones, rates=xp.where(noisy, faults.rate_factor, ones[: task.satellites]))
         available = self._each(
             ones, pseudoranges=seen, rates=xp.where(self._during(faults.no_rates, k), 0.0, seen)
         )
@@ -272,11 +334,18 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         measured = exact + task.sensor_sigma * factor * noise[:m]
         ranges, rates, forces, attitude = (measured[sensor.readings] for sensor in task.sensors)
         forces = xp.where(stuck, truth.accelerometers, forces)
-        readings = xp.concat([ranges + truth.multipath, rates, forces, attitude])
+        ranges = ranges + truth.multipath
+        if p.ramp_probability:
+            off = self._during(faults.ramp, k) & (self.places == faults.ramp_satellite)
+            ranges = ranges + xp.where(
+                off, (p.ramp_rate * p.sampling_interval) * (k - faults.ramp[0] + 1.0), 0.0
+            )
+        readings = xp.concat([ranges, rates, forces, attitude])
         if feedback is not None:
             expected = gnss_ins.ranges(feedback, gnss_ins.geometry(feedback, position, velocity))
             innovation = readings[task.tracked] - xp.concat(expected)
-            kept = xp.astype(xp.abs(innovation) <= task.apertures, noise.dtype)
+            kept = (xp.abs(innovation) <= task.apertures) | (faults.aperture < 0.5)
+            kept = xp.astype(kept, noise.dtype)
             available = xp.concat([available[task.tracked] * kept, available[task.tracked.stop :]])
         truth = truth._replace(
             step=step,
@@ -363,9 +432,10 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         ended = truth.hold <= 0.0
         shortest, longest = p.urban_hold
         steps = xp.round((shortest + (longest - shortest) * uniform) / p.sampling_interval)
+        outside = truth.faults.urban < 0.5
         return truth._replace(
-            cn0=cn0,
-            multipath=xp.where(ended, error, truth.multipath),
+            cn0=xp.where(outside, truth.cn0, cn0),
+            multipath=xp.where(outside, 0.0, xp.where(ended, error, truth.multipath)),
             hold=xp.where(ended, steps, truth.hold) - 1.0,
         )
 
@@ -405,6 +475,10 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             "no_rates": window(faults.no_rates),
             "hidden": window(faults.hidden),
             "hidden_satellites": faults.hidden_satellites,
+            "ramp": window(faults.ramp),
+            "ramp_satellite": faults.ramp_satellite,
+            "urban": faults.urban,
+            "aperture": faults.aperture,
             "mode": truth.mode,
             "noise_factor": truth.noise_factor,
             "stuck_now": truth.stuck,

@@ -139,6 +139,8 @@ class UavAutopilotParameters(TaskParameters):
     """Each sensor drops out once in every so many measurements; zero: never."""
     dropout_length: tuple[int, int] = parameter((1, 15), at_least=1, ascending=True)
     """Range of their length in measurements. Ours: up to half a settling time."""
+    undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability of an episode without dropouts in which all levels and factors are one. Ours."""
 
     gain_decades: float = parameter(0.5, above=0.0, at_most=8.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the

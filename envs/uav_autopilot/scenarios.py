@@ -12,11 +12,12 @@ from ..task import Scenario
 
 _RANDOM = {
     "command_amplitude": (0.25, 1.0),
-    "disturbance_levels": ((0.25, 4.0), (0.25, 4.0), (0.25, 4.0)),
+    "disturbance_levels": ((0.2, 5.0), (0.2, 5.0), (0.2, 5.0)),
     "disturbance_times": ((100, 250), (350, 500)),
-    "sensor_levels": ((0.5, 2.0), (0.5, 5.0)),
+    "sensor_levels": ((0.5, 6.0), (0.5, 6.0)),
     "sensor_times": ((150, 450),),
     "dropout_period": 300,
+    "undisturbed": 1.0 / 6.0,
 }
 _NOMINAL_WITH_COMMANDS = {"command_amplitude": (0.25, 1.0)}
 
@@ -37,8 +38,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "random",
-            "Steps and doublets of the command; gust level and sensor noise drawn for each episode and "
-            "changing inside it; short dropouts of single sensors.",
+            "Training distribution: steps and doublets of the command; gust level and sensor noise drawn for each "
+            "episode and changing inside it; short dropouts of single sensors; in one of six nothing of these.",
             _RANDOM,
             {"steady": (50, 600)},
             training=True,
@@ -66,7 +67,8 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "actuator-lag",
-            "The actuator is twice as slow as the filter and the autopilot believe (plant U).",
+            "The actuator is twice as slow as the filter and the autopilot believe (plant U); no training episode "
+            "holds the like.",
             {**_NOMINAL_WITH_COMMANDS, "actuator_lag": 2.0},
             {"steady": (100, 600)},
         ),

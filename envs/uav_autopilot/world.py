@@ -143,6 +143,11 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
             room = draws.unit(f"dropout_{i}", m) * (p.dropout_period - length)
             starts.append(i * p.dropout_period + 1.0 + xp.floor(room))
             stops.append(starts[-1] + length)
+        if p.undisturbed:
+            calm = draws.event("undisturbed", p.undisturbed)
+            levels = levels._replace(values=xp.where(calm, 1.0, levels.values))
+            sensor_levels = sensor_levels._replace(values=xp.where(calm, 1.0, sensor_levels.values))
+            stops = [xp.where(calm, start, stop) for start, stop in zip(starts, stops, strict=True)]
         if p.plant == "U":
             state = xp.concat([state[:-1], state[-1:] * levels.values[0]])
         truth = Truth(
