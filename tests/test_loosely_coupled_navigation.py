@@ -406,25 +406,65 @@ def test_disturbances_stand_where_they_are_drawn():
             assert (end <= windows["after"][0]).all()
 
 
-def test_random_draws_a_decade_and_reports_half_of_the_changes():
-    task, lanes = make("random"), 20000
+def test_random_draws_what_it_says_and_reports_half_of_the_changes():
+    task, lanes = make("random", undisturbed=0.0), 20000
     state = task.begin(*numbers(task, lanes, 0, 8)[:2]).truth
     low, high = 10**-0.5, 10**0.5
     intensities = state.receiver_levels**2 / 2.0
-    for drawn in (state.drift_deviation / 0.6, *intensities):
-        assert low <= drawn.min() * (1 + 1e-12)
+    for lowest, drawn in ((0.05, state.drift_deviation / 0.6), *((low, values) for values in intensities)):
+        assert lowest <= drawn.min() * (1 + 1e-12)
         assert drawn.max() <= high * (1 + 1e-12)
-        assert abs(np.log(drawn).mean()) < 4 * math.log(10) / math.sqrt(12 * lanes)
-    one = state.change[1] > 1e6
-    assert abs(one.mean() - 0.5) < 2 / math.sqrt(lanes)
-    assert (state.change[0] < state.change[1] + 1).all()
+        middle, width = 0.5 * math.log(lowest * high), math.log(high / lowest)
+        assert abs(np.log(drawn).mean() - middle) < 4 * width / math.sqrt(12 * lanes)
+    changes = (state.change < 1e6).sum(axis=0)
+    for count in range(3):
+        assert abs((changes == count).mean() - 1 / 3) < 4 * math.sqrt(2 / 9 / lanes)
+    assert (state.change[0] <= state.change[1]).all()
     silent = state.reported_levels[1] == state.reported_levels[0]
     assert abs(silent.mean() - 0.5) < 2 / math.sqrt(lanes)
-    assert abs((state.outage[0] < 1e6).mean() - 0.5) < 2 / math.sqrt(lanes)
+    for window, share in ((state.outage, 0.4), (state.jamming, 0.25), (state.spoofing, 0.25)):
+        assert abs((window[0] < 1e6).mean() - share) < 2 / math.sqrt(lanes)
+    gain, rate = 2.0 * np.log(state.jamming_gain), state.spoofing_rate
+    assert math.log(3.0) <= gain.min() < math.log(3.1)
+    assert math.log(290.0) < gain.max() <= math.log(300.0)
+    assert -3.0 <= rate.min() < -2.9
+    assert 2.9 < rate.max() < 3.0
+
+
+def test_nothing_befalls_one_of_six():
+    task, lanes = make("random"), 20000
+    state = task.begin(*numbers(task, lanes, 0, 8)[:2]).truth
+    calm = state.drift_deviation == 0.6
+    assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / lanes)
+    modelled = make("paper").begin(*numbers(make("paper"), 8, 0, 8)[:2]).truth
+    for name in ("coloured_step", "white_step"):
+        assert getattr(state, name)[calm] == pytest.approx(getattr(modelled, name)[0], rel=1e-12)
+    assert state.receiver_levels[0, calm] == pytest.approx(math.sqrt(2.0), rel=1e-12)
+    for name in ("change", "outage", "jamming", "spoofing"):
+        assert (getattr(state, name)[:, calm] == 1e9).all()
+
+
+def test_outliers_are_as_many_and_as_large_as_stated():
+    task, lanes = make("outliers", horizon=50), 4000
+    uniforms, normals, rows = numbers(task, lanes, 50, 8)
+    state = task.begin(uniforms, normals)
+    seen, rng = [], np.random.default_rng(0)
+    for row in rows:
+        row[3] = rng.random(lanes)
+        state = task.measure(state, row)
+        seen.append(state.truth.deviation)
+        error = state.measurement.fix - state.truth.reference
+        # The error is what is left of a position of 2 m.
+        assert error[0] == pytest.approx(state.truth.deviation * row[2], abs=1e-14)
+    far = np.array(seen) > 2.0
+    assert abs(far.mean() - 0.05) < 4 * math.sqrt(0.05 * 0.95 / far.size)
+    assert np.array(seen)[far] == pytest.approx(10.0 * math.sqrt(2.0), rel=1e-12)
+    assert np.array(seen)[~far] == pytest.approx(math.sqrt(2.0), rel=1e-12)
 
 
 def test_ins_noise_has_the_drawn_intensities():
-    task = make("random")
+    low = 10**-0.5
+    task = make("random", coloured_factor=(low, 1 / low), white_factor=(low, 1 / low), undisturbed=0.0)
     state = task.begin(*numbers(task, 6, 0, 9)[:2]).truth
     s = task.parameters.sampling
     for i in range(6):

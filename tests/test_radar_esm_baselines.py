@@ -172,7 +172,7 @@ def played(task, estimator, seeds, decisions):
 
 
 def test_ideal_is_the_channel_of_the_true_class():
-    task = make_task(ID, scenario="random")
+    task = make_task(ID, scenario="random", class_change=None)
     _, states = played(task, Ideal(task), range(24), 120)
     for episode, mean, covariance in states:
         lane, true = numpy.arange(24), episode.truth.target_class

@@ -164,7 +164,7 @@ def test_fields_and_shapes():
 
 
 def test_observation_shows_what_it_names():
-    task = make("random", averaging_measurements=1.0)
+    task = make("random", averaging_measurements=1.0, second_emitter_probability=(0.0, 0.0))
     noise = draw(task, 64, 3)
     decided = refused = 0
     for k, (state, observation, _) in enumerate(roll(task, noise), start=1):
@@ -282,8 +282,9 @@ def test_everyone_is_told_the_first_measurement_and_how_good_it_is():
 
 WORLDS = {
     "true_class": "S2", "emitter": "fixed", "initial_range": (1e3, 2e3), "closing_speed": (-50.0, -40.0),
-    "class_change": (2.0, 3.0), "silence_start": 0.5, "silence_end": 0.5, "second_emitter_probability": 0.9,
-    "second_emitter_separation": (90.0, 91.0),
+    "class_change": (2.0, 3.0), "class_change_probability": 0.9, "silence_start": (0.4, 0.5), "silence_end": (0.5, 0.6),
+    "second_emitter_probability": (0.8, 0.9), "second_emitter_separation": (90.0, 91.0), "glint_probability": 0.3,
+    "undisturbed": 0.1,
 }  # fmt: skip
 """Parameters of what is and nothing else; no filter may know them."""
 
@@ -397,6 +398,51 @@ def test_class_changes_once_within_its_limits():
     assert scans.std() == pytest.approx(60 / math.sqrt(12), rel=0.1)
 
 
+def test_random_targets_are_silent_crowded_or_change_or_none_of_it():
+    task, N = make("random"), 8000
+    uniforms, normals, _ = draw(task, N, 14)
+    truth = task.begin(uniforms, normals).truth
+    four = 4.0 * math.sqrt(0.25 / N)
+    calm = (truth.silence_start == 0.0) & (truth.silence_end == 1.0) & (truth.second_emitter == 0.0)
+    assert abs(calm.mean() - 1 / 6) < four
+    changes = truth.change_scan <= task.horizon
+    assert not changes[calm].any()
+    assert abs(changes[~calm].mean() - 1 / 3) < four
+    assert truth.change_scan[changes].min() >= 10
+    assert truth.change_scan[changes].max() <= 110
+    assert truth.radiating[calm].all()
+    share = truth.silence_end / (truth.silence_start + truth.silence_end)
+    assert abs(truth.radiating.mean() - share.mean()) < four
+    for values, low, high in (
+        (truth.silence_start, 0.0, 0.5),
+        (truth.silence_end, 0.05, 1.0),
+        (truth.second_emitter, 0.0, 0.6),
+    ):
+        drawn = values[~calm]
+        assert low <= drawn.min() < low + 0.01
+        assert high - 0.01 < drawn.max() <= high
+        assert drawn.mean() == pytest.approx(
+            0.5 * (low + high), abs=4.0 * (high - low) / math.sqrt(12 * drawn.size)
+        )
+
+
+def test_glint_is_as_frequent_and_as_large_as_stated():
+    task = make("glint", horizon=60)
+    uniforms, normals, rows = draw(task, 1000, 15)
+    state, factors = task.begin(uniforms, normals), []
+    for row in rows:
+        state = task.measure(state, row)
+        error = state.measurement.radar - state.truth.motion[:2]
+        factor = error / (numpy.array([[3000.0], [20.0]]) * row[3:5])
+        # The error is what is left of a range of 1e5 m; normal numbers near zero magnify its rounding.
+        sure = (numpy.abs(row[3:5]) > 1e-3).all(axis=0)
+        assert factor[0, sure] == pytest.approx(factor[1, sure], rel=1e-6)
+        factors.append(factor[0, sure].round(6))
+    factors = numpy.concatenate(factors)
+    assert set(factors.tolist()) == {1.0, 5.0}
+    assert abs((factors == 5.0).mean() - 0.1) < 4.0 * math.sqrt(0.09 / factors.size)
+
+
 def test_silent_targets_radiate_in_bursts():
     task = make("silent")
     *_, (_, _, state) = roll(task, draw(task, 2000, 13))
@@ -415,8 +461,8 @@ def test_silent_targets_radiate_in_bursts():
         ({"true_class": "S3"}, "true_class must be one of 'random', 'S0', 'S1', 'S2', got 'S3'"),
         ({"emitter": "sometimes"}, "emitter must be one of"),
         ({"association_error": 1.0}, "association_error must be .* below 1"),
-        ({"second_emitter_probability": 1.5}, "second_emitter_probability must be .* at most 1"),
-        ({"silence_start": 0.0, "silence_end": 0.0}, "must not both be 0"),
+        ({"second_emitter_probability": (0.0, 1.5)}, r"second_emitter_probability\[1\] must be .* at most 1"),
+        ({"silence_start": (0.0, 0.1), "silence_end": (0.0, 0.1)}, "must not both be 0"),
         ({"acceleration_sigma": (1.0, 2.0)}, "acceleration_sigma must be 3 numbers"),
         ({"range_sigma": 0.0}, "range_sigma must be .* above 0"),
         ({"initial_range": (2e5, 1e5)}, "initial_range must be in ascending order"),

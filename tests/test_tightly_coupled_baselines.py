@@ -67,6 +67,7 @@ def test_bound_is_the_dense_recursion():
         "stick_probability": 1.0, "stick_duration": (0.1, 0.15), "rates_outage_probability": 0.5,
         "rates_outage_duration": (0.05, 0.1), "satellites_outage_probability": 1.0,
         "satellites_outage_duration": (0.1, 0.1), "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
+        "manoeuvre_throughout": 0.0, "undisturbed": 0.0, "urban": False, "aperture": False,
     }  # fmt: skip
     task = make_task(ID, **keywords)
     seen, bounds = [], []

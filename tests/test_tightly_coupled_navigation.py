@@ -297,6 +297,71 @@ def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
     assert (probabilities.max(axis=0) > 0.5).all()
 
 
+UNMIXED = {"urban": False, "aperture": False, "undisturbed": 0.0}
+"""Without what only some episodes of ``random`` have."""
+
+
+def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre():
+    task, N = make("random", horizon=300), 4000
+    uniforms, normals, _ = numbers(task, N, 21, 0)
+    truth = task.begin(uniforms, normals).truth
+    faults, p = truth.faults, task.parameters
+    four = 4.0 * math.sqrt(0.25 / N)
+    windows = numpy.stack([faults.noisy, faults.stuck, faults.no_rates, faults.hidden, faults.ramp])[:, 1]
+    calm = (windows < 0.0).all(axis=0) & (faults.urban == 0.0) & (faults.aperture == 0.0)
+    without = (1 - 0.3) * (1 - 0.3) * (1 - 0.15) * (1 - 0.2) * (1 - 0.15) * (1 - 0.2)
+    assert abs(calm.mean() - (p.undisturbed + (1 - p.undisturbed) * without)) < four
+    for values, share in ((faults.urban, 0.15), (faults.aperture, 0.2)):
+        assert abs(values.mean() - (1 - p.undisturbed) * share) < four
+    assert (faults.ramp == -1.0).all()
+    throughout = (truth.legs.kind == 2.0).all(axis=0)
+    assert abs(throughout.mean() - 0.15) < four
+    assert (truth.legs.start[1:, throughout] > p.horizon + 1).all()
+    strength = numpy.linalg.norm(truth.legs.acceleration, axis=0)
+    assert strength[:, faults.urban > 0.0].max() <= 4.0 + 1e-12
+    assert strength.max() > 39.0
+    speed = numpy.linalg.norm(truth.state[4:7], axis=0)
+    assert 10.0 < speed[faults.urban > 0.0].max() <= 15.0 + 1e-9
+    assert speed.max() > 290.0
+    assert (truth.cn0[:, faults.urban == 0.0] == p.clear_cn0).all()
+
+
+def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_reflections():
+    task = make("random", aperture_probability=0.5, urban_probability=0.5, undisturbed=0.0, rate_aperture=0.1)
+    lost, off = numpy.zeros(16), numpy.zeros(16)
+    for _, state, _, _ in drive(task, 16, 22, 60):
+        faults, step = state.truth.faults, state.truth.step
+        excused = numpy.zeros(16, dtype=bool)
+        for first, last in (faults.no_rates, faults.hidden):
+            excused |= (first <= step) & (step <= last)
+        lost += (state.measurement.available[4:8] == 0.0).any(axis=0) & ~excused
+        off += (state.truth.range_error != 0.0).any(axis=0)
+    assert (lost[faults.aperture == 0.0] == 0.0).all()
+    assert (lost[faults.aperture == 1.0] > 0.0).all()
+    assert 0 < faults.aperture.sum() < 16
+    assert (off[faults.urban == 0.0] == 0.0).all()
+    assert (off[faults.urban == 1.0] > 0.0).all()
+    assert 0 < faults.urban.sum() < 16
+
+
+def test_a_pseudorange_drifts_off_as_stated():
+    quiet = make("satellite-ramp", pseudorange_sigma=1e-6)
+    for k, state, _, _ in drive(quiet, 8, 23, 350):
+        s = state.truth
+        place, first = s.faults.ramp_satellite.astype(int), s.faults.ramp[0]
+        expected = numpy.where(k >= first, 10.0 * 0.01 * (k - first + 1.0), 0.0)
+        error = numpy.zeros((4, 8))
+        error[place, numpy.arange(8)] = expected
+        assert s.range_error == pytest.approx(error, abs=1e-12)
+        ranges, _ = gnss_ins.observe(
+            s.state, *quiet.satellites_at(s.step), state.measurement.ins_angles, quiet.parameters.gravity
+        )
+        # Ranges of 2e7 m are rounded by 4e-9, the noise is 1e-6.
+        assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-5)
+    assert ((first >= 101) & (first <= 301)).all()
+    assert (error > 0.0).sum(axis=0).all()
+
+
 def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     task = make(
         "random",
@@ -305,11 +370,15 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         rates_outage_probability=0.0,
         satellites_outage_probability=1.0,
         satellites_outage_duration=(2.0, 2.0),
+        stick_duration=(0.3, 1.0),
+        rate_fault_duration=(1.0, 3.0),
+        **UNMIXED,
     )
     previous, noisy, stuck, out = None, 0, 0, 0
     for k, state, _, _ in drive(task, 8, 11, 600):
         s, said = state.truth, state.measurement
-        noisy = noisy + (s.noise_factor[4:8] == 5.0).sum(axis=0)
+        assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.faults.rate_factor)).all()
+        noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
         assert (s.noise_factor[:4] == 1.0).all()
         held = (s.step >= s.faults.stuck[0]) & (s.step <= s.faults.stuck[1]) & (k > 1)
         assert (held == (s.stuck == 1.0)).all()
@@ -325,10 +394,12 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
     assert (out == 200).all()
     assert ((noisy >= 100) & (noisy <= 300)).all()
     assert ((stuck >= 29) & (stuck <= 100)).all()
+    assert ((s.faults.rate_factor > 2.0) & (s.faults.rate_factor < 10.0)).all()
+    assert numpy.ptp(s.faults.rate_factor) > 2.0
 
 
 def test_rates_are_lost_when_it_is_drawn():
-    task = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5)
+    task = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5, **UNMIXED)
     lost, drawn = 0, 0
     for _, state, _, _ in drive(task, 16, 11, 600):
         (first, last), step = state.truth.faults.no_rates, state.truth.step
@@ -342,7 +413,7 @@ def test_rates_are_lost_when_it_is_drawn():
 
 def test_outages_are_as_probable_and_as_long_as_stated():
     runs = 4000
-    task = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6)
+    task = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6, **UNMIXED)
     p = task.parameters
     faults = task.begin(*numbers(task, runs, 14, 0)[:2]).truth.faults
     for (first, last), probability, seconds in (
@@ -373,6 +444,7 @@ def test_urban_errors_have_the_stated_quantiles():
 
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
         s = truth._replace(cn0=wide + cn0, multipath=wide, hold=wide)
+        s = s._replace(faults=s.faults._replace(urban=numpy.ones(N)))
         s = task.world._reflected(s, noise())
         assert (s.multipath >= 0.0).all()
         # 160,000 draws: four standard errors of the quantiles.
@@ -385,14 +457,14 @@ def test_urban_errors_have_the_stated_quantiles():
 
 
 def test_random_course_has_every_leg_and_bounded_strength():
-    task = make("random")
+    task = make("random", manoeuvre_throughout=0.0, **UNMIXED)
     rng = numpy.random.default_rng(13)
     legs = task.begin(rng.random((task.noise.uniforms, 512)), rng.standard_normal((17, 512))).truth.legs
     kinds = legs.kind
     assert set(numpy.unique(kinds[0])) == {0.0, 1.0}
     assert set(numpy.unique(kinds[1:])) == {1.0, 2.0}
     strength = numpy.linalg.norm(legs.acceleration, axis=0)
-    assert ((strength <= 40.0 + 1e-12) & ((strength >= 2.0 - 1e-12) == (kinds == 2.0))).all()
+    assert ((strength <= 40.0 + 1e-12) & ((strength >= 0.5 - 1e-12) == (kinds == 2.0))).all()
     lengths = numpy.diff(legs.start, axis=0)
     assert lengths.min() >= 100
     assert lengths.max() <= 300
@@ -409,7 +481,8 @@ def test_torch_rolls_out_as_numpy_does(torch):
 
 
 def test_gradient_from_cost_to_action(torch):
-    task = make("random", "gain", torch)
+    # Where loops lose what they do not expect the cost has steps.
+    task = make("random", "gain", torch, aperture=False)
 
     def loss(action):
         total = 0.0

@@ -164,6 +164,7 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         dropout_period=50,
         disturbance_times=((10, 20), (30, 40)),
         sensor_times=((10, 50),),
+        undisturbed=0.0,
     )
     noise, a = Noise(task, N, seed, steps + 1), actions(task, seed, steps, N)
     d, p = task.design, task.parameters
@@ -586,16 +587,16 @@ def test_gradient_of_the_cost_through_the_closed_loop(torch: Any) -> None:
 
 
 def test_random_episodes_hold_what_they_promise() -> None:
-    task = make("U")
+    task = make("U", undisturbed=0.0)
     N, p = 400, task.parameters
     noise = Noise(task, N, 0, 1)
     truth = task.begin(noise.uniforms, noise.initial).truth
     times, levels = truth.commands.times, truth.levels.values
     assert (numpy.diff(times, axis=0) > 0).all()
     assert (times.max(axis=0) <= p.horizon).all()
-    assert numpy.abs(levels).min() >= 0.25
-    assert numpy.abs(levels).max() <= 4.0
-    assert abs(numpy.log(levels).mean()) < 0.12  # log-uniform about one: four standard errors
+    assert numpy.abs(levels).min() >= 0.2
+    assert numpy.abs(levels).max() <= 5.0
+    assert abs(numpy.log(levels).mean()) < 0.14  # log-uniform about one: four standard errors
     command = [truth.commands.at(numpy.full(N, k), numpy) for k in range(p.horizon)]
     changes = (numpy.diff(numpy.array(command), axis=0) != 0).sum(axis=0)
     assert changes.min() >= 4
@@ -605,6 +606,18 @@ def test_random_episodes_hold_what_they_promise() -> None:
     assert (length >= 1).all()
     assert (length <= 15).all()
     assert (truth.dropout_stops <= p.horizon + 1).all()
+
+
+def test_nothing_befalls_one_of_six() -> None:
+    task, N = make("U"), 4000
+    noise = Noise(task, N, 0, 1)
+    truth = task.begin(noise.uniforms, noise.initial).truth
+    calm = (truth.levels.values == 1.0).all(axis=0)
+    assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / N)
+    assert (truth.sensor_levels.values[..., calm] == 1.0).all()
+    assert (truth.sensor_levels.values[..., ~calm] != 1.0).all()
+    assert (truth.dropout_stops[..., calm] == truth.dropout_starts[..., calm]).all()
+    assert (truth.dropout_stops[..., ~calm] > truth.dropout_starts[..., ~calm]).all()
 
 
 def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:

@@ -120,7 +120,7 @@ class KnownMode(_KnownMode):
     kind = "reference"
     knows = (
         "the true hypothesis at every step, when a manoeuvre begins, the true noise of every sensor, when the "
-        "accelerometers stick, and multipath errors"
+        "accelerometers stick, and what pseudoranges are off by"
     )
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
@@ -141,7 +141,7 @@ class KnownMode(_KnownMode):
         expected, rows = self.observed(measurement, track.mean)
         residual = measurement.readings - expected
         ranges = task.sensors[0].readings
-        residual = xp.concat([residual[ranges] - truth.multipath, residual[ranges.stop :]])
+        residual = xp.concat([residual[ranges] - truth.range_error, residual[ranges.stop :]])
         update = extended_kalman.update_one_by_one(
             track.mean, track.covariance, residual, rows, *self.sensors(measurement, truth)
         )
@@ -160,7 +160,7 @@ class KnownModeBound(_KnownMode):
     kind = "bound"
     knows = (
         "the true hypothesis at every step, the acceleration with which a manoeuvre begins, the true noise of "
-        "every sensor, when the accelerometers stick, and multipath errors"
+        "every sensor, when the accelerometers stick, and what pseudoranges are off by"
     )
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:

@@ -64,7 +64,7 @@ class LooselyCoupledNavigation(Task):
     ### Rewards
 
     ``-30 log(1 + x / 30)``, x the squared error of position, summed over the axes, over the nominal variance of a
-    measurement (``N / sampling_interval``), in units of 0.07, what the paper's plain scheme is charged on average.
+    measurement (``N / sampling_interval``), in units of 0.15, what the paper's plain scheme is charged on average.
 
     ### Starting State
 
@@ -108,7 +108,7 @@ class LooselyCoupledNavigation(Task):
     scenarios = SCENARIOS
     modes = SCHEMES
     cost_description = "squared error of position over the nominal variance of a measurement"
-    reward_unit = 0.07
+    reward_unit = 0.15
     paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: LooselyCoupledNavigationParameters

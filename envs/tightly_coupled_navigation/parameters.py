@@ -166,6 +166,10 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     and 95 % quantiles by C/N0 as in the public smartLoc data of Berlin."""
     urban_probability: float = parameter(1.0, at_least=0.0, at_most=1.0)
     """Share of the episodes that are between houses, where there are any. Ours."""
+    urban_speed: float = parameter(1.0, at_least=0.0)
+    """Speeds between houses over those that are drawn. Ours."""
+    urban_strength: float = parameter(1.0, at_least=0.0)
+    """Accelerations between houses over those that are drawn. Ours."""
     urban_hold: tuple[float, float] = parameter((0.5, 2.0), at_least=0.0, ascending=True)
     """Limits of the time for which such an error holds, s. Ours."""
     urban_cn0_walk: float = parameter(0.5, at_least=0.0)

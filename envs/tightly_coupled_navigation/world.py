@@ -99,6 +99,8 @@ class Truth(NamedTuple):
     """Held error of each pseudorange, ``(S, N)``, m."""
     hold: Array
     """Steps for which it still holds, ``(S, N)``."""
+    range_error: Array
+    """What every pseudorange is off by beside its noise: multipath and ramp, ``(S, N)``, m."""
 
 
 class Measurement(NamedTuple):
@@ -156,7 +158,11 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         # Drawn in open country too: every scenario takes the same numbers.
         cn0 = draws.uniform("cn0", p.cn0_limits, S)
         faults = self._further_faults(draws, faults)
-        cn0 = xp.where(faults.urban > 0.0, cn0, p.clear_cn0)
+        between_houses = faults.urban > 0.0
+        cn0 = xp.where(between_houses, cn0, p.clear_cn0)
+        velocity = xp.where(between_houses, p.urban_speed * velocity, velocity)
+        slower = xp.where(between_houses, p.urban_strength * legs.acceleration, legs.acceleration)
+        legs = legs._replace(acceleration=slower)
         none = zeros[None]
         moving = xp.concat([none] * 4 + [velocity, none, legs.acceleration[:, 0]] + [none] * 6)
         spread = self.initial_sigma * normals
@@ -175,6 +181,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             cn0=cn0,
             multipath=xp.stack([zeros] * S),
             hold=xp.stack([zeros] * S),
+            range_error=xp.stack([zeros] * S),
         )
         covariance = (identity * self.initial_sigma**2)[:, :, None] + zeros
         return truth, Initial(moving + self.known * spread, covariance)
@@ -334,13 +341,12 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         measured = exact + task.sensor_sigma * factor * noise[:m]
         ranges, rates, forces, attitude = (measured[sensor.readings] for sensor in task.sensors)
         forces = xp.where(stuck, truth.accelerometers, forces)
-        ranges = ranges + truth.multipath
+        error = truth.multipath
         if p.ramp_probability:
             off = self._during(faults.ramp, k) & (self.places == faults.ramp_satellite)
-            ranges = ranges + xp.where(
-                off, (p.ramp_rate * p.sampling_interval) * (k - faults.ramp[0] + 1.0), 0.0
-            )
-        readings = xp.concat([ranges, rates, forces, attitude])
+            run = (p.ramp_rate * p.sampling_interval) * (k - faults.ramp[0] + 1.0)
+            error = error + xp.where(off, run, 0.0)
+        readings = xp.concat([ranges + error, rates, forces, attitude])
         if feedback is not None:
             expected = gnss_ins.ranges(feedback, gnss_ins.geometry(feedback, position, velocity))
             innovation = readings[task.tracked] - xp.concat(expected)
@@ -355,6 +361,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             noise_factor=factor,
             stuck=xp.astype(stuck, noise.dtype),
             accelerometers=forces,
+            range_error=error,
         )
         return truth, Measurement(step, readings, available, ins_angles, truth.cn0, position, velocity)
 
@@ -458,7 +465,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Legs and faults with the steps of each (first and last, -1 where there is none), and what holds now: the true
-        hypothesis, the noise of every reading over the nominal one, stuck accelerometers, and multipath.
+        hypothesis, the noise of every reading over the nominal one, stuck accelerometers, and what pseudoranges are
+        off by.
         """
         legs, faults = truth.legs, truth.faults
 
@@ -482,5 +490,5 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             "mode": truth.mode,
             "noise_factor": truth.noise_factor,
             "stuck_now": truth.stuck,
-            "multipath": truth.multipath,
+            "range_error": truth.range_error,
         }

@@ -116,7 +116,7 @@ class UavAutopilot(Task):
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"
     )
-    reward_unit = 1.0
+    reward_unit = 1.5
     # What gusts and sensors do rules the noise of the reward, and the paper pays for it too.
     reward = "relative"
     paper_policy = PaperPolicy("gain", (0.0,))
