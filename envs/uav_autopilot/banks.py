@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -55,7 +55,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
     """What both controls share: a subclass says what an action does to the process noise."""
 
     parameters: UavAutopilotParameters
-    shown_action: Block
+    shown_action: Any
     no_action: tuple[float, ...]
     """What is shown as the last action before the first."""
 
@@ -224,6 +224,10 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         """Return the action as shown, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
         raise NotImplementedError
 
+    def sensor_variances(self, shown: Array) -> Any:
+        """Variances of the readings that the update takes, of each sensor, numbers or ``(m, N)``."""
+        return self.task.sensor_variances
+
     def believed(
         self, update: packed_covariance.Update, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
@@ -231,14 +235,14 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return update.mean, update.covariance
 
     def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
-        """Equations (12), (11) with the process noise that the action asks for, and the control."""
+        """Equations (12), (11) with the noises that the action asks for, and the control."""
         shown, scale = self.steered(action)
         update = packed_covariance.update_coordinates(
             state.mean,
             state.covariance + scale * self.process_noise,
             measurement.reading,
             self.task.measured,
-            self.task.sensor_variances,
+            self.sensor_variances(shown),
             measurement.available,
         )
         estimate, covariance = self.believed(update, measurement, shown)
@@ -299,6 +303,36 @@ class GainBank(_AutopilotFilter):
         """
         told = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
         return super().covariance(state) * told
+
+
+class NoiseBank(_AutopilotFilter):
+    """Control ``noise``: the action scales the process noise and the noise of every sensor."""
+
+    def __init__(self, task: "UavAutopilot") -> None:
+        super().__init__(task)
+        self.no_action = (0.0,) * (1 + len(task.sensors))
+        self.nominal_variances = task.constant(task.sensor_variances)[:, None]
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """The process noise, then each sensor."""
+        return gymnasium.spaces.Box(-1.0, 1.0, (1 + len(self.task.sensors),), numpy.float32)
+
+    @property
+    def shown_action(self) -> Block:
+        """Last action."""
+        return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors))
+
+    def steered(self, action: Array) -> tuple[Array, Array]:
+        """Scale the process noise by ``10 ** (process_decades a)``."""
+        xp = self.xp
+        shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
+        return shown, xp.exp(shown[0] * (self.parameters.process_decades * math.log(10.0)))
+
+    def sensor_variances(self, shown: Array) -> Array:
+        """Nominal ones times ``10 ** (2 sensor_decades a)``."""
+        scale = self.xp.exp(shown[1:] * (2.0 * self.parameters.sensor_decades * math.log(10.0)))
+        return self.nominal_variances * scale
 
 
 class ModeBank(_AutopilotFilter):

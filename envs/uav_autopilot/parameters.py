@@ -147,6 +147,11 @@ class UavAutopilotParameters(TaskParameters):
     circle for every positive scale, so the value is what is useful: about what ``random`` draws, and no more,
     because an agent that explores over decades learns to shun them. The limit is half the digits of a
     number."""
+    process_decades: float = parameter(1.5, above=0.0, at_most=8.0)
+    """Decades by which an action of one scales the process noise under control ``noise``. Ours: what levels from 0.2 to
+    5 are worth, and a little more."""
+    sensor_decades: float = parameter(0.8, above=0.0, at_most=4.0)
+    """Decades by which it scales the standard deviation of a sensor. Ours: the largest factor of ``random``."""
     wide_band_scale: float = parameter(100.0, above=0.0)
     """Scale of the process noise in mode "wide-band"."""
     over_smoothed_scale: float = parameter(0.01, above=0.0)
