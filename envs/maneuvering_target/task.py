@@ -48,7 +48,8 @@ class ManeuveringTarget(Task):
     A flat `Box` of float64; `env.unwrapped.observation_fields` lists name, unit and scale of every component.
     `gain`: innovations over their predicted sigma, log(1 + normalised innovation squared), exponential
     averages of both, the share 1 - R/S of the innovation variance that is the filter's own, the last alpha,
-    the measurement sigma, scans since the start. Bank: the same for each filter, log-likelihoods relative to
+    the measurement sigma, scans since the start, whether this scan saw the target and the time since the last one that did.
+    Bank: the same for each filter, log-likelihoods relative to
     the largest, log predicted mode probabilities, last weights, under `gains` the last gains. Large values are
     compressed by sign(x) log(1 + |x|).
 
@@ -62,6 +63,14 @@ class ManeuveringTarget(Task):
 
     The track starts at the true state plus errors of the measurement's size: sigma in position and
     sqrt(2) sigma / T in velocity, the same for all filters (24).
+
+    ## Scans that miss the target or come early
+
+    In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some do
+    not: `available` is 0 then, the measurement zero, the filters' state the predicted one and the weights the predicted
+    ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u uniform on [0, 1): the filters
+    predict over the time that has passed, and estimate and truth are those of that time. The velocity's gain is
+    beta over the time since the last measurement, for which the innovation has grown.
 
     ## Episode End
 
@@ -78,6 +87,8 @@ class ManeuveringTarget(Task):
     """
 
     id = "filtergym/ManeuveringTarget-v0"
+    # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain then.
+    interface = 2
     paper_source = (
         "P. A. Bakulev, M. I. Sychev, Nguyen Trong Luu, Tracking a manoeuvring target with an IMM algorithm "
         "over two alpha-beta filters (in Russian)"
