@@ -157,8 +157,8 @@ class FilterpyEstimator(SingleTrackEstimator):
         usual = getattr(self.task.parameters, "sampling_interval", None)
         if interval is not None and usual is not None and not math.isclose(interval, usual, rel_tol=1e-9):
             raise ValueError(
-                f"{type(self).__name__} predicts over {usual:g} s, and a measurement comes after {interval:g} s: it must "
-                "say by a method `predict(track, interval)` what that means"
+                f"{type(self).__name__} predicts over {usual:g} s, and a measurement comes after {interval:g} s: it "
+                "must say by a method `predict(track, interval)` what that means"
             )
         track.predict()
 

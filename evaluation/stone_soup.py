@@ -30,7 +30,9 @@ class StoneSoupEstimator(SingleTrackEstimator):
 
     @property
     def interval(self) -> float:
-        """Seconds from one measurement to the next, where these do not say; a subclass must, where nor do the parameters."""
+        """Seconds from one measurement to the next, where these do not say; where the parameters leave it open a
+        subclass must.
+        """
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:

@@ -14,10 +14,10 @@ belongs to the gains that were used. Reading: the paper needs a covariance for t
 none; of the readings tried this is the only one that reproduces its claim about the best gains, and
 (I - K H) P with a gain that is not Kalman's is indefinite.
 
-**Scans that are missed or come early.** Over an interval Delta the prediction is ``x' = x + Delta v``, and a scan that has
-no measurement ends there: state and covariance are those predicted. The innovation of the next one has grown since the
-last measurement, for ``t = sum Delta`` s, so the velocity's gain is ``beta / t``: what (19), (20) make of a filter whose
-scan period is t. T of the functions below is Delta in a prediction, t in an update, a number or ``(N,)``.
+**Scans that are missed or come early.** Over an interval Delta the prediction is ``x' = x + Delta v``, and a scan that
+has no measurement ends there: state and covariance are those predicted. The innovation of the next one has grown since
+the last measurement, for ``t = sum Delta`` s, so the velocity's gain is ``beta / t``: what (19), (20) make of a filter
+whose scan period is t. T of the functions below is Delta in a prediction, t in an update, a number or ``(N,)``.
 
 All arrays are elementwise in the batch; axes of space are just more batch.
 """
@@ -64,9 +64,7 @@ def predict_covariance(P: Covariance, T: float | Array) -> Covariance:
     return Covariance(P.position + T * (P.cross + cross), cross, P.velocity)
 
 
-def update_covariance(
-    P: Covariance, R: Array, alpha: Array, beta: Array, T: float | Array
-) -> Covariance:
+def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: float | Array) -> Covariance:
     """Covariance after an update with any gains (Joseph form).
 
     Args:
@@ -92,9 +90,9 @@ def left_by_acceleration(
     """Covariance after an update when the target has accelerated since the measurement before.
 
     An acceleration ``a`` over an interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
-    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``. Where it goes on for ``since`` s after
-    the update, without a measurement, these become, with ``r = since / T``, ``(1 - alpha + (2 - beta) r + r^2) d`` and
-    ``(2 - beta + 2 r) d / T``.
+    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``. Where it goes on for ``since`` s
+    after the update, without a measurement, these become, with ``r = since / T``,
+    ``(1 - alpha + (2 - beta) r + r^2) d`` and ``(2 - beta + 2 r) d / T``.
 
     Args:
         P: covariance without it, after the update, or predicted from there by ``since``.

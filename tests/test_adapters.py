@@ -141,7 +141,9 @@ def test_kalman_filter_of_stone_soup_is_ours(scenario):
 def test_kalman_filter_of_stone_soup_is_ours_at_irregular_times():
     """Its clock counts microseconds, in which a target flies 0.3 mm."""
     stone_soup = example("stone_soup_kalman")
-    mean, expected = (estimates(one, "irregular-scans")[0] for one in (stone_soup.Kalman, OurContinuousKalman))
+    mean, expected = (
+        estimates(one, "irregular-scans")[0] for one in (stone_soup.Kalman, OurContinuousKalman)
+    )
     np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-3)
 
 
@@ -169,7 +171,12 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
 
 
 def test_every_example_is_tried():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*LIBRARIES, "mine", "inverted_pendulum", "flights"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {
+        *LIBRARIES,
+        "mine",
+        "inverted_pendulum",
+        "flights",
+    }
 
 
 @pytest.mark.parametrize("irregular", [{}, {"detection_probability": (0.5, 0.5), "scan_jitter": (0.9, 0.9)}])
@@ -268,7 +275,9 @@ def test_a_filter_for_one_interval_refuses_another():
         predict = adapters.FilterpyEstimator.predict
 
     compare(Rigid, OurKalman, scenario="missed-detections", horizon=5)
-    with pytest.raises(ValueError, match=r"Rigid predicts over 6 s, and a measurement comes after .* s: it must"):
+    with pytest.raises(
+        ValueError, match=r"Rigid predicts over 6 s, and a measurement comes after .* s: it must"
+    ):
         filtergym.evaluate(ID, {"mine": Rigid}, "irregular-scans", episodes=1, horizon=5)
 
 

@@ -182,6 +182,7 @@ def test_imm_equals_filterpys(task):
 def test_unscented_filter_equals_filterpys(task):
     filterpy = pytest.importorskip("filterpy.kalman")
     acceleration, change, start_rate = 0.5, 0.4, 1.5
+
     def track(x, P):
         points = filterpy.MerweScaledSigmaPoints(5, alpha=1.0, beta=2.0, kappa=0.0)
         peer = filterpy.UnscentedKalmanFilter(

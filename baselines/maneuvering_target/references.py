@@ -31,7 +31,9 @@ class KnownTurn(KalmanModel):
         """Start where everyone starts."""
         return TurnMemory(*initial, truth.velocity)
 
-    def update(self, measurement: Measurement, truth: Truth, memory: TurnMemory) -> tuple[Array, Array, TurnMemory]:
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: TurnMemory
+    ) -> tuple[Array, Array, TurnMemory]:
         """Predict with the noise of this scan and update with its measurement.
 
         The acceleration is the change of the velocity since the scan before, as large along x as along y.

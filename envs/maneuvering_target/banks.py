@@ -111,7 +111,7 @@ class _RadarBank(Bank[Task, Measurement, Any]):
         return self.T if self.regular else measurement.elapsed
 
     def seen(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
-        """One of two where the scan saw the target, the other where it missed it: numbers, arrays, or tuples of them."""
+        """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
@@ -149,7 +149,9 @@ class _RadarBank(Bank[Task, Measurement, Any]):
             Block(
                 "elapsed",
                 log_elapsed,
-                "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(*PERIODS_SHOWN),
+                "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(
+                    *PERIODS_SHOWN
+                ),
                 shown=KEPT_AS_LOG,
             ),
         )
@@ -289,8 +291,8 @@ class GainBank(_RadarBank):
         return state.mean
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last would
-        leave of which these know nothing: one as large as usual, and as the last innovations say.
+        """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last
+        would leave of which these know nothing: one as large as usual, and as the last innovations say.
         """
         xp, f = self.xp, state
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)

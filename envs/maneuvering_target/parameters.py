@@ -116,7 +116,7 @@ class ManeuveringTargetParameters(TaskParameters):
         if self.flight == "track":
             if self.scan_jitter[1] > 0.0:
                 raise ValueError(
-                    f'a flight that is a table has no states between its scans, got scan_jitter {self.scan_jitter!r}: '
+                    f"a flight that is a table has no states between its scans, got scan_jitter {self.scan_jitter!r}: "
                     "leave it at (0, 0)"
                 )
             if len(self.track) != 4:

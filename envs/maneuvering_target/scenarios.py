@@ -79,14 +79,13 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "missed-detections",
-            "Flights as in random; a scan sees the target with probability 0.7, and what it misses is bridged by prediction.",
+            "Flights as in random; a scan sees the target with probability 0.7 only.",
             {"flight": "random", "detection_probability": (0.7, 0.7)},
             {"start": (1, 10), "settled": (11, 100)},
         ),
         Scenario(
             "irregular-scans",
-            "Flights as in random; scans come early by up to 0.8 of the scan period, so that intervals last from 0.2 to "
-            "1.8 of it.",
+            "Flights as in random; scans come early by up to 0.8 of the scan period: intervals of 1.2 to 10.8 s.",
             {"flight": "random", "scan_jitter": (0.8, 0.8)},
             {"start": (1, 10), "settled": (11, 100)},
         ),

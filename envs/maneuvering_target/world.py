@@ -23,7 +23,7 @@ class Maneuvers(NamedTuple):
     """``(6, manoeuvres, N)``: the four of a turn and the two of thrust, as the properties below name them; one
     array, because the truth picks from all of them in every scan."""
     turn: Array = None
-    """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where scans do not come early: their effect is all then."""
+    """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early: the effect is all then."""
 
     @property
     def velocity_along(self) -> Array:
@@ -334,7 +334,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
 
         Thrust is constant within a period, and so is the turn rate.
         """
-        xp, T, m = self.xp, self.parameters.sampling_interval, truth.maneuvers
+        T, m = self.parameters.sampling_interval, truth.maneuvers
         if isinstance(m, Legs):
             return self.on_legs(m, scan - early)
         if not isinstance(m, Maneuvers):  # a table: its scans come on time
@@ -391,9 +391,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Manoeuvres: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each, or where legs begin (s) and
-        their turn rates (rad/s); whether one is flown now. Of flights that are a table the number; nothing of one. Where
-        scans may miss the target or come early, the probability that they see it, and the share of the scan period by
-        which they come early at most.
+        their turn rates (rad/s); whether one is flown now. Of flights that are a table the number; nothing of one.
+        Where scans may miss the target or come early, the probability that they see it, and the share of the scan
+        period by which they come early at most.
         """
         if truth.scans is None:
             return self._flight_context(truth, truth.scan)
