@@ -4,24 +4,28 @@
     pip install python-ins
     python benchmarks/drive.py GNSS_IMU --out docs/data/drive.nc --figure docs/images/drive.png
 
-The log (BSD-3-Clause, Tim Everett): a car, a consumer IMU at 100 Hz and an RTK receiver at 4 Hz, 549 s. What is made
-of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
+The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
+4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment.** While the car stands, roll and pitch are levelled and the gyroscopes' bias is their mean. The heading
-   is the course of the first motion less what was turned until then. From there an error-state filter with RTK positions
-   and velocities estimates position, velocity, attitude and the biases of gyroscopes and accelerometers.
-2. **Windows.** At the start of each the INS takes velocity, attitude and biases of that filter, which has seen nothing
-   later, and the position of RTK; then it runs free. Windows do not overlap.
-3. **Truth** is the RTK position of the antenna, 1 cm by its own report (fixed but for eight epochs).
-4. **Fixes** are simulated: truth plus white noise. The receiver's report holds its RTK solution only, and raw
-   observations would need a positioning engine of one's own.
+1. **Alignment.** While the car stands, roll and pitch are levelled, and the mean of the gyroscopes is their bias. The
+   heading is the course of the first motion less what was turned until then. From there an error-state filter with RTK
+   positions and velocities estimates position, velocity, attitude and the biases of gyroscopes and accelerometers.
+2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
+   nothing later, and the position of RTK; then it runs free. Windows do not overlap.
+3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.
+4. **Fixes** are simulated: truth plus white noise. The solution in the log is RTK only; a position of its own would
+   have to be computed from the receiver's raw observations.
 
-Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless it says otherwise: the
-IMU's milliseconds are stretched to the logger's time tags; its samples come 0.125 s late (the innovations here are least
-between 0.11 and 0.14 s); it is mounted at (180, -6.79, 185.35) degrees roll, pitch, yaw to the vehicle; the antenna stands
-5 cm left of it. Acceleration is in units of 9.80665 m/s^2, rates in degrees/s. Densities of white noise are measured here,
-at the standstill over 1 s with the engine running: ten times the data sheet's. Nothing is low-pass filtered: the
-integration does that.
+Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repository unless it says otherwise:
+
+* The IMU's milliseconds are stretched to the logger's time tags, and these are 0.125 s late (innovations of the
+  velocity here are as small from 0.09 to 0.14 s).
+* The IMU is mounted at (180, -6.79, 185.35) degrees roll, pitch, yaw to the vehicle, the antenna 5 cm left of it.
+* Accelerations are in units of 9.80665 m/s^2, rates in degrees/s. Nothing is low-pass filtered: the integration does
+  that.
+* Heights are above sea level and taken for ellipsoidal ones: 16 m change the scale by 3e-6.
+* Densities of white noise are measured here, over 1 s at the standstill with the engine running; around roll
+  and pitch that is ten times what the repository has from the data sheet.
 """
 
 import argparse
@@ -35,9 +39,9 @@ from typing import Any
 
 import numpy
 import xarray
+from filtergym.envs.loosely_coupled_navigation.task import TASK
 from filtergym.filters.geodesy import east_north
 
-ENVIRONMENT = "filtergym/LooselyCoupledNavigation-v0"
 SOURCE = "https://github.com/rtklibexplorer/GNSS_IMU, commit 8235ee6c5f349db529bf43ad556a3769b346b5a1, data/drive_0708"
 LICENCE = "BSD-3-Clause, Copyright (c) 2025, rtklibexplorer"
 INERTIAL, FIXES = "data/drive_0708/imu_1934.csv", "data/drive_0708/gnss_1934_sf.pos"
@@ -60,9 +64,10 @@ STANDING, MOVING = 0.2, 2.0
 """Speed up to which the car stands, and from which the course is the heading, m/s."""
 ALIGNMENT = 30.0
 """From the end of the standstill to the first window, s: some turns, after which the heading is known."""
+MEASUREMENTS = 80
+"""In a window, 20 s; one more is recorded, for the last observation."""
 PARAMETERS = {
     "axes": 2,
-    "horizon": 80,
     "sampling_interval": 0.25,
     "receiver_intensity": 0.5,
     "drift": 0.0,
@@ -70,8 +75,9 @@ PARAMETERS = {
     "correlation_time": 30.0,
     "white_intensity": 0.0,
 }
-"""Of the environment. Fixes come as often as RTK, with the deviation of the environment's own, 1.41 m; the levels of the
-INS errors are what :func:`likeliest` finds."""
+"""Of the environment. Fixes come as often as RTK, with the deviation that the environment has by default, 1.41 m. The
+levels of the INS errors are what :func:`likeliest` finds, rounded: no constant and no white part can be seen, and of
+the coloured one ``coloured^2 / correlation_time`` is better known than each."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +114,14 @@ def read_inertial(file: Path) -> Any:
         raise ValueError(f"{file.name}.tag holds no time tags of RTKLIB")
     _, whole, rest = struct.unpack("<IId", tags[60:76])
     last = numpy.frombuffer(tags[76:], "<u4")[-2]
-    # First and last line may be cut.
-    table = numpy.genfromtxt(file, delimiter=",", skip_header=1, skip_footer=1, invalid_raise=False)
-    if table.ndim != 2 or table.shape[1] != 7 or len(table) < 2 or not numpy.isfinite(table).all():
+    try:
+        # First and last line may be cut.
+        lines = file.read_text(encoding="utf-8").splitlines()[1:-1]
+        table = numpy.array([line.split(",") for line in lines], dtype=float).reshape(len(lines), 7)
+        understood = len(table) > 1 and numpy.isfinite(table).all()
+    except ValueError:
+        understood = False
+    if not understood:
         raise ValueError(f"{file.name} is no table of three accelerations, three rates and milliseconds")
     since = table[:, 6] - table[0, 6]
     if (numpy.diff(since) <= 0.0).any():
@@ -157,7 +168,7 @@ def aligned(inertial: Any, fixes: Any) -> Aligned:
         ValueError: if the recording does not begin with a standstill of 5 s, or nothing moves after it.
     """
     import pandas
-    from pyins import filters, inertial_sensor, measurements, strapdown, util
+    from pyins import earth, filters, inertial_sensor, measurements, strapdown, transform, util
 
     speed = numpy.hypot(fixes.VN, fixes.VE).to_numpy()
     if not (speed > MOVING).any():
@@ -169,43 +180,41 @@ def aligned(inertial: Any, fixes: Any) -> Aligned:
     bias = standing[util.GYRO_COLS].mean()
     forward, right, down = standing[util.ACCEL_COLS].mean()
     inertial = inertial[(inertial.index >= begin) & (inertial.index <= fixes.index[-1])].copy()
-    inertial[util.GYRO_COLS] -= bias
 
     first = fixes.iloc[int(numpy.argmax(speed > MOVING))]
     before = inertial.index < first.name
-    turned = numpy.degrees(numpy.trapezoid(inertial.gyro_z[before], inertial.index[before]))
-    start = pandas.Series(
+    turned = numpy.trapezoid(inertial.gyro_z[before] - bias.gyro_z, inertial.index[before])
+    position = [numpy.interp(inertial.index[0], fixes.index, fixes[name]) for name in util.LLA_COLS]
+    attitude = numpy.degrees(
         [
-            *(numpy.interp(inertial.index[0], fixes.index, fixes[name]) for name in util.LLA_COLS),
-            *(0.0, 0.0, 0.0),
-            numpy.degrees(numpy.arctan2(-right, -down)),
-            numpy.degrees(numpy.arctan2(forward, numpy.hypot(right, down))),
-            numpy.degrees(numpy.arctan2(first.VE, first.VN)) - turned,
-        ],
-        util.TRAJECTORY_COLS,
-        name=inertial.index[0],
+            numpy.arctan2(-right, -down),
+            numpy.arctan2(forward, numpy.hypot(right, down)),
+            numpy.arctan2(first.VE, first.VN) - turned,
+        ]
     )
+    start = pandas.Series([*position, 0.0, 0.0, 0.0, *attitude], util.TRAJECTORY_COLS, name=inertial.index[0])
+    # What a standing gyroscope measures is its bias and the rotation of the Earth.
+    bias -= transform.mat_from_rph(attitude).T @ earth.rate_n(position[0])
+    inertial[util.GYRO_COLS] -= bias
     increments = strapdown.compute_increments_from_imu(inertial, "rate")
     aiding = fixes[fixes.index > inertial.index[1]]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)
-        found = filters.run_feedback_filter(
-            start,
-            0.05,
-            0.05,
-            2.0,
-            10.0,
-            increments,
-            inertial_sensor.EstimationModel(
-                numpy.radians(GYROSCOPE_BIAS), numpy.radians(GYROSCOPE_NOISE), numpy.radians(GYROSCOPE_WALK)
-            ),
-            inertial_sensor.EstimationModel(ACCELEROMETER_BIAS, ACCELEROMETER_NOISE, ACCELEROMETER_WALK),
-            [
-                measurements.Position(aiding, 0.02, numpy.array(LEVER)),
-                measurements.NedVelocity(aiding, 0.06, numpy.array(LEVER)),
-            ],
-            time_step=0.25,
-        )
+    found = filters.run_feedback_filter(
+        start,
+        0.05,
+        0.05,
+        2.0,
+        10.0,
+        increments,
+        inertial_sensor.EstimationModel(
+            numpy.radians(GYROSCOPE_BIAS), numpy.radians(GYROSCOPE_NOISE), numpy.radians(GYROSCOPE_WALK)
+        ),
+        inertial_sensor.EstimationModel(ACCELEROMETER_BIAS, ACCELEROMETER_NOISE, ACCELEROMETER_WALK),
+        [
+            measurements.Position(aiding, 0.02, numpy.array(LEVER)),
+            measurements.NedVelocity(aiding, 0.06, numpy.array(LEVER)),
+        ],
+        time_step=0.25,
+    )
     biases = pandas.DataFrame(
         numpy.hstack([found.gyro, found.accel]), found.gyro.index, [*util.THETA_COLS, *util.DV_COLS]
     )
@@ -249,23 +258,25 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     Raises:
         ValueError: if positions are missing, or none is left after the alignment.
     """
-    T, K = PARAMETERS["sampling_interval"], PARAMETERS["horizon"]
+    T, K = PARAMETERS["sampling_interval"], MEASUREMENTS
     steps = numpy.diff(fixes.index)
     if abs(steps - T).max() > 0.01:
         raise ValueError(f"positions come every {T} s, but two are {abs(steps).max():.2f} s apart")
+    # pyins 1.0.1 uses a keyword that pandas 4 will not have.
+    warnings.filterwarnings("ignore", "The copy keyword is deprecated")
     navigation = aligned(inertial, fixes)
     clock = fixes.index.to_numpy() - fixes.index[0]
     first = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[0] + ALIGNMENT))
     last = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[-1], side="right"))
-    starts = range(first, last - K, K)
+    starts = range(first, last - K - 1, K)
     if not starts:
         raise ValueError(f"after the alignment there are not {K * T:g} s left for a recording")
     site = tuple(numpy.radians(fixes.iloc[0][["lat", "lon"]].to_numpy(dtype=float)))
     reference = metres(fixes, site).T
-    truth = numpy.array([reference[start : start + K + 1] for start in starts])
+    truth = numpy.array([reference[start : start + K + 2] for start in starts])
     ins = []
     for start in starts:
-        track = metres(free_inertial(navigation, fixes.index.to_numpy()[start : start + K + 1]), site).T
+        track = metres(free_inertial(navigation, fixes.index.to_numpy()[start : start + K + 2]), site).T
         ins.append(track + (reference[start] - track[0]))
     deviation = (PARAMETERS["receiver_intensity"] / T) ** 0.5
     noise = numpy.random.default_rng(seed).standard_normal(truth[:, 1:].shape)
@@ -278,15 +289,15 @@ def dataset(
     """Recordings in the form of files.
 
     Args:
-        truth: positions from the start of each window on, m, ``(episode, time + 1, axis)``.
+        truth: positions from the start of each window on, m, ``(episode, 1 + time, axis)``.
         ins: likewise, by the INS.
         fix: likewise from the first measurement on, by the receiver.
         deviation: of the fixes, m.
         starts: of the windows, s since the start of the drive.
     """
-    episodes, K, axes = fix.shape
+    episodes, measured, axes = fix.shape
     T = PARAMETERS["sampling_interval"]
-    number = numpy.broadcast_to(numpy.arange(1.0, K + 1.0), (episodes, K))
+    number = numpy.broadcast_to(numpy.arange(1.0, measured + 1.0), (episodes, measured))
     each = ("episode", "time", "axis")
     found = xarray.Dataset(
         {
@@ -294,10 +305,10 @@ def dataset(
             "ins": (each, ins[:, 1:], {"units": "m"}),
             "increment": (each, numpy.diff(ins, axis=1), {"units": "m"}),
             "fix": (each, fix, {"units": "m"}),
-            "available": (each[:2], numpy.ones((episodes, K))),
-            "reported_deviation": (each[:2], numpy.full((episodes, K), deviation), {"units": "m"}),
+            "available": (each[:2], numpy.ones((episodes, measured))),
+            "reported_deviation": (each[:2], numpy.full((episodes, measured), deviation), {"units": "m"}),
             "seconds": (each[:2], T * number, {"units": "s"}),
-            "length": ("episode", numpy.full(episodes, K, dtype="int32")),
+            "length": ("episode", numpy.full(episodes, measured - 1, dtype="int32")),
             "truth": (("episode", "time", "component"), truth[:, 1:], {"units": "m"}),
             "initial_mean": (("episode", "component"), truth[:, 0], {"units": "m"}),
             "initial_covariance": (
@@ -312,8 +323,8 @@ def dataset(
         },
     )
     found.attrs = {
-        "environment": ENVIRONMENT,
-        "interface": 2,
+        "environment": TASK.id,
+        "interface": TASK.interface,
         "parameters": json.dumps(PARAMETERS),
         "source": SOURCE,
         "licence": LICENCE,
@@ -342,11 +353,17 @@ def modelled(time: numpy.ndarray, levels: dict[str, float]) -> numpy.ndarray:
     )
 
 
-def likeliest(recorded: xarray.Dataset) -> tuple[dict[str, float], float]:
+def likeliest(
+    recorded: xarray.Dataset, correlation_time: float | None = None
+) -> tuple[dict[str, float], float]:
     """Levels of the INS errors under which fixes less INS positions are likeliest, and their log-likelihood for each
     of them.
 
     The receiver's noise is part of it: what matters is what a filter can see through that.
+
+    Args:
+        recorded: of :func:`recordings`.
+        correlation_time: s; None looks for the likeliest.
     """
     from scipy.optimize import minimize
 
@@ -362,11 +379,12 @@ def likeliest(recorded: xarray.Dataset) -> tuple[dict[str, float], float]:
         density = numpy.log(numpy.diag(factor)).sum() + 0.5 * len(time) * numpy.log(2.0 * numpy.pi)
         return float((density + 0.5 * (white**2).sum() / len(seen)) / len(time))
 
-    bounds = numpy.log([(1e-3, 10.0), (1e-2, 10.0), (0.1, 1e3), (1e-4, 10.0)])
-    tries = [
-        minimize(unlikely, numpy.log([0.3, 0.5, tau, 0.05]), bounds=bounds, method="Nelder-Mead")
-        for tau in (1.0, 10.0)
-    ]
+    tries = []
+    for tau in (1.0, 10.0) if correlation_time is None else (correlation_time,):
+        taus = (0.1, 1e3) if correlation_time is None else (tau, tau)
+        bounds = numpy.log([(1e-3, 10.0), (1e-2, 10.0), taus, (1e-4, 10.0)])
+        begin = numpy.log([0.3, 0.5, tau, 0.05])
+        tries.append(minimize(unlikely, begin, bounds=bounds, method="Nelder-Mead"))
     best = min(tries, key=lambda found: found.fun)
     return dict(zip(names, numpy.exp(best.x), strict=True)), -float(best.fun)
 
@@ -375,7 +393,6 @@ def report(recorded: xarray.Dataset) -> None:
     """Print how large the INS error grows, and what the environment's model makes of it."""
     found = abs(errors(recorded))
     time = recorded["seconds"].to_numpy()[0]
-    levels, likelihood = likeliest(recorded)
     covariance = modelled(time, PARAMETERS)
     print("| after, s | median, m | root mean square, m | largest, m | by the model, m |")
     print("|---:|---:|---:|---:|---:|")
@@ -387,8 +404,10 @@ def report(recorded: xarray.Dataset) -> None:
                 f"| {after:g} | {numpy.median(found[:, at]):.2g} | {rms:.2g} | {found[:, at].max():.2g} "
                 f"| {covariance[at, at] ** 0.5:.2g} |"
             )
-    said = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
-    print(f"likeliest levels: {said}; log-likelihood {likelihood:.3f} for each fix")
+    for correlation_time in (None, 1.0):
+        levels, likelihood = likeliest(recorded, correlation_time)
+        said = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
+        print(f"likeliest levels: {said}; log-likelihood {likelihood:.3f} for each fix")
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
@@ -416,7 +435,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
     right.plot(time, rms, color="tab:red", label="root mean square")
     model = numpy.sqrt(numpy.diag(modelled(time, PARAMETERS)))
     right.plot(time, model, color="tab:blue", linestyle="--", label="the model's standard deviation")
-    right.set(xlabel="since the start of the window, s", ylabel="INS error of an axis, m", ylim=(-40, 40))
+    right.set(xlabel="since the start of the window, s", ylabel="INS error of an axis, m", ylim=(-65, 65))
     right.legend(frameon=False, loc="upper left")
     picture.savefig(file, dpi=110)
     pyplot.close(picture)
