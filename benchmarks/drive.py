@@ -60,6 +60,8 @@ GYROSCOPE_BIAS, ACCELEROMETER_BIAS = 0.1, 0.2
 """Standard deviations of the biases left after the standstill, degrees/s and m/s^2."""
 GYROSCOPE_WALK, ACCELEROMETER_WALK = 0.0001, 0.001
 """Root densities of their random walks, degrees/s^1.5 and m/s^2.5; ours: they matter over minutes."""
+RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
+"""Standard deviations of its positions and velocities, of each axis, m and m/s; about what it reports."""
 STANDING, MOVING = 0.2, 2.0
 """Speed up to which the car stands, and from which the course is the heading, m/s."""
 ALIGNMENT = 30.0
@@ -200,18 +202,20 @@ def aligned(inertial: Any, fixes: Any) -> Aligned:
     aiding = fixes[fixes.index > inertial.index[1]]
     found = filters.run_feedback_filter(
         start,
-        0.05,
-        0.05,
-        2.0,
-        10.0,
-        increments,
-        inertial_sensor.EstimationModel(
+        position_sd=0.05,
+        velocity_sd=0.05,
+        level_sd=2.0,
+        azimuth_sd=10.0,
+        increments=increments,
+        gyro_model=inertial_sensor.EstimationModel(
             numpy.radians(GYROSCOPE_BIAS), numpy.radians(GYROSCOPE_NOISE), numpy.radians(GYROSCOPE_WALK)
         ),
-        inertial_sensor.EstimationModel(ACCELEROMETER_BIAS, ACCELEROMETER_NOISE, ACCELEROMETER_WALK),
-        [
-            measurements.Position(aiding, 0.02, numpy.array(LEVER)),
-            measurements.NedVelocity(aiding, 0.06, numpy.array(LEVER)),
+        accel_model=inertial_sensor.EstimationModel(
+            ACCELEROMETER_BIAS, ACCELEROMETER_NOISE, ACCELEROMETER_WALK
+        ),
+        measurements=[
+            measurements.Position(aiding, RTK_POSITION, numpy.array(LEVER)),
+            measurements.NedVelocity(aiding, RTK_VELOCITY, numpy.array(LEVER)),
         ],
         time_step=0.25,
     )
