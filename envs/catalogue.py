@@ -19,8 +19,10 @@ from typing import Any
 import gymnasium
 import numpy
 
-from .flight_tables import FLIGHT_SUFFIXES
+from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
+from .recording import Recording, recording_from
+from .recording_files import is_recording, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
 
@@ -28,7 +30,7 @@ ADDED: dict[str, type[Task]] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""
 
 
-ScenarioChoice = str | Path | Trajectory | Flights | Sequence[Any] | Mapping[str, Any] | None
+ScenarioChoice = str | Path | Trajectory | Flights | Recording | Sequence[Any] | Mapping[str, Any] | None
 """What names a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
 
 MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
@@ -193,23 +195,55 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
 
 def opened(cls: type[Task], scenario: Any) -> Any:
-    """Return flights in place of what names them, so that files are read once; anything else as it is.
+    """Return flights or a recording in place of what names them, so that files are read once; anything else as it is.
 
     Args:
         cls: the environment.
         scenario: as :func:`find_scenario` takes it; a name of one of the environment's own is no file.
 
     Raises:
-        ValueError: if the files hold no flights.
+        ValueError: if the files hold neither.
     """
     if isinstance(scenario, Mapping):
         if find_mixture(cls, scenario) is not None:
             return scenario
+        if "measurements" in scenario:
+            return recording_from(scenario)
         return flights_from(scenario) if "trajectories" in scenario else trajectory_of(scenario)
     items = scenario if isinstance(scenario, list | tuple) else [scenario]
     if any(isinstance(item, str) and item in cls.scenarios for item in items):
         return scenario
+    if isinstance(scenario, str | Path) and is_recording(scenario):
+        return read_recording(scenario, cls.id)
     return read_flights(scenario) if names_flights(scenario) else scenario
+
+
+def read_recording(path: Any, environment: str | None = None, **keywords: Any) -> Recording:
+    """Read recorded measurements.
+
+    Args:
+        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write.
+        environment: id of the environment that it is for; default: what the file says.
+        **keywords: parameters of the environment that win over those of the file.
+
+    Returns:
+        What can be given as scenario: every episode replays one recording.
+
+    Raises:
+        ValueError: if it cannot be read, or does not fit the environment.
+    """
+    file = Path(path)
+    try:
+        if not file.is_file():
+            raise ValueError("there is no such file")
+        if file.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
+        recording = read_netcdf(file, task_class, environment, keywords)
+    except Exception as error:  # readers raise whatever a broken file makes them stumble over
+        raise ValueError(f"recording {file}: {error or type(error).__name__}") from error
+    cls = task_class(recording.environment)
+    recording.scenario(cls, {})
+    return recording
 
 
 def find_scenario(
@@ -222,7 +256,8 @@ def find_scenario(
     Args:
         cls: the environment.
         scenario: a name; a trajectory (also as a dictionary of its fields, as it comes out of JSON); a set of
-            flights as :func:`~.flights.read_flights` takes it, or returns it; or what was found before.
+            flights as :func:`~.flights.read_flights` takes it, or returns it; a recording, or a NetCDF file of one; or
+            what was found before.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
@@ -241,6 +276,8 @@ def find_scenario(
         return cls.scenario_from_trajectory(scenario, keywords or {})
     if isinstance(scenario, Flights):
         return cls.scenario_from_flights(scenario, keywords or {})
+    if isinstance(scenario, Recording):
+        return scenario.scenario(cls, keywords or {})
     name = cls.default_scenario if scenario is None else scenario
     if not isinstance(name, str):
         raise ValueError(
@@ -279,7 +316,8 @@ def make_task(
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})
-    return cls(parameters, control, xp, device)
+    replayed = () if chosen.recording is None else (chosen.recording,)
+    return cls(parameters, control, xp, device, *replayed)
 
 
 def register() -> None:

@@ -84,6 +84,7 @@ class ManeuveringTarget(Task):
     )
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
+    of_world_only = ("flight", "track", "track_scans")
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "

@@ -169,7 +169,7 @@ class RadarEsmTracking(Task):
         kept, covariance = super().records(episode), self.covariance(episode)
         for i, component in enumerate(self.components):
             kept[f"variance_{component.name}"] = covariance[i, i]
-        if "mode_probability" in kept:
+        if "mode_probability" in kept and self.recording is None:
             is_true = one_hot(episode.truth.target_class, self.classes, self.xp)
             kept["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
         return kept
