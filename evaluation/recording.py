@@ -69,7 +69,7 @@ def record(
     ]
     joined = [
         {name: numpy.concatenate([part[name] for part in parts]) for name in parts[0]}
-        for parts in zip(*chunks)
+        for parts in zip(*chunks, strict=True)
     ]
     measurements, initial_arrays = joined
     truth, lengths = measurements.pop("truth"), initial_arrays.pop("length")

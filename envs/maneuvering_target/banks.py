@@ -264,10 +264,12 @@ class GainBank(_RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Normalised innovation squared, and the gain."""
+        """Normalised innovation squared, log-density of the measurement as predicted, and the gain."""
+        nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         return {
-            "nis": self.xp.expm1(state.log_squared),
+            "nis": nis,
             "nis_degrees": 2.0 + 0.0 * state.alpha,
+            "log_likelihood": -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi),
             "alpha": state.alpha,
         }
 
@@ -423,11 +425,16 @@ class FilterBank(_RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """NIS of the combined prediction, and the weights."""
+        """NIS of the combined prediction, log-density of the measurement as the filters predict it, and the weights."""
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         nis = log_density(innovation, S)[1]
-        return {"nis": nis, "nis_degrees": 2.0 + 0.0 * nis, "mode_probability": state.probabilities}
+        return {
+            "nis": nis,
+            "nis_degrees": 2.0 + 0.0 * nis,
+            "log_likelihood": imm.log_mixture_density(state.log_predicted, state.log_likelihood),
+            "mode_probability": state.probabilities,
+        }
 
 
 class SteeredFilterBank(FilterBank):
