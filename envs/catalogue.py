@@ -21,6 +21,7 @@ import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
+from .recorded_tables import read_columns
 from .recording import Recording, recording_from
 from .recording_files import is_recording, read_netcdf
 from .task import Scenario, Task
@@ -222,7 +223,8 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     """Read recorded measurements.
 
     Args:
-        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write.
+        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.recorded_columns`.
         environment: id of the environment that it is for; default: what the file says.
         **keywords: parameters of the environment that win over those of the file.
 
@@ -238,7 +240,16 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
             raise ValueError("there is no such file")
         if file.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        recording = read_netcdf(file, task_class, environment, keywords)
+        if is_recording(file):
+            recording = read_netcdf(file, task_class, environment, keywords)
+        elif environment is None:
+            raise ValueError(
+                "it does not say of which environment it is: give its id, as the argument environment or before "
+                "--recording"
+            )
+        else:
+            check_names(task_class(environment), keywords)
+            recording = read_columns(file, task_class(environment), keywords)
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         raise ValueError(f"recording {file}: {error or type(error).__name__}") from error
     cls = task_class(recording.environment)

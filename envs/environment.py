@@ -428,10 +428,11 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         task: environment id.
         control: what the action steers; default: the first of the environment's controls.
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
-            the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
-            one scenario, drawn by these weights from the episode's generator.
-        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, and zero on a
-            recording without truth.
+            the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture,
+            ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these weights from
+            the episode's generator.
+        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, and
+            zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.

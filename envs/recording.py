@@ -5,9 +5,9 @@ start of the track, the times, and the truth where it is known. As a scenario it
 place of the task's own: an episode replays one recording, which the first uniform number of its generator draws. Banks,
 estimators, backends and evaluations know nothing of it.
 
-What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names and
-shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed loop
-they do, and no recording can answer what the sensors would have said to another estimate.
+What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names
+and shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed
+loop they do, and no recording can answer what the sensors would have said to another estimate.
 
 Where there is no truth there is no error and no cost, and rewards are zero.
 """
@@ -22,6 +22,7 @@ import numpy
 
 from .draws import Draws
 from .observation import Array
+from .parameters import check, declared, frozen
 from .task import Scenario, Task, World, named_arrays
 
 MOST_NUMBERS = 100_000_000
@@ -173,23 +174,22 @@ class Recording:
             raise ValueError(
                 f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
             )
-        parameters = {**self.parameters, **keywords}
-        # Checked by themselves before they are counted with.
-        default = cls.Parameters(**{n: v for n, v in parameters.items() if n != "horizon"})
-        interval = default.decision_interval
-        longest = int(self.lengths.max())
-        horizon = parameters.get("horizon", longest - longest % interval)
-        if not isinstance(horizon, int | numpy.integer) or horizon > longest:
+        named = {**self.parameters, **keywords}
+        interval = frozen(named.get("decision_interval", 1))
+        check("decision_interval", interval, *declared(cls.Parameters)["decision_interval"])
+        longest, shortest = int(self.lengths.max()), int(self.lengths.min())
+        if shortest < interval:
             raise ValueError(
-                f"horizon must be an integer of at most {longest}, the measurements of recording {self.name!r}, got "
-                f"{horizon!r}"
+                f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
+                f"{self.name!r}, got {interval}"
             )
-        if min(self.lengths_within(int(horizon), interval)) < 1:
+        parameters = {**self.parameters, "horizon": longest - longest % interval}
+        made = cls.Parameters(**{**parameters, **keywords})
+        if made.horizon > longest:
             raise ValueError(
-                f"recording {self.name!r} has an episode of fewer measurements than decision_interval {interval}"
+                f"horizon must be at most {longest}, the measurements of recording {self.name!r}, got {made.horizon}"
             )
-        parameters = {**self.parameters, "horizon": int(horizon)}
-        self.check_fits(cls(cls.Parameters(**{**parameters, **keywords}), cls.controls[0]))
+        self.check_fits(cls(made, cls.controls[0]))
         return Scenario(
             self.name,
             "Recorded measurements.",

@@ -50,8 +50,8 @@ OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
     "relative": cost_reward,
     "none": no_reward,
 }
-"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away. "none" is
-that of recordings without truth."""
+"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away. "none"
+is that of recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 

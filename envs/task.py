@@ -346,6 +346,9 @@ class Task(ABC):
     """What an action means under each control, in words."""
     of_world_only: ClassVar[tuple[str, ...]] = ()
     """Parameters that only the simulated world reads and that are too much for a recording, such as tables."""
+    recorded_columns: ClassVar[Mapping[str, str]] = {}
+    """Columns of a table of what sensors really said that :meth:`recorded` knows, beside ``time``, with what they are;
+    empty where tables cannot be read."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
@@ -459,6 +462,21 @@ class Task(ABC):
     def scenario_from_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
         """Make a scenario of a set of flights of which every episode flies one; see :attr:`flights`."""
         raise ValueError(f"{cls.id} does not take flights as scenario")
+
+    @classmethod
+    def recorded(cls, columns: Any) -> Any:
+        """Make measurements and a start of the track of one table of what sensors really said.
+
+        Args:
+            columns: :class:`~.recorded_tables.Columns`, of the names in :attr:`recorded_columns`.
+
+        Returns:
+            :class:`~.recorded_tables.Recorded`.
+
+        Raises:
+            ValueError: for what lacks, or cannot be.
+        """
+        raise NotImplementedError(f"{cls.__name__} has recorded_columns and no method for them")
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
         """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.

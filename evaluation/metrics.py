@@ -137,9 +137,10 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
             for window, times in slices.items():
                 value = bootstrap.estimate(mean_over_time(run, probability[:, times]))
                 yield Measure("mean_mode_probability", mode, window, value, "1")
-    if "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all():
+    says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
+    if says or not judged:  # there is nothing else of an estimator of one's own then
         for window, times in slices.items():
-            value = mean_of_present(run["log_likelihood"].values[:, times], bootstrap)
+            value = mean_of_present(run["log_likelihood"].values[:, times], bootstrap) if says else NOTHING
             yield Measure("log_likelihood", "measurement", window, value, "nat")
     if not is_bound and judged:
         cost = run["cost"].values

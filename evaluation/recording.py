@@ -52,9 +52,10 @@ def record(
     chosen = find_scenario(cls, opened(cls, scenario), keywords)
     plain = task_on("numpy", cls.id, scenario=chosen, **keywords)
     if chosen.recording is None:
-        initial, measurement = measured_once(plain)
-        arrays = [values for part in (measurement,) for _, values in named_arrays(part)]
-        row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays) + len(plain.components) + 1
+        arrays = dict(named_arrays(measured_once(plain)[1]))
+        row = (
+            sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(plain.components) + 1
+        )
         if row * episodes * (plain.horizon + 1) > MOST_NUMBERS:
             raise ValueError(
                 f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "

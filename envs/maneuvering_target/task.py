@@ -13,10 +13,12 @@ import numpy
 
 from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
+from ..recorded_tables import Columns, Recorded
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
+from .recorded import COLUMNS, recorded
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
@@ -85,6 +87,7 @@ class ManeuveringTarget(Task):
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
     of_world_only = ("flight", "track", "track_scans")
+    recorded_columns = COLUMNS
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
@@ -123,6 +126,11 @@ class ManeuveringTarget(Task):
         self.flights = self.parameters.track_scans
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
+
+    @classmethod
+    def recorded(cls, columns: Columns) -> Recorded:
+        """Make measurements of plots."""
+        return recorded(columns)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -12,9 +12,11 @@ import numpy
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..observation import Array
+from ..recorded_tables import Columns, Recorded
 from ..task import Component, Episode, PaperPolicy, Task
 from .banks import ClassBank, one_hot
 from .parameters import RadarEsmTrackingParameters
+from .recorded import COLUMNS, recorded
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
 
@@ -106,6 +108,7 @@ class RadarEsmTracking(Task):
     )
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
+    recorded_columns = COLUMNS
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",
@@ -157,6 +160,11 @@ class RadarEsmTracking(Task):
         )
         starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
         return models, numpy.stack(starts, axis=-1)
+
+    @classmethod
+    def recorded(cls, columns: Columns) -> Recorded:
+        """Make measurements of ranges, their rates, bearings and decisions."""
+        return recorded(columns, cls.Parameters)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
