@@ -366,16 +366,16 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
     indices = asarray(indices)
     if indices.dtype == bool:
         raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
-    graph, chosen = _OPEN.get(), _chosen
+    graph, places = _OPEN.get(), indices.nodes.ravel().tolist()
+    rows: Any
     if isinstance(x, numpy.ndarray) and x.dtype == float:
-        rows, chosen = numpy.moveaxis(x, axis, -1), Graph.take
+        rows = numpy.moveaxis(x, axis, -1)
+        taken = [[graph.take(row, place) for place in places] for row in rows.reshape(-1, rows.shape[-1])]
     else:
         x = asarray(x)
         rows = numpy.moveaxis(x.nodes, axis, -1)
-    choices: Any = rows.reshape(-1, rows.shape[-1])
-    if chosen is _chosen:
-        choices = choices.tolist()
-    taken = [[chosen(graph, row, index) for index in indices.nodes.ravel().tolist()] for row in choices]
+        choices = rows.reshape(-1, rows.shape[-1]).tolist()
+        taken = [[_chosen(graph, row, place) for place in places] for row in choices]
     shaped = numpy.array(taken, dtype=numpy.int64).reshape(*rows.shape[:-1], *indices.shape)
     for i in range(indices.ndim):
         shaped = numpy.moveaxis(shaped, rows.ndim - 1 + i, axis % x.ndim + i)

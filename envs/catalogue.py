@@ -23,7 +23,7 @@ from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
 from .recorded_tables import read_columns
 from .recording import Recording, recording_from
-from .recording_files import is_recording, read_netcdf
+from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
 
@@ -240,7 +240,7 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
             raise ValueError("there is no such file")
         if file.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        if is_recording(file):
+        if names_environment(file):
             recording = read_netcdf(file, task_class, environment, keywords)
         elif environment is None:
             raise ValueError(
@@ -251,7 +251,8 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
             check_names(task_class(environment), keywords)
             recording = read_columns(file, task_class(environment), keywords)
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
-        raise ValueError(f"recording {file}: {error or type(error).__name__}") from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"recording {file}: {reason}") from error
     cls = task_class(recording.environment)
     recording.scenario(cls, {})
     return recording

@@ -72,12 +72,23 @@ def write_recording(recording: Recording, path: Path) -> None:
 def is_recording(path: Any) -> bool:
     """Whether this is the path of a NetCDF file that says of which environment it holds measurements."""
     try:
-        if Path(path).suffix != ".nc" or not Path(path).is_file() or Path(path).stat().st_size > MOST_BYTES:
-            return False
-        with _opened(Path(path)) as data:
-            return "environment" in data.attrs
+        return (
+            Path(path).is_file() and Path(path).stat().st_size <= MOST_BYTES and names_environment(Path(path))
+        )
     except Exception:  # whatever it is, it is for somebody else to say what is wrong with it
         return False
+
+
+def names_environment(path: Path) -> bool:
+    """Whether a file is NetCDF that says of which environment it holds measurements.
+
+    Raises:
+        Exception: whatever, for a file whose name says that it is NetCDF and that is none.
+    """
+    if path.suffix != ".nc":
+        return False
+    with _opened(path) as data:
+        return "environment" in data.attrs
 
 
 def _opened(path: Path) -> "xarray.Dataset":

@@ -169,8 +169,8 @@ def evaluate(
             or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
         scenario: name of a scenario, a trajectory, a set of flights, or a recording; default: the environment's
             training distribution.
-        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up. Of a recording every
-            episode is replayed once, whatever is asked for.
+        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up. Of a recording
+            every episode is replayed once, whatever is asked for.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.

@@ -288,9 +288,10 @@ def tidy_records(
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
-    and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all is
-    consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted); ``mean_mode_probability``;
-    ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards). Without truth what needs it is left out.
+    and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
+    is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
+    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards). Without truth what
+    needs it is left out.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -298,7 +299,7 @@ def tidy_records(
 
     Args:
         dataset: from an evaluation.
-        metrics: the environment's own, from one policy's part of the dataset.
+        metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
     bootstrap, best = bootstrap_of(dataset), best_of(dataset)
     attrs = dataset.attrs
@@ -310,7 +311,8 @@ def tidy_records(
     for name in dataset["policy"].values.tolist():
         measures: list[Any] = [*_measures(dataset, name, bootstrap), *_comparisons(dataset, name, bootstrap)]
         measures += _behind_best(dataset, name, best, bootstrap)
-        if metrics is not None:
+        # Of a recording, they would ask for more of the truth than it holds.
+        if metrics is not None and not attrs.get("recorded"):
             measures += metrics(dataset.sel(policy=name), bootstrap)
         for m in measures:
             records.append(
