@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
-from .recording import Recording
+from .recording import Recording, measured_once
 from .task import Task
 
 TIME = ("time", "timestamp", "seconds")
@@ -143,6 +143,7 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
         ValueError: if it cannot be read, or lacks what the environment needs.
     """
     if not cls.recorded_columns:
+        measured_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
     known = _Known({*TIME, RECORDING, *cls.recorded_columns})
     if not path.name.endswith(FLIGHT_SUFFIXES):

@@ -42,6 +42,17 @@ class Replayed(NamedTuple):
     """Column of the last one."""
 
 
+class Started(NamedTuple):
+    """A start of the track that was made of the first measurements of E episodes."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """Those after the start, ``(E, T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """``(E, ...)``."""
+    used: int
+    """Measurements that the start took."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Recorded episodes of one environment, E of them; the longest has T measurements.

@@ -190,6 +190,8 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
         interface = int(attrs.get("interface", cls.interface))
         check_interface(cls, interface)
         fields = read_dataset(data, path.stem)
+    if not fields["initial"]:
+        _start(cls, fields, {**parameters, **keywords})
     return Recording(
         environment=cls.id,
         interface=interface,
@@ -199,6 +201,20 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
         licence=str(attrs.get("licence", "")),
         **fields,
     )
+
+
+def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
+    """Let the tracks start from their first measurements."""
+    try:
+        start = cls.recorded_start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
+    except KeyError as error:
+        raise ValueError(f"it lacks {error.args[0]}") from error
+    if start.used:
+        fields["seconds"] = fields["seconds"][:, start.used :] - fields["seconds"][:, start.used - 1, None]
+        fields["lengths"] = fields["lengths"] - start.used
+        if fields["truth"] is not None:
+            fields["truth"] = fields["truth"][:, start.used :]
+    fields["measurements"], fields["initial"] = dict(start.measurements), dict(start.initial)
 
 
 def check_interface(cls: type[Task], interface: int) -> None:

@@ -478,6 +478,27 @@ class Task(ABC):
         """
         raise NotImplementedError(f"{cls.__name__} has recorded_columns and no method for them")
 
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Any:
+        """Make the start of the track of the first measurements, where a recording has none; few tasks can.
+
+        Args:
+            measurements: by name, ``(E, T, ...)``.
+            seconds: ``(E, T)``.
+            parameters: of the task.
+
+        Returns:
+            :class:`~.recording.Started`.
+
+        Raises:
+            ValueError: if that cannot be.
+        """
+        raise ValueError(
+            f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
+        )
+
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
         """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
 

@@ -6,6 +6,7 @@ import json
 import pickle
 import subprocess
 import sys
+from collections import namedtuple
 
 import gymnasium as gym
 import numpy as np
@@ -440,6 +441,50 @@ def test_ranges_and_decisions(tmp_path):
     assert np.isfinite(evaluate(ESM, _names(ESM)[:1], scenario=read, tracks=True)["estimate"].values).all()
 
 
+def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, tmp_path):
+    for env, used in ((TARGET, 2), (LOOSE, 0), (ESM, 1)):
+        data = recordings[env].dataset
+        data = data.drop_vars([name for name in data.variables if str(name).startswith("initial_")])
+        data.to_netcdf(tmp_path / "raw.nc", engine="scipy")
+        read = read_recording(tmp_path / "raw.nc")
+        assert read.lengths.tolist() == [n - used for n in recordings[env].lengths]
+        counted = "number" if env == LOOSE else "scan"
+        assert read.measurements[counted][:, 0].tolist() == [1] * 3
+        assert np.isfinite(evaluate(env, _names(env)[:1], scenario=read)["cost"].values).all()
+        if env == TARGET:
+            said = recordings[env].measurements
+            velocity = (said["position"][:, 1] - said["position"][:, 0]) / 6.0
+            np.testing.assert_allclose(read.initial["mean"], np.hstack([said["position"][:, 1], velocity]))
+            np.testing.assert_array_equal(read.truth, recordings[env].truth[:, 2:])
+            np.testing.assert_allclose(read.seconds[:, 0], 6.0)
+        if env == LOOSE:
+            np.testing.assert_allclose(read.initial["mean"], recordings[env].initial["mean"], atol=1e-12)
+    data = recordings[TIGHT].dataset.drop_vars(["initial_mean", "initial_covariance"])
+    data.to_netcdf(tmp_path / "raw.nc", engine="scipy")
+    with pytest.raises(ValueError, match="lacks initial_mean and initial_covariance"):
+        read_recording(tmp_path / "raw.nc")
+
+
+def test_scans_without_a_plot_are_missing_measurements_where_there_are_such(tmp_path, monkeypatch):
+    """As soon as the environment's measurement has ``available``, ``interval`` and ``elapsed``."""
+    from filtergym.envs.maneuvering_target import recorded as plots
+
+    fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
+    monkeypatch.setattr(plots, "Measurement", namedtuple("Measurement", fields))
+    time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
+    x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
+    found = plots.recorded(plots.Columns("track", {"x": x, "y": x + 1.0}, time, {}))
+    said = found.measurements
+    assert list(said) == fields
+    assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]
+    assert said["available"].tolist() == [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
+    np.testing.assert_allclose(said["interval"], [5.2, 4.8, 5.0, 5.0, 5.0, 5.0])
+    np.testing.assert_allclose(said["elapsed"], [5.2, 4.8, 9.8, 14.8, 19.8, 5.0])
+    assert said["position"][1].tolist() == [0.0, 0.0]
+    assert said["variance"][2].tolist() == [1e4, 1e4]  # range_sigma squared
+    assert said["position"][4].tolist() == [6e3, 6001.0]
+
+
 def changed(**columns):
     """Plots with other columns; None leaves one out."""
     return {name: values for name, values in {**PLOTS, **columns}.items() if values is not None}
@@ -502,6 +547,13 @@ WRONG = {
         "row 1 has a decision and lacks a bearing",
     ),
     "no tables": (TIGHT, LOG, "reads recordings from NetCDF only"),
+    "a closed loop": (UAV, LOG, "is a closed loop, in which the estimate decides"),
+    "kilometres away": (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
+    "a scan without a plot": (
+        TARGET,
+        changed(x=[1.0, 2.0, 3.0, None, 5.0], y=[1.0, 2.0, 3.0, None, 5.0]),
+        "row 3 has no plot",
+    ),
     "another environment": (ESM, PLOTS, "reads time and range, range_rate"),
 }
 

@@ -4,9 +4,12 @@ The first row is the start of the track: there the position of the INS is taken 
 it. Every further row is a measurement.
 """
 
+from collections.abc import Mapping
+
 import numpy
 
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from .parameters import AXES, LooselyCoupledNavigationParameters
 
 COLUMNS = {
@@ -15,6 +18,13 @@ COLUMNS = {
     "sigma": "m, standard deviation of each axis of the fix, as reported; optional, default: the parameters'",
     **{f"{kind}_{axis}": "likewise" for kind in ("ins", "fix") for axis in AXES},
 }
+
+
+def started(measurements: Mapping[str, numpy.ndarray]) -> Started:
+    """Start every episode where its INS was before the first increment."""
+    mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
+    covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
+    return Started(measurements, {"mean": mean, "covariance": covariance}, 0)
 
 
 def recorded(columns: Columns) -> Recorded:

@@ -10,13 +10,17 @@ complexes". The reference ``Xr`` is ``amplitude sin(rate t)``; the INS integrate
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
+import numpy
+
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .parameters import AXES, LooselyCoupledNavigationParameters
-from .recorded import COLUMNS, recorded
+from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
 from .world import InsGnssWorld
 
@@ -130,6 +134,13 @@ class LooselyCoupledNavigation(Task):
     def recorded(cls, columns: Columns) -> Recorded:
         """Make measurements of positions by INS and receiver."""
         return recorded(columns)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start where the INS was before the first increment."""
+        return started(measurements)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -5,12 +5,14 @@ plots, equation (24): the position of the second, and the difference of both ove
 covariance that belongs to it.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy
 
 from ...filters import polar
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
@@ -25,6 +27,8 @@ COLUMNS = {
     "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
 }
 PAIRS = (("x", "y"), ("range", "azimuth"), ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma"))
+FARTHEST_RANGE = 500e3
+"""m; what lies beyond this is taken for a mistake of units."""
 LARGEST_GAP = 1000
 """Scans that may be missing between two rows; more is a mistake of units."""
 
@@ -46,23 +50,19 @@ def recorded(columns: Columns) -> Recorded:
         row = int(numpy.flatnonzero(numpy.isfinite(position).any(axis=1) & ~there)[0])
         raise ValueError(f"row {row} has one coordinate of two")
     variance = _variances(columns, position, there)
+    farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
+    if farthest > FARTHEST_RANGE:
+        raise ValueError(
+            f"a plot lies {farthest / 1e3:,.0f} km from the radar, whose range ends at {FARTHEST_RANGE / 1e3:,.0f} km "
+            "(positions are metres)"
+        )
     plots = numpy.flatnonzero(there)
     if len(plots) < 3:
         raise ValueError(
             f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two, and goes on"
         )
-    before, first = plots[:2]
-    lasted = columns.time[first] - columns.time[before]
-    difference = (variance[before] + variance[first]) / lasted**2
-    initial = {
-        "mean": numpy.concatenate([position[first], (position[first] - position[before]) / lasted]),
-        "covariance": numpy.block(
-            [
-                [numpy.diag(variance[first]), numpy.diag(variance[first] / lasted)],
-                [numpy.diag(variance[first] / lasted), numpy.diag(difference)],
-            ]
-        ),
-    }
+    first = plots[1]
+    initial = two_plot_start(position[plots[:2]], variance[plots[:2]], numpy.diff(columns.time[plots[:2]]))
     parameters: dict[str, Any] = {}
     if "available" in Measurement._fields:
         interval = columns.interval()
@@ -94,6 +94,48 @@ def recorded(columns: Columns) -> Recorded:
         float(columns.time[first]),
         time,
     )
+
+
+def two_plot_start(
+    position: numpy.ndarray, variance: numpy.ndarray, lasted: numpy.ndarray
+) -> dict[str, numpy.ndarray]:
+    """Start of a track from two plots: the second, and their difference over the time between them.
+
+    Args:
+        position: of the two, ``(..., 2, 2)``, m.
+        variance: of their errors, likewise, m^2.
+        lasted: s, ``(..., 1)``.
+    """
+    before, first = position[..., 0, :], position[..., 1, :]
+    covariance = numpy.zeros((*first.shape[:-1], 4, 4))
+    shared = variance[..., 1, :] / lasted
+    for axis in range(2):
+        covariance[..., axis, axis] = variance[..., 1, axis]
+        covariance[..., axis, axis + 2] = covariance[..., axis + 2, axis] = shared[..., axis]
+        covariance[..., axis + 2, axis + 2] = variance[..., axis].sum(axis=-1) / lasted[..., 0] ** 2
+    mean = numpy.concatenate([first, (first - before) / lasted], axis=-1)
+    return {"mean": mean, "covariance": covariance}
+
+
+def started(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray) -> Started:
+    """Start every episode from its first two plots.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if seconds.shape[1] < 3 or not numpy.isfinite(seconds[:, :3]).all():
+        raise ValueError("an episode without initial_mean starts from its first two plots, and needs a third")
+    available = measurements.get("available", numpy.ones(seconds.shape))
+    if not (available[:, :2] > 0.0).all():
+        raise ValueError(
+            "an episode without initial_mean starts from its first two scans, and one has no plot"
+        )
+    initial = two_plot_start(
+        measurements["position"][:, :2], measurements["variance"][:, :2], numpy.diff(seconds[:, :2])
+    )
+    later = {name: values[:, 2:] for name, values in measurements.items()}
+    later["scan"] = later["scan"] - measurements["scan"][:, 1:2]
+    return Started(later, initial, 2)
 
 
 def _positions(columns: Columns) -> numpy.ndarray:

@@ -14,16 +14,15 @@ import numpy
 from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
-from .recorded import COLUMNS, recorded
+from .recorded import COLUMNS, FARTHEST_RANGE, recorded, started
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
-FARTHEST_RANGE = 500e3
-"""Metres; a user's trajectory beyond this is taken for a mistake of units."""
 MOST_SCANS = 100_000
 """Of all flights of a set together: a week of flying at 6 s."""
 
@@ -131,6 +130,13 @@ class ManeuveringTarget(Task):
     def recorded(cls, columns: Columns) -> Recorded:
         """Make measurements of plots."""
         return recorded(columns)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start from the first two plots, equation (24)."""
+        return started(measurements, seconds)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -4,12 +4,14 @@ The first row is scan 0, which starts the track. A decision is the number of an 
 nothing; beside one stand both bearings, or their difference.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy
 
 from ...filters.class_fusion import bearing_difference
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 
 COLUMNS = {
     "range": "m",
@@ -57,21 +59,41 @@ def recorded(columns: Columns, parameters_of: Any) -> Recorded:
         "decision": numpy.where(decided, decision, types).astype(numpy.int64),
         "bearing_difference": numpy.where(decided, difference, 0.0),
     }
-    # What an acceleration of unknown class adds: as in equation (12) at the start.
-    acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
-    initial = {
-        "mean": numpy.append(radar[0], 0.0),
-        "covariance": numpy.diag([p.range_sigma**2, p.range_rate_sigma**2, acceleration]),
-        **{f"first_{name}": values[0] for name, values in said.items()},
-    }
+    later, initial, _ = started({name: values[None] for name, values in said.items()}, p)
     return Recorded(
-        {name: values[1:] for name, values in said.items()},
-        initial,
+        {name: values[0] for name, values in later.items()},
+        {name: values[0] for name, values in initial.items()},
         scans[1:],
         {} if "sampling_interval" in columns.given else {"sampling_interval": interval},
         float(columns.time[0]),
         columns.time[1:],
     )
+
+
+def started(measurements: Mapping[str, numpy.ndarray], p: Any) -> Started:
+    """Start every episode on its first measurement.
+
+    Args:
+        measurements: ``(E, T, ...)``.
+        p: parameters.
+
+    Raises:
+        ValueError: if there is no second one.
+    """
+    if measurements["radar"].shape[1] < 2:
+        raise ValueError("the first measurement starts the track, and a recording needs a second one")
+    first = {name: values[:, 0] for name, values in measurements.items()}
+    # What an acceleration of unknown class adds: as in equation (12) at the start.
+    acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
+    covariance = numpy.diag([p.range_sigma**2, p.range_rate_sigma**2, acceleration])
+    initial = {
+        "mean": numpy.pad(first["radar"], ((0, 0), (0, 1))),
+        "covariance": numpy.tile(covariance, (len(first["radar"]), 1, 1)),
+        **{f"first_{name}": values for name, values in first.items()},
+    }
+    later = {name: values[:, 1:] for name, values in measurements.items()}
+    later["scan"], initial["first_scan"] = later["scan"] - first["scan"][:, None], 0 * first["scan"]
+    return Started(later, initial, 1)
 
 
 def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:

@@ -5,6 +5,7 @@ support measures (ESM) station with recognition of the target's class (in Russia
 theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/singer.py``.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy
@@ -13,10 +14,11 @@ from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..observation import Array
 from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, Episode, PaperPolicy, Task
 from .banks import ClassBank, one_hot
 from .parameters import RadarEsmTrackingParameters
-from .recorded import COLUMNS, recorded
+from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
 
@@ -165,6 +167,13 @@ class RadarEsmTracking(Task):
     def recorded(cls, columns: Columns) -> Recorded:
         """Make measurements of ranges, their rates, bearings and decisions."""
         return recorded(columns, cls.Parameters)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start on the first measurement, which is that of scan 0."""
+        return started(measurements, parameters)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
