@@ -236,6 +236,11 @@ class Recording:
                         f"recording {self.name!r}: {prefix}{name} has the shape {shape} and {task.id} with these "
                         f"parameters {kind} {expected[name]}"
                     )
+        if self.truth is not None and task.World.error_cost is World.error_cost:
+            raise ValueError(
+                f"recording {self.name!r} has truth, and {task.id} does not say what an error costs: give its World "
+                "the method error_cost, or leave the truth out"
+            )
         if self.truth is not None and self.truth.shape[2] != len(task.components):
             raise ValueError(
                 f"recording {self.name!r}: truth has {self.truth.shape[2]} components and {task.id} has "

@@ -74,7 +74,7 @@ def record(
     ]
     measurements, initial_arrays = joined
     truth, lengths = measurements.pop("truth"), initial_arrays.pop("length")
-    times = plain.parameters.sampling_interval * numpy.arange(1, truth.shape[1] + 1)
+    times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
     there = times_there(lengths, truth.shape[1])
     parameters = differing(plain.parameters)
     for name in cls.of_world_only:

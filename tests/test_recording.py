@@ -4,15 +4,17 @@ import copy
 import dataclasses
 import json
 import pickle
+import runpy
 import subprocess
 import sys
 from collections import namedtuple
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import xarray
-from filtergym.envs.catalogue import make_task
+from filtergym.envs.catalogue import make_task, task_class
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
@@ -25,6 +27,7 @@ from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
 
 from filtergym import evaluate, read_recording, record, tidy_records
+from filtergym.reports.tables import with_interval
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
 ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigation-v0"
@@ -35,6 +38,7 @@ OPEN = {
     ESM: {"horizon": 24},
     TIGHT: {"horizon": 12, "decision_interval": 3},
 }
+DOCS = Path(__file__).parent.parent / "docs"
 BACKENDS = ["numpy", *(["compiled"] if AVAILABLE else [])]
 
 
@@ -286,7 +290,6 @@ def test_references_are_refused_on_recordings(recordings):
 def test_training_and_tuning_refuse_recordings(recordings):
     from filtergym.agents.training_run import training_scenarios
     from filtergym.baselines.tuning import tune
-    from filtergym.envs.catalogue import task_class
 
     with pytest.raises(ValueError, match="held out"):
         training_scenarios(task_class(TARGET), recordings[TARGET])
@@ -672,6 +675,49 @@ def test_a_single_mistake_of_arrays_is_told(recordings):
         dataclasses.replace(made, names=("a", "a", "b"))
     with pytest.raises(ValueError, match="horizon must be at most 24"):
         make_task(TARGET, scenario=made, horizon=30)
+
+
+def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
+    from filtergym.envs.maneuvering_target.world import RadarWorld
+    from filtergym.envs.task import World
+
+    monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
+    with pytest.raises(ValueError, match="does not say what an error costs"):
+        make_task(TARGET, scenario=recordings[TARGET])
+    make_task(TARGET, scenario=blind(recordings[TARGET]))
+
+
+# --- the page
+
+PAGE = DOCS / "own_data.md"
+
+
+def test_the_example_of_the_page_prints_what_it_says(capsys):
+    section = PAGE.read_text(encoding="utf-8").partition("## What the sensors really said")[2]
+    code = section.partition("```python\n")[2].partition("```")[0]
+    exec(code, {})
+    said = [line.rpartition("  # ")[2] for line in code.splitlines() if "  # " in line]
+    assert capsys.readouterr().out.splitlines() == said
+
+
+def test_the_table_of_the_page_is_that_of_its_command(tmp_path):
+    runpy.run_path(str(DOCS / "examples" / "plots.py"))["write_plots"](tmp_path / "plots.csv")
+    read = read_recording(tmp_path / "plots.csv", TARGET)
+    assert read.names == ("straight", "turning")
+    records = tidy_records(evaluate(TARGET, ["imm", "imm-tuned"], scenario=read))
+    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
+    text = PAGE.read_text(encoding="utf-8")
+    for policy, shown in (("imm", "`imm` (paper)"), ("imm-tuned", "`imm-tuned`")):
+        cells = [with_interval(found[policy, metric]) for metric in ("log_likelihood", "anis")]
+        assert f"| {shown} | {' | '.join(cells)} | 0.849 to 1.16 |" in text
+
+
+def test_every_column_is_on_the_page():
+    text = PAGE.read_text(encoding="utf-8")
+    axes = ("ins_y", "ins_z", "fix_y", "fix_z")
+    for env in (TARGET, LOOSE, ESM):
+        columns = [name for name in task_class(env).recorded_columns if name not in axes]
+        assert [name for name in columns if f"`{name}`" not in text] == []
 
 
 # --- the command line
