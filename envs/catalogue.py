@@ -20,9 +20,9 @@ import gymnasium
 import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
-from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
+from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from .recorded_tables import read_columns
-from .recording import Recording, recording_from
+from .recording import Recording, joined, recording_from
 from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
@@ -224,7 +224,9 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
 
     Args:
         path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.recorded_columns`.
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.recorded_columns`. A
+            folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
+            broken one is left out and named in the notes.
         environment: id of the environment that it is for; default: what the file says.
         **keywords: parameters of the environment that win over those of the file.
 
@@ -234,7 +236,32 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     Raises:
         ValueError: if it cannot be read, or does not fit the environment.
     """
-    file = Path(path)
+    several = list(path) if isinstance(path, list | tuple) else [path]
+    if not several:
+        raise ValueError("name at least one file of recordings, got none")
+    if environment is not None:
+        check_names(task_class(environment), keywords)
+    files = [file for one in several for file in files_of(one)]
+    found: list[Recording] = []
+    left_out: list[str] = []
+    for file in files:
+        try:
+            found.append(_read_recording(file, found[0].environment if found else environment, keywords))
+        except ValueError as error:
+            if len(files) == 1:
+                raise
+            left_out.append(f"{file.name}: left out: {str(error).partition(f'recording {file}: ')[2]}")
+    if not found:
+        further = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        raise ValueError(f"nothing of {str(path)!r} can be replayed: {'; '.join(left_out[:3])}{further}")
+    if len(files) == 1:
+        return found[0]
+    name = str(path) if not isinstance(path, list | tuple) else f"{len(files)} files"
+    return joined(found, name, left_out)
+
+
+def _read_recording(file: Path, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
+    """Read one file."""
     try:
         if not file.is_file():
             raise ValueError("there is no such file")
@@ -248,13 +275,11 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
                 "--recording"
             )
         else:
-            check_names(task_class(environment), keywords)
             recording = read_columns(file, task_class(environment), keywords)
+        recording.scenario(task_class(recording.environment), {})
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"recording {file}: {reason}") from error
-    cls = task_class(recording.environment)
-    recording.scenario(cls, {})
     return recording
 
 

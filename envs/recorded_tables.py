@@ -91,7 +91,10 @@ class Columns:
 
     def interval(self) -> float:
         """Sampling interval, s: the one that the user has named, or the median of those in the table."""
-        return float(self.given.get("sampling_interval", numpy.median(numpy.diff(self.time))))
+        if "sampling_interval" in self.given:
+            return float(self.given["sampling_interval"])
+        # Rounded as times are: files of one sensor have the same then.
+        return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
 
     def regular(self, why: str) -> float:
         """Sampling interval of measurements that must be regular, s.

@@ -14,7 +14,7 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -67,7 +67,7 @@ class Recording:
             otherwise the last measurement again.
         truth: true values of the task's components in their units, ``(E, T, C)``; None where they are not known.
         names: of the episodes; default: their numbers.
-        parameters: of the environment, where they differ from the defaults; not the horizon.
+        parameters: of the environment, where they differ from the defaults; a horizon makes episodes shorter.
         name: of the whole, in reports.
         source: where the data come from, in words.
         licence: of the data, in words.
@@ -194,7 +194,7 @@ class Recording:
                 f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
                 f"{self.name!r}, got {interval}"
             )
-        parameters = {**self.parameters, "horizon": longest - longest % interval}
+        parameters = {"horizon": longest - longest % interval, **self.parameters}
         made = cls.Parameters(**{**parameters, **keywords})
         if made.horizon > longest:
             raise ValueError(
@@ -323,6 +323,66 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
     for name in ("names", "notes"):
         others[name] = tuple(others.get(name, ()))
     return Recording(**arrays, **others)
+
+
+def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
+    """Put recordings of one environment side by side; those with other parameters than the first are left out.
+
+    Args:
+        recordings: at least one.
+        name: of the whole.
+        notes: what is to be told of the reading, a line each; what is left out is added.
+    """
+    first, told = recordings[0], list(notes)
+    kept: list[Recording] = []
+    for one in recordings:
+        differing = sorted(
+            parameter
+            for parameter in {*one.parameters, *first.parameters}
+            if one.parameters.get(parameter) != first.parameters.get(parameter)
+        )
+        if differing:
+            told.append(
+                f"{one.name}: left out: {differing[0]} is {one.parameters.get(differing[0], 'the default')}, and of "
+                f"{first.name} {first.parameters.get(differing[0], 'the default')}"
+            )
+        else:
+            kept.append(one)
+    untrue = [one.name for one in kept if one.truth is None]
+    if untrue and len(untrue) < len(kept):
+        told.append(f"{untrue[0]}: has no truth, so nobody is judged")
+    longest = max(one.seconds.shape[1] for one in kept)
+
+    def side_by_side(arrays: Sequence[numpy.ndarray], padded: bool = True) -> numpy.ndarray:
+        if padded:
+            arrays = [
+                numpy.pad(
+                    values,
+                    [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)],
+                    constant_values=numpy.nan if values.dtype.kind == "f" else 0,
+                )
+                for values in arrays
+            ]
+        return numpy.concatenate(arrays)
+
+    names = []
+    for one in kept:
+        alone = len(one.names) == 1
+        names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
+    return dataclasses.replace(
+        first,
+        measurements={
+            key: side_by_side([one.measurements[key] for one in kept]) for key in first.measurements
+        },
+        initial={key: side_by_side([one.initial[key] for one in kept], False) for key in first.initial},
+        seconds=side_by_side([one.seconds for one in kept]),
+        lengths=numpy.concatenate([one.lengths for one in kept]),
+        truth=None if untrue else side_by_side([one.truth for one in kept if one.truth is not None]),
+        names=tuple(names),
+        name=name,
+        source=name,
+        notes=tuple(told),
+    )
 
 
 class Tables(NamedTuple):

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import pickle
 import runpy
-import subprocess
 import sys
 from collections import namedtuple
 from pathlib import Path
@@ -27,6 +26,7 @@ from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
 
 from filtergym import evaluate, read_recording, record, tidy_records
+from filtergym.__main__ import main
 from filtergym.reports.tables import with_interval
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
@@ -488,6 +488,44 @@ def test_scans_without_a_plot_are_missing_measurements_where_there_are_such(tmp_
     assert said["position"][4].tolist() == [6e3, 6001.0]
 
 
+def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
+    table(tmp_path / "a.csv", **PLOTS)
+    table(tmp_path / "b.csv", **{name: values[:4] for name, values in PLOTS.items()})
+    table(tmp_path / "c.csv", **changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]))
+    table(tmp_path / "d.csv", **changed(time=[0.0, 6.0, 12.0, 18.0, 24.0]))
+    for source in (tmp_path, str(tmp_path / "*.csv"), [tmp_path / f"{name}.csv" for name in "abcd"]):
+        read = read_recording(source, TARGET)
+        assert read.names == ("a", "b")
+        assert read.lengths.tolist() == [3, 2]
+        assert read.notes == (
+            "c.csv: left out: time is the same in rows 1 and 2: rows must be in the order of their times",
+            "d: left out: sampling_interval is 6.0, and of a 5.0",
+        )
+    dataset = evaluate(TARGET, ["imm"], scenario=read)
+    assert dataset.attrs["notes"] == list(read.notes)
+    assert np.isfinite(dataset["nis"].values[0]).sum(axis=1).tolist() == [3, 2]
+    with pytest.raises(
+        ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time is the same"
+    ):
+        read_recording([tmp_path / "c.csv"] * 2, TARGET)
+
+
+def test_files_with_and_without_truth_are_not_judged(recordings, tmp_path):
+    recordings[TARGET].write(tmp_path / "known.nc")
+    blind(recordings[TARGET]).write(tmp_path / "untold.nc")
+    read = read_recording(tmp_path)
+    assert read.names[2:4] == ("known: 2", "untold: 0")
+    assert read.truth is None
+    assert read.notes == ("untold: has no truth, so nobody is judged",)
+
+
+def test_a_horizon_makes_episodes_shorter(recordings, tmp_path):
+    recordings[TARGET].write(tmp_path / "plots.nc")
+    read = read_recording(tmp_path / "plots.nc", horizon=10)
+    assert make_task(TARGET, scenario=read).flights == (10, 10, 10)
+    assert make_task(TARGET, scenario=read, horizon=7).horizon == 7
+
+
 def changed(**columns):
     """Plots with other columns; None leaves one out."""
     return {name: values for name, values in {**PLOTS, **columns}.items() if values is not None}
@@ -723,27 +761,83 @@ def test_every_column_is_on_the_page():
 # --- the command line
 
 
-def command(*words, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "filtergym", *map(str, words)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run a command in an empty folder: exit code, and what it has printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        printed = capsys.readouterr()
+        return end.value.code, printed.out + printed.err
+
+    return run
+
+
+def test_record_and_evaluate_on_the_command_line(command, tmp_path):
+    code, out = command("record", TARGET, "--episodes", 2, "--set", "horizon=12", "--out", "plots.nc")
+    assert (code, out.strip()) == (0, "2 episodes in plots.nc")
+    code, out = command(
+        "evaluate",
+        "--recording",
+        "plots.nc",
+        "--policy",
+        "imm",
+        "--estimates",
+        "estimates.csv",
+        "--out",
+        "figures",
     )
-
-
-def test_record_and_evaluate_on_the_command_line(tmp_path):
-    words = ("record", TARGET, "--episodes", 2, "--set", "horizon=12", "--out", "plots.nc")
-    made = command(*words, cwd=tmp_path)
-    assert made.returncode == 0, made.stderr
-    assert "2 episodes in plots.nc" in made.stdout
-    words = ("evaluate", "--recording", "plots.nc", "--policy", "imm", "--estimates", "estimates.csv")
-    found = command(*words, cwd=tmp_path)
-    assert found.returncode == 0, found.stderr
-    assert "2 recordings" in found.stdout
+    assert code == 0
+    assert "2 recordings" in out
     assert len((tmp_path / "estimates.csv").read_text().splitlines()) == 25
+    assert (tmp_path / "figures" / "records.json").exists()
+    # The file names its environment as a scenario, too.
+    code, again = command("evaluate", "--scenario", "plots.nc", "--policy", "imm")
+    assert code == 0
+    assert again.splitlines()[:9] == out.splitlines()[:9]
+
+
+def test_tables_on_the_command_line(command, tmp_path):
     table(tmp_path / "plots.csv", **PLOTS)
-    told = command("evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", cwd=tmp_path)
-    assert told.returncode == 0, told.stderr
-    assert "log-likelihood per measurement" in told.stdout
+    code, out = command(
+        "evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", "--json", "records.json"
+    )
+    assert code == 0
+    assert "log-likelihood per measurement" in out
+    metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
+    assert {"log_likelihood", "anis", "anis_band", "nis_inside"} <= metrics
+    assert not {"rmse", "cost", "anees"} & metrics
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["evaluate", "--recording", "plots.csv"], "does not say of which environment it is"),
+        (["evaluate"], "name an environment, or a recording, which names its own"),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--scenario", "paper"],
+            "takes the place of --scenario",
+        ),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"],
+            "'known-turn' is told what",
+        ),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--site", "1,2"],
+            "--site is for flights from files",
+        ),
+        (["evaluate", TARGET, "--recording", "nothing/*.csv"], "no file matches 'nothing/*.csv'"),
+        (["record", TARGET, "--out", "plots.csv"], "a recording is a NetCDF file, whose name ends in .nc"),
+        (["record", UAV, "--out", "loop.nc"], "is a closed loop"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_one_sentence(words, sentence, command, tmp_path):
+    table(tmp_path / "plots.csv", **PLOTS)
+    code, out = command(*words)
+    assert code == 2
+    assert sentence in out
+    assert out.startswith("Error: ")
+    assert len(out.strip().splitlines()) == 1

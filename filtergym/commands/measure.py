@@ -83,8 +83,11 @@ def evaluate_policies(
     out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
     json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     recording: Annotated[
-        Path | None,
-        typer.Option(help="In place of a scenario: what sensors really said, NetCDF or a table (CSV)."),
+        str | None,
+        typer.Option(
+            help="In place of a scenario: what sensors really said, NetCDF or tables (CSV): a file, a folder, or a "
+            "pattern in quotes."
+        ),
     ] = None,
     estimates: Annotated[
         Path | None,
@@ -118,23 +121,17 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     keywords = parsed_settings(settings or [])
+    if recording is not None and scenario is not None:
+        raise ValueError("--recording takes the place of --scenario: leave one of them out")
+    named = task_class(environment).scenarios if environment else {}
     flown: Any = scenario
-    if recording is not None:
-        if scenario is not None:
-            raise ValueError("--recording takes the place of --scenario: leave one of them out")
-        flown = read_recording(recording, environment, **keywords)
-        environment = flown.environment
-    elif environment is None and scenario is not None and is_recording(scenario):
-        flown = read_recording(scenario, **keywords)
+    if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
+        flown = read_recording(recording or scenario, environment, **keywords)
         environment = flown.environment
     if environment is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     cls = task_class(environment)
-    if isinstance(flown, Recording):
-        pass
-    elif scenario not in cls.scenarios and scenario is not None and is_recording(scenario):
-        flown = read_recording(scenario, cls.id, **keywords)
-    elif scenario not in cls.scenarios and names_flights(scenario):
+    if not isinstance(flown, Recording) and scenario not in named and names_flights(scenario):
         flown = read_flights(
             scenario,
             None if site is None else pair("--site", site),
@@ -144,7 +141,7 @@ def evaluate_policies(
             smoothing=smoothing,
         )
     elif site is not None:
-        raise ValueError(f"--site is for flights from files, and scenario {scenario!r} is none")
+        raise ValueError(f"--site is for flights from files, and {scenario or recording!r} is none")
     known = baselines_of(cls.id)
     if out is not None:
         writable_folder(out)
