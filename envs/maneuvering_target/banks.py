@@ -313,10 +313,15 @@ class GainBank(_RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Normalised innovation squared, and the gain."""
+        """Normalised innovation squared and log-density of the measurement as predicted (NaN where there is none), and the
+        gain.
+        """
+        nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
+        density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
-            "nis": self.xp.expm1(state.log_squared),
+            "nis": self.seen(measurement, nis, math.nan),
             "nis_degrees": 2.0 * measurement.available,
+            "log_likelihood": self.seen(measurement, density, math.nan),
             "alpha": state.alpha,
         }
 
@@ -479,12 +484,16 @@ class FilterBank(_RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """NIS of the combined prediction, and the weights."""
+        """NIS of the combined prediction and log-density of the measurement as the filters predict it (NaN where there is
+        none), and the weights.
+        """
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
+        density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
         return {
-            "nis": log_density(innovation, S)[1],
+            "nis": self.seen(measurement, log_density(innovation, S)[1], math.nan),
             "nis_degrees": 2.0 * measurement.available,
+            "log_likelihood": self.seen(measurement, density, math.nan),
             "mode_probability": state.probabilities,
         }
 

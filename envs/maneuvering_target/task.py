@@ -13,15 +13,16 @@ import numpy
 
 from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
+from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
+from .recorded import COLUMNS, FARTHEST_RANGE, recorded, started
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
-FARTHEST_RANGE = 500e3
-"""Metres; a user's trajectory beyond this is taken for a mistake of units."""
 MOST_SCANS = 100_000
 """Of all flights of a set together: a week of flying at 6 s."""
 
@@ -95,6 +96,8 @@ class ManeuveringTarget(Task):
     )
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
+    of_world_only = ("flight", "track", "track_scans")
+    recorded_columns = COLUMNS
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
@@ -133,6 +136,18 @@ class ManeuveringTarget(Task):
         self.flights = self.parameters.track_scans
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
+
+    @classmethod
+    def recorded(cls, columns: Columns) -> Recorded:
+        """Make measurements of plots."""
+        return recorded(columns)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start from the first two plots, equation (24)."""
+        return started(measurements, seconds)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -384,9 +384,9 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
-    def cost(self, truth: Truth, mean: Array) -> Array:
+    def error_cost(self, error: Array) -> Array:
         """Squared position error over the squared range sigma."""
-        scaled = (mean[:2] - truth.position) * (1.0 / self.parameters.range_sigma)
+        scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def context(self, truth: Truth) -> dict[str, Array]:
