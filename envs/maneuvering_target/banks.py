@@ -7,7 +7,7 @@ probabilities (13), averages and gains hold.
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -17,9 +17,12 @@ from ...filters.gaussian import log_density
 from ...filters.ordered_sums import weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Quantity
-from ..task import Bank, Initial, Task
+from ..task import Bank, Initial
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import ManeuveringTarget
 
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
@@ -86,15 +89,15 @@ class Filters(NamedTuple):
     """Position gains used last, ``(M, N)``."""
 
 
-class _RadarBank(Bank[Task, Measurement, Any]):
+class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
     """What both banks share: the averages that are shown, and the end of the observation."""
 
     parameters: ManeuveringTargetParameters
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         self.T = self.parameters.sampling_interval
-        self.regular = self.parameters.regular
+        self.regular = task.regular
         self.forgetting = math.exp(-1.0 / self.parameters.averaging_measurements)
         self.average = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
@@ -313,8 +316,8 @@ class GainBank(_RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Normalised innovation squared and log-density of the measurement as predicted (NaN where there is none), and the
-        gain.
+        """Normalised innovation squared and log-density of the measurement as predicted (NaN where there is none), and
+        the gain.
         """
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
@@ -329,7 +332,7 @@ class GainBank(_RadarBank):
 class FilterBank(_RadarBank):
     """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         p = self.parameters
         self.count = len(p.gains)
@@ -484,7 +487,7 @@ class FilterBank(_RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """NIS of the combined prediction and log-density of the measurement as the filters predict it (NaN where there is
+        """NIS of the combined prediction, log-density of the measurement as the filters predict it (NaN where there is
         none), and the weights.
         """
         predicted = self.xp.exp(state.log_predicted)
@@ -501,7 +504,7 @@ class FilterBank(_RadarBank):
 class SteeredFilterBank(FilterBank):
     """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 

@@ -12,9 +12,8 @@ import numpy
 
 from ...filters import polar
 from ..recorded_tables import Columns, Recorded
-from ..recording import Started
+from ..recording import Recording, Started
 from .parameters import ManeuveringTargetParameters
-from .world import Measurement
 
 COLUMNS = {
     "x": "m, east of the radar",
@@ -37,8 +36,7 @@ def recorded(columns: Columns) -> Recorded:
     """Make measurements of the plots of one track.
 
     Raises:
-        ValueError: for what lacks or cannot be; scans without a plot are missing measurements where the environment
-            has such, and otherwise refused.
+        ValueError: for what lacks or cannot be. Scans without a plot are missing measurements.
     """
     for pair in PAIRS:
         if sum(columns.has(name) for name in pair) == 1:
@@ -64,17 +62,8 @@ def recorded(columns: Columns) -> Recorded:
     first = plots[1]
     initial = two_plot_start(position[plots[:2]], variance[plots[:2]], numpy.diff(columns.time[plots[:2]]))
     parameters: dict[str, Any] = {}
-    if "available" in Measurement._fields:
-        interval = columns.interval()
-        rows, time = _scans(columns, int(first), interval)
-    else:
-        interval = columns.regular("this environment scans at fixed times")
-        rows, time = numpy.arange(first + 1, len(there)), columns.time[first + 1 :]
-        if not there[rows].all():
-            missing = int(rows[~there[rows]][0])
-            raise ValueError(
-                f"row {missing} has no plot, and in this environment every scan has one: cut it there"
-            )
+    interval = columns.interval()
+    rows, time = _scans(columns, int(first), interval)
     if "sampling_interval" not in columns.given:
         parameters["sampling_interval"] = interval
     seen = (rows >= 0) & there[rows]
@@ -87,12 +76,26 @@ def recorded(columns: Columns) -> Recorded:
         **_clocks(numpy.append(columns.time[first], time), seen),
     }
     return Recorded(
-        {name: said[name] for name in Measurement._fields},
+        said,
         initial,
         rows,
         parameters,
         float(columns.time[first]),
         time,
+    )
+
+
+def scanned_regularly(recording: Recording, p: ManeuveringTargetParameters) -> bool:
+    """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    there = numpy.isfinite(recording.seconds)
+    said = recording.measurements
+    return all(
+        bool((said[name][there] == value).all())
+        for name, value in (
+            ("available", 1.0),
+            ("interval", p.sampling_interval),
+            ("elapsed", p.sampling_interval),
+        )
     )
 
 
@@ -125,8 +128,7 @@ def started(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray) -
     """
     if seconds.shape[1] < 3 or not numpy.isfinite(seconds[:, :3]).all():
         raise ValueError("an episode without initial_mean starts from its first two plots, and needs a third")
-    available = measurements.get("available", numpy.ones(seconds.shape))
-    if not (available[:, :2] > 0.0).all():
+    if not (measurements["available"][:, :2] > 0.0).all():
         raise ValueError(
             "an episode without initial_mean starts from its first two scans, and one has no plot"
         )

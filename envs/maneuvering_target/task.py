@@ -19,7 +19,7 @@ from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
-from .recorded import COLUMNS, FARTHEST_RANGE, recorded, started
+from .recorded import COLUMNS, FARTHEST_RANGE, recorded, scanned_regularly, started
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
@@ -134,6 +134,10 @@ class ManeuveringTarget(Task):
         """Name the hypotheses and the paper's action."""
         count = len(self.parameters.gains)
         self.flights = self.parameters.track_scans
+        self.regular = self.parameters.regular and (
+            self.recording is None or scanned_regularly(self.recording, self.parameters)
+        )
+        """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
