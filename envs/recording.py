@@ -25,8 +25,8 @@ from .observation import Array
 from .parameters import check, declared, frozen
 from .task import Scenario, Task, World, named_arrays
 
-MOST_NUMBERS = 100_000_000
-"""Of a recording: 800 MB; what it is replayed from takes as much again."""
+MOST_NUMBERS = 50_000_000
+"""Of a recording: 400 MB; to replay it takes twice as much again."""
 
 
 class Replayed(NamedTuple):

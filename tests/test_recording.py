@@ -638,7 +638,7 @@ def test_ten_million_rows_are_refused_early(tmp_path):
     (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + row * (MOST_ROWS + 2))
     with pytest.raises(ValueError, match="more than 1,000,000 rows"):
         read_recording(tmp_path / "long.csv", TARGET)
-    with pytest.raises(ValueError, match="more than the 100,000,000 numbers that a recording may hold"):
+    with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may hold"):
         record(TARGET, episodes=10, horizon=10_000_000)
 
 
@@ -703,6 +703,21 @@ def test_files_say_what_they_hold(recordings):
     assert data.attrs["interface"] == 2
     assert json.loads(data.attrs["parameters"])["axes"] == 2
     assert data["recording"].values.tolist() == ["0", "1", "2"]
+
+
+def test_recordings_of_another_environment_or_an_older_one_are_refused(recordings):
+    with pytest.raises(
+        ValueError, match="is of filtergym/ManeuveringTarget-v0, not of filtergym/RadarEsmTracking-v0"
+    ):
+        gym.make(ESM, scenario=recordings[TARGET])
+    with pytest.raises(
+        ValueError, match="was made for interface 1 of .* which has 2 now: .* record them anew"
+    ):
+        gym.make(ESM, scenario=dataclasses.replace(recordings[ESM], interface=1))
+    with pytest.raises(
+        ValueError, match=r"ins has the shape \(2,\) and .* with these parameters measures \(1,\)"
+    ):
+        gym.make(LOOSE, scenario=recordings[LOOSE], axes=1)
 
 
 def test_a_single_mistake_of_arrays_is_told(recordings):
