@@ -328,7 +328,6 @@ def dataset(
     )
     found.attrs = {
         "environment": TASK.id,
-        "interface": TASK.interface,
         "parameters": json.dumps(PARAMETERS),
         "source": SOURCE,
         "licence": LICENCE,

@@ -251,7 +251,6 @@ def _joined(
         raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")
     return Recording(
         environment=cls.id,
-        interface=cls.interface,
         measurements=measurements,
         initial={
             name: numpy.stack([numpy.asarray(found.initial[name]) for _, found in parts])

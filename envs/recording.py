@@ -59,7 +59,6 @@ class Recording:
 
     Args:
         environment: its id.
-        interface: :attr:`.Task.interface` for which it was made.
         measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
         initial: every array of what everyone is told of the start of the track, ``(E, ...)``.
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
@@ -78,7 +77,6 @@ class Recording:
     """
 
     environment: str
-    interface: int
     measurements: Mapping[str, numpy.ndarray]
     initial: Mapping[str, numpy.ndarray]
     seconds: numpy.ndarray
@@ -170,15 +168,10 @@ class Recording:
             keywords: parameters that win over those of the recording.
 
         Raises:
-            ValueError: if it is of another environment or interface, or does not fit the parameters.
+            ValueError: if it is of another environment, or does not fit the parameters.
         """
         if self.environment != cls.id:
             raise ValueError(f"recording {self.name!r} is of {self.environment}, not of {cls.id}")
-        if self.interface != cls.interface:
-            raise ValueError(
-                f"recording {self.name!r} was made for interface {self.interface} of {cls.id}, which has "
-                f"{cls.interface} now: its measurements mean something else, record them anew"
-            )
         known = [f.name for f in dataclasses.fields(cls.Parameters)]
         unknown = [name for name in self.parameters if name not in known]
         if unknown:
@@ -304,11 +297,7 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
         "initial": {},
     }
     known = {f.name for f in dataclasses.fields(Recording)}
-    if (
-        not {"environment", "interface", "measurements", "initial", "seconds", "lengths"}
-        <= set(fields)
-        <= known
-    ):
+    if not {"environment", "measurements", "initial", "seconds", "lengths"} <= set(fields) <= known:
         raise ValueError(
             f"a recording as a dictionary has {', '.join(sorted(known))}, got {', '.join(map(repr, fields))}"
         )

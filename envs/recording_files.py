@@ -4,7 +4,7 @@ Dimensions ``episode``, ``time``, ``component``, ``other_component`` and what fu
 every array of the environment's ``Measurement`` by its name, ``(episode, time, ...)``; ``seconds`` ``(episode, time)``,
 NaN where an episode has no measurement; ``length`` ``(episode)``; optionally ``truth`` ``(episode, time, component)``;
 and what everyone is told of the start of the track, ``initial_mean``, ``initial_covariance`` and so on. Attributes:
-``environment``, ``interface``, ``parameters`` (JSON), ``source``, ``licence``.
+``environment``, ``parameters`` (JSON), ``source``, ``licence``.
 """
 
 import dataclasses
@@ -57,7 +57,6 @@ def dataset_of(recording: Recording) -> "xarray.Dataset":
         coords={"recording": ("episode", numpy.array(recording.names, dtype=str))},
         attrs={
             "environment": recording.environment,
-            "interface": recording.interface,
             "parameters": json.dumps(dict(recording.parameters)),
             **told,
         },
@@ -186,15 +185,11 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
                 raise TypeError
         except (ValueError, TypeError):
             raise ValueError("its attribute parameters must be a JSON object") from None
-        # Before anything is looked at: an older file may have other variables.
-        interface = int(attrs.get("interface", cls.interface))
-        check_interface(cls, interface)
         fields = read_dataset(data, path.stem)
     if not fields["initial"]:
         _start(cls, fields, {**parameters, **keywords})
     return Recording(
         environment=cls.id,
-        interface=interface,
         parameters={**parameters, **keywords},
         name=path.stem,
         source=str(attrs.get("source", "")),
@@ -215,15 +210,6 @@ def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any
         if fields["truth"] is not None:
             fields["truth"] = fields["truth"][:, start.used :]
     fields["measurements"], fields["initial"] = dict(start.measurements), dict(start.initial)
-
-
-def check_interface(cls: type[Task], interface: int) -> None:
-    """Raise ValueError if measurements were recorded when they meant something else."""
-    if interface != cls.interface:
-        raise ValueError(
-            f"it was made for interface {interface} of {cls.id}, which has {cls.interface} now: its measurements mean "
-            "something else, record them anew"
-        )
 
 
 def differing(parameters: Any) -> dict[str, Any]:

@@ -74,7 +74,10 @@ def record(
     ]
     measurements, initial_arrays = joined
     truth, lengths = measurements.pop("truth"), initial_arrays.pop("length")
-    times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
+    if "interval" in measurements:
+        times = numpy.cumsum(measurements["interval"], axis=1)
+    else:
+        times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
     there = times_there(lengths, truth.shape[1])
     parameters = differing(plain.parameters)
     for name in cls.of_world_only:
@@ -84,7 +87,6 @@ def record(
         names = [f"{chosen.flights[number]} {i}" for i, number in enumerate(initial_arrays.pop("flight"))]
     return Recording(
         environment=cls.id,
-        interface=cls.interface,
         measurements=measurements,
         initial=initial_arrays,
         seconds=numpy.where(there, times, numpy.nan),

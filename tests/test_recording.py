@@ -6,7 +6,6 @@ import json
 import pickle
 import runpy
 import sys
-from collections import namedtuple
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,6 +16,8 @@ from filtergym.envs.catalogue import make_task, task_class
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
+from filtergym.envs.maneuvering_target.recorded import recorded as plot_measurements
+from filtergym.envs.recorded_tables import Columns
 from filtergym.envs.recording import measured_once
 from filtergym.envs.task import named_arrays
 from filtergym.evaluation.estimates import write_estimates
@@ -468,17 +469,13 @@ def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, t
         read_recording(tmp_path / "raw.nc")
 
 
-def test_scans_without_a_plot_are_missing_measurements_where_there_are_such(tmp_path, monkeypatch):
-    """As soon as the environment's measurement has ``available``, ``interval`` and ``elapsed``."""
-    from filtergym.envs.maneuvering_target import recorded as plots
-
+def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
-    monkeypatch.setattr(plots, "Measurement", namedtuple("Measurement", fields))
     time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
     x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
-    found = plots.recorded(plots.Columns("track", {"x": x, "y": x + 1.0}, time, {}))
+    found = plot_measurements(Columns("track", {"x": x, "y": x + 1.0}, time, {}))
     said = found.measurements
-    assert list(said) == fields
+    assert set(said) == set(fields)
     assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]
     assert said["available"].tolist() == [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
     np.testing.assert_allclose(said["interval"], [5.2, 4.8, 5.0, 5.0, 5.0, 5.0])
@@ -486,6 +483,46 @@ def test_scans_without_a_plot_are_missing_measurements_where_there_are_such(tmp_
     assert said["position"][1].tolist() == [0.0, 0.0]
     assert said["variance"][2].tolist() == [1e4, 1e4]  # range_sigma squared
     assert said["position"][4].tolist() == [6e3, 6001.0]
+
+
+def test_a_table_with_gaps_is_filtered_over_the_times_it_has(tmp_path):
+    """No plot is prediction only, over the time that has passed; nothing becomes NaN but what is of no measurement."""
+    time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0, 40.0])
+    x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3, 8e3])
+    path = table(tmp_path / "gaps.csv", time=time, x=x, y=x + 1.0)
+    read = read_recording(path, TARGET)
+    names = ["imm", "kalman-imm-turn", "adaptive-rearm", "constant"]
+    names = [name for name in names if name in _names(TARGET)]
+    for backend in ("numpy", "auto"):
+        found = evaluate(TARGET, names, scenario=read, tracks=True, backend=backend)
+        assert np.isfinite(found["estimate"].values).all()
+        nis = found["nis"].sel(policy="imm").values[0]
+        assert np.isnan(nis).tolist() == [False, True, True, True, False, False, False]
+    estimate = found["estimate"].sel(policy="imm").values[0]
+    lasted = np.array([4.8, 5.0, 5.0])
+    # Of a mixture of two filters the mean moves on as its own velocity says.
+    moved = estimate[0, :2] + np.cumsum(lasted)[:, None] * estimate[0, 2:]
+    assert abs(estimate[1:4, :2] - moved).max() < 1e-9 * 1e4
+    # The same with cells of the scans that nobody wrote down.
+    full = np.insert(time, 4, [20.0, 25.0])
+    told = np.insert(x, 4, [np.nan, np.nan])
+    again = read_recording(table(tmp_path / "told.csv", time=full, x=told, y=told + 1.0), TARGET)
+    for name, values in read.measurements.items():
+        np.testing.assert_array_equal(values, again.measurements[name])
+
+
+@pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
+def test_missed_and_irregular_scans_are_replayed_bit_for_bit(scenario, tmp_path):
+    for backend in ("numpy", "auto"):
+        made = record(TARGET, scenario, episodes=3, horizon=30, backend=backend)
+        made.write(tmp_path / "made.nc")
+        simulated = evaluate(TARGET, ["imm"], scenario, 3, horizon=30, backend=backend)
+        replayed = evaluate(TARGET, ["imm"], read_recording(tmp_path / "made.nc"), backend=backend)
+        np.testing.assert_array_equal(simulated["error"].values, replayed["error"].values)
+    interval = made.measurements["interval"]
+    np.testing.assert_allclose(made.seconds, np.cumsum(interval, axis=1))
+    assert (np.ptp(interval) > 1.0) == (scenario == "irregular-scans")
+    assert (made.measurements["available"] == 0.0).any() == (scenario == "missed-detections")
 
 
 def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
@@ -590,11 +627,6 @@ WRONG = {
     "no tables": (TIGHT, LOG, "reads recordings from NetCDF only"),
     "a closed loop": (UAV, LOG, "is a closed loop, in which the estimate decides"),
     "kilometres away": (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
-    "a scan without a plot": (
-        TARGET,
-        changed(x=[1.0, 2.0, 3.0, None, 5.0], y=[1.0, 2.0, 3.0, None, 5.0]),
-        "row 3 has no plot",
-    ),
     "another environment": (ESM, PLOTS, "reads time and range, range_rate"),
 }
 
@@ -655,10 +687,6 @@ NOT_FINITE = "position is not finite at measurement 3; what is missing has the v
             lambda d: d.assign_attrs(environment=LOOSE),
             "it is of filtergym/LooselyCoupledNavigation-v0, not of",
         ),
-        (
-            lambda d: d.assign_attrs(interface=0),
-            "interface 0 of filtergym/ManeuveringTarget-v0, which has 1 now",
-        ),
         (lambda d: d.assign_attrs(parameters="{"), "must be a JSON object"),
         (
             lambda d: d.assign_attrs(parameters='{"rang_sigma": 1}'),
@@ -700,20 +728,15 @@ def test_files_say_what_they_hold(recordings):
     assert data["truth"].dims == ("episode", "time", "component")
     assert data["initial_covariance"].dims == ("episode", "component", "other_component")
     assert data.attrs["environment"] == LOOSE
-    assert data.attrs["interface"] == 2
     assert json.loads(data.attrs["parameters"])["axes"] == 2
     assert data["recording"].values.tolist() == ["0", "1", "2"]
 
 
-def test_recordings_of_another_environment_or_an_older_one_are_refused(recordings):
+def test_recordings_of_another_environment_are_refused(recordings):
     with pytest.raises(
         ValueError, match="is of filtergym/ManeuveringTarget-v0, not of filtergym/RadarEsmTracking-v0"
     ):
         gym.make(ESM, scenario=recordings[TARGET])
-    with pytest.raises(
-        ValueError, match="was made for interface 1 of .* which has 2 now: .* record them anew"
-    ):
-        gym.make(ESM, scenario=dataclasses.replace(recordings[ESM], interface=1))
     with pytest.raises(
         ValueError, match=r"ins has the shape \(2,\) and .* with these parameters measures \(1,\)"
     ):
