@@ -711,7 +711,7 @@ def test_recordings_of_another_environment_or_an_older_one_are_refused(recording
     ):
         gym.make(ESM, scenario=recordings[TARGET])
     with pytest.raises(
-        ValueError, match="was made for interface 1 of .* which has 2 now: .* record them anew"
+        ValueError, match=r"was made for interface 1 of .* which has 2 now: .* record them anew"
     ):
         gym.make(ESM, scenario=dataclasses.replace(recordings[ESM], interface=1))
     with pytest.raises(
