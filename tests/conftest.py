@@ -33,42 +33,6 @@ def pytest_generate_tests(metafunc):
         metafunc.parametrize("env_id", list(catalogue()))
 
 
-NEED_SHIPPED_AGENTS = (
-    "test_agents_policies.py::test_shipped_agents_need_no_torch",
-    "test_agents_policies.py::test_there_are_shipped_agents",
-    "test_command_line.py::test_animate_draws_every_policy",
-    "test_command_line.py::test_comparison_shows_what_the_records_say",
-    "test_command_line.py::test_full_benchmark_compares_everything",
-    "test_command_line.py::test_list_names_everything",
-    "test_consistency.py::",
-    "test_estimators.py::test_a_class_of_ones_own_is_found_from_the_working_directory",
-    "test_estimators.py::test_a_name_that_is_taken_is_refused[bptt]",
-    "test_open_loop.py::test_a_schedule_wins_less_than_half_of_what_an_agent_wins",
-    "test_readme.py::test_snippet_runs[index]",
-    "test_scored_right.py::TestMadePolicy::test_a_loop_costs_what_an_evaluation_says[bptt]",
-    "test_scored_right.py::TestMadePolicy::test_a_loop_costs_what_an_evaluation_says[ppo]",
-    "test_scored_right.py::TestMadePolicy::test_batches_and_episodes_that_begin_at_different_times[bptt]",
-    "test_scored_right.py::TestMadePolicy::test_of_a_run_and_of_an_object",
-    "test_scored_right.py::TestRunFolder::",
-    "test_training_seeds.py::test_command_fills_the_page",
-    "test_training_seeds.py::test_the_numbers_follow_from_the_episodes",
-    "test_training_seeds.py::test_what_cannot_be_compared",
-    "test_trust.py::test_a_model_is_not_unpickled",
-    "test_trust.py::test_a_name_with_a_colon_can_be_a_path",
-    "test_trust.py::test_a_path_is_not_read_as_markup",
-    "test_trust.py::test_plain_arrays_take_no_trust",
-    "test_trust.py::test_the_module_that_a_record_names_is_not_imported",
-)
-"""Tests of what an agent of ManeuveringTarget is an example of: they wait for new ones."""
-
-
-def pytest_collection_modifyitems(items):
-    """Leave out what needs a shipped agent while there is none."""
-    for item in items:
-        if any(name in item.nodeid for name in NEED_SHIPPED_AGENTS):
-            item.add_marker(pytest.mark.skip(reason="agents of ManeuveringTarget wait for training"))
-
-
 @pytest.fixture
 def short(env_id):
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""

@@ -16,6 +16,8 @@ from filtergym.filters import geodesy
 from filtergym.filters import loosely_coupled as ins_gnss
 from scipy.spatial.transform import Rotation
 
+from filtergym import evaluate, read_recording
+
 ROOT = Path(__file__).parent.parent
 spec = importlib.util.spec_from_file_location("drive", ROOT / "benchmarks" / "drive.py")
 drive = importlib.util.module_from_spec(spec)
@@ -306,3 +308,15 @@ def test_shipped_file_is_a_drive(shipped):
     assert rms[3] < 0.1  # 1 s
     assert 2.0 < rms[39] < 5.0
     assert 10.0 < rms[79] < 20.0
+
+
+def test_shipped_file_is_replayed_to_every_kind_of_filter():
+    read = read_recording(ROOT / "docs" / "data" / "drive.nc")
+    found = evaluate(read.environment, ["plain-reduced", "augmented", "gnss-only"], scenario=read)
+    assert found.sizes["episode"] == 24
+    assert np.isfinite(found["error"].values).all()
+    error = found["error"] ** 2
+    root = np.sqrt(error.sum("component").mean(["episode", "time"]))
+    # Two axes of white noise of 1.41 m, and what the page says of the filter that estimates the rate errors.
+    assert float(root.sel(policy="gnss-only")) == pytest.approx(2.0, abs=0.1)
+    assert float(root.sel(policy="augmented")) == pytest.approx(0.859, abs=1e-3)
