@@ -359,15 +359,23 @@ def triu(x: Any, /, *, k: int = 0) -> Traced:
 
 
 def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
-    """Entries by their place; places that depend on numbers choose from a table of constants, or one by one."""
-    x, indices = asarray(x), asarray(indices)
+    """Entries by their place; places that depend on numbers choose from a table of constants, or one by one.
+
+    A large table of constants had better stay an array of NumPy: its numbers do not become expressions then.
+    """
+    indices = asarray(indices)
     if indices.dtype == bool:
         raise NotTraceable("how many entries a mask chooses depends on numbers: use where")
-    graph, rows = _OPEN.get(), numpy.moveaxis(x.nodes, axis, -1)
-    choices = rows.reshape(-1, rows.shape[-1])
-    taken = [
-        [_chosen(graph, row.tolist(), index) for index in indices.nodes.ravel().tolist()] for row in choices
-    ]
+    graph, places = _OPEN.get(), indices.nodes.ravel().tolist()
+    rows: Any
+    if isinstance(x, numpy.ndarray) and x.dtype == float:
+        rows = numpy.moveaxis(x, axis, -1)
+        taken = [[graph.take(row, place) for place in places] for row in rows.reshape(-1, rows.shape[-1])]
+    else:
+        x = asarray(x)
+        rows = numpy.moveaxis(x.nodes, axis, -1)
+        choices = rows.reshape(-1, rows.shape[-1]).tolist()
+        taken = [[_chosen(graph, row, place) for place in places] for row in choices]
     shaped = numpy.array(taken, dtype=numpy.int64).reshape(*rows.shape[:-1], *indices.shape)
     for i in range(indices.ndim):
         shaped = numpy.moveaxis(shaped, rows.ndim - 1 + i, axis % x.ndim + i)

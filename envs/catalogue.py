@@ -19,8 +19,11 @@ from typing import Any
 import gymnasium
 import numpy
 
-from .flight_tables import FLIGHT_SUFFIXES
-from .flights import TRAFFIC, Flights, flights_from, names_flights, read_flights
+from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
+from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
+from .recorded_tables import read_columns
+from .recording import Recording, joined, recording_from
+from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
 
@@ -28,7 +31,7 @@ ADDED: dict[str, type[Task]] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""
 
 
-ScenarioChoice = str | Path | Trajectory | Flights | Sequence[Any] | Mapping[str, Any] | None
+ScenarioChoice = str | Path | Trajectory | Flights | Recording | Sequence[Any] | Mapping[str, Any] | None
 """What names a scenario: a name, files of flights, trajectories or their fields, or None for the environment's own."""
 
 MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
@@ -193,23 +196,91 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
 
 
 def opened(cls: type[Task], scenario: Any) -> Any:
-    """Return flights in place of what names them, so that files are read once; anything else as it is.
+    """Return flights or a recording in place of what names them, so that files are read once; anything else as it is.
 
     Args:
         cls: the environment.
         scenario: as :func:`find_scenario` takes it; a name of one of the environment's own is no file.
 
     Raises:
-        ValueError: if the files hold no flights.
+        ValueError: if the files hold neither.
     """
     if isinstance(scenario, Mapping):
         if find_mixture(cls, scenario) is not None:
             return scenario
+        if "measurements" in scenario:
+            return recording_from(scenario)
         return flights_from(scenario) if "trajectories" in scenario else trajectory_of(scenario)
     items = scenario if isinstance(scenario, list | tuple) else [scenario]
     if any(isinstance(item, str) and item in cls.scenarios for item in items):
         return scenario
+    if isinstance(scenario, str | Path) and is_recording(scenario):
+        return read_recording(scenario, cls.id)
     return read_flights(scenario) if names_flights(scenario) else scenario
+
+
+def read_recording(path: Any, environment: str | None = None, **keywords: Any) -> Recording:
+    """Read recorded measurements.
+
+    Args:
+        path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.recorded_columns`. A
+            folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
+            broken one is left out and named in the notes.
+        environment: id of the environment that it is for; default: what the file says.
+        **keywords: parameters of the environment that win over those of the file.
+
+    Returns:
+        What can be given as scenario: every episode replays one recording.
+
+    Raises:
+        ValueError: if it cannot be read, or does not fit the environment.
+    """
+    several = list(path) if isinstance(path, list | tuple) else [path]
+    if not several:
+        raise ValueError("name at least one file of recordings, got none")
+    if environment is not None:
+        check_names(task_class(environment), keywords)
+    files = [file for one in several for file in files_of(one)]
+    found: list[Recording] = []
+    left_out: list[str] = []
+    for file in files:
+        try:
+            found.append(_read_recording(file, found[0].environment if found else environment, keywords))
+        except ValueError as error:
+            if len(files) == 1:
+                raise
+            left_out.append(f"{file.name}: left out: {str(error).partition(f'recording {file}: ')[2]}")
+    if not found:
+        further = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        raise ValueError(f"nothing of {str(path)!r} can be replayed: {'; '.join(left_out[:3])}{further}")
+    if len(files) == 1:
+        return found[0]
+    name = str(path) if not isinstance(path, list | tuple) else f"{len(files)} files"
+    return joined(found, name, left_out)
+
+
+def _read_recording(file: Path, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
+    """Read one file."""
+    try:
+        if not file.is_file():
+            raise ValueError("there is no such file")
+        if file.stat().st_size > MOST_BYTES:
+            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
+        if names_environment(file):
+            recording = read_netcdf(file, task_class, environment, keywords)
+        elif environment is None:
+            raise ValueError(
+                "it does not say of which environment it is: give its id, as the argument environment or before "
+                "--recording"
+            )
+        else:
+            recording = read_columns(file, task_class(environment), keywords)
+        recording.scenario(task_class(recording.environment), {})
+    except Exception as error:  # readers raise whatever a broken file makes them stumble over
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"recording {file}: {reason}") from error
+    return recording
 
 
 def find_scenario(
@@ -222,7 +293,8 @@ def find_scenario(
     Args:
         cls: the environment.
         scenario: a name; a trajectory (also as a dictionary of its fields, as it comes out of JSON); a set of
-            flights as :func:`~.flights.read_flights` takes it, or returns it; or what was found before.
+            flights as :func:`~.flights.read_flights` takes it, or returns it; a recording, or a NetCDF file of one; or
+            what was found before.
         keywords: parameters given beside it; a trajectory is sampled at their ``sampling_interval``.
 
     Raises:
@@ -241,6 +313,8 @@ def find_scenario(
         return cls.scenario_from_trajectory(scenario, keywords or {})
     if isinstance(scenario, Flights):
         return cls.scenario_from_flights(scenario, keywords or {})
+    if isinstance(scenario, Recording):
+        return scenario.scenario(cls, keywords or {})
     name = cls.default_scenario if scenario is None else scenario
     if not isinstance(name, str):
         raise ValueError(
@@ -279,7 +353,8 @@ def make_task(
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})
-    return cls(parameters, control, xp, device)
+    replayed = () if chosen.recording is None else (chosen.recording,)
+    return cls(parameters, control, xp, device, *replayed)
 
 
 def register() -> None:

@@ -211,6 +211,10 @@ class _Compiled(Task):
         """Return the same problem with another control."""
         return compiled(self.original.under(control), self.threads)
 
+    def on_numpy(self) -> Task:
+        """Return the same problem on NumPy arrays, not compiled."""
+        return self.original
+
     def estimated_outside(self) -> Task:
         """Return this task with an outside estimate in place of its bank."""
         programs = Programs(self.programs.traced.estimated_outside(), self.programs.graph)
@@ -268,10 +272,11 @@ def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
     return other
 
 
-def _traced(cls: type[Task], parameters: Any, control: str) -> Programs:
+def _traced(cls: type[Task], parameters: Any, control: str, *replayed: Any) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        programs = Programs(cls(parameters, control, namespace), graph)
+        device = (None,) if replayed else ()
+        programs = Programs(cls(parameters, control, namespace, *device, *replayed), graph)
     _ = programs.later
     return programs
 
@@ -302,7 +307,8 @@ def compiled(task: Task, threads: int = 1) -> Task:
         raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
     # Parameters that hold arrays are traced each time.
     trace = _remembered if _hashes(task.parameters) else _traced
-    return _wrapped(task, trace(type(task), task.parameters, task.control), threads)
+    replayed = () if task.recording is None else (task.recording,)
+    return _wrapped(task, trace(type(task), task.parameters, task.control, *replayed), threads)
 
 
 def warn_of(what: str, error: BaseException) -> None:

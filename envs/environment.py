@@ -94,6 +94,10 @@ def _unexpected_action(expected: str, action: Array) -> ValueError:
     return ValueError(f"expected {expected}, got {action.dtype} of shape {tuple(action.shape)}: {shown}")
 
 
+def _no_truth(course: Course) -> str:
+    return f"recording {course.names[0]!r} has no truth, so nobody knows what an estimate costs"
+
+
 class _Face:
     """What both faces share: a task, its spaces, and the reward."""
 
@@ -127,6 +131,7 @@ class _Face:
         """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
+        self._reward_asked = reward_kind is not None
         if reward_kind is None:
             reward_kind = self._class.reward
         if reward_kind not in REWARDS:
@@ -162,6 +167,8 @@ class _Face:
         """
         self._make, self._keywords, self._longest = make, dict(keywords), longest
         course = self._course(scenario, {})
+        if not all(task.has_truth for task in course.tasks):
+            self._pay_nothing(course)
         self.task, self._first_course, beside_paper = course.tasks[0], course, self.reward_kind == "relative"
         if len(course.tasks) > 1:
             self.lanes = MixedLanes(count, course, beside_paper, longest)
@@ -172,6 +179,18 @@ class _Face:
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
         if self.privileged:
             self._wrong = self.task.constant(numpy.zeros((count, len(self.task.components))))
+
+    def _pay_nothing(self, course: Course) -> None:
+        """Let every reward be zero, where nobody knows the truth.
+
+        Raises:
+            ValueError: if a reward was asked for, or what is privileged.
+        """
+        wanted = f"reward={self.reward_kind!r}" if self._reward_asked else ""
+        wanted = "observation='asymmetric'" if self.privileged else wanted
+        if wanted:
+            raise ValueError(f"{_no_truth(course)}: leave out {wanted}; rewards are zero")
+        self.reward_kind = "none"
 
     # --- scenarios
 
@@ -187,6 +206,15 @@ class _Face:
         found = [find_scenario(self._class, choice, keywords) for choice in choices]
         tasks = tuple(self._make(one, **keywords) for one in found)
         names = tuple(one.name for one in found)
+        course = Course(
+            scenario,
+            dict(parameters),
+            tasks,
+            names,
+            (1.0,) if mixture is None else tuple(mixture.values()),
+        )
+        if hasattr(self, "task") and self.reward_kind != "none" and not all(t.has_truth for t in tasks):
+            raise ValueError(f"{_no_truth(course)}, and this environment pays: make another one of it")
         first = getattr(self, "task", tasks[0])
         for task, name in zip(tasks, names, strict=True):
             check_alike(first, task, name)
@@ -195,8 +223,7 @@ class _Face:
                     f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
                     "it out, or make the environment without observation='asymmetric'"
                 )
-        weights = (1.0,) if mixture is None else tuple(mixture.values())
-        return Course(scenario, dict(parameters), tasks, names, weights)
+        return course
 
     def _send(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
         """Let the coming episodes of some lanes be of what the options of a reset name."""
@@ -369,12 +396,8 @@ class _Face:
             if self.privileged:
                 wrong = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
             if self.detailed_info:
-                batch_last = {
-                    "error": task.error(state),
-                    "cost": task.cost(state),
-                    **task.track(state),
-                    **task.records(state),
-                }
+                judged = {"error": task.error(state), "cost": task.cost(state)} if task.has_truth else {}
+                batch_last = {**judged, **task.track(state), **task.records(state)}
                 # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 for name, values in batch_last.items():
                     moved = task.xp.moveaxis(values[..., : lanes.count], -1, 0)
@@ -405,9 +428,11 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         task: environment id.
         control: what the action steers; default: the first of the environment's controls.
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
-            the path of a file with one; or a mixture, ``{"random": 0.8, "paper": 0.2}``, of which every episode flies
-            one scenario, drawn by these weights from the episode's generator.
-        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own.
+            the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture,
+            ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these weights from
+            the episode's generator.
+        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, and
+            zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.

@@ -8,7 +8,7 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,7 @@ def _rows_refused(rows: int) -> ValueError:
     return ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
 
 
-def _csv(file: Path) -> dict[str, Any]:
+def _csv(file: Path, known: Container[str]) -> dict[str, Any]:
     with file.open(encoding="utf-8-sig", newline="") as lines:
         header = lines.readline()
         delimiter = next((d for d in ",;\t" if d in header), ",")
@@ -65,7 +65,7 @@ def _csv(file: Path) -> dict[str, Any]:
         twice = {name for name in names if names.count(name) > 1}
         if twice:
             raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
-        wanted = [i for i, name in enumerate(names) if name.lower() in _WANTED]
+        wanted = [i for i, name in enumerate(names) if name.lower() in known]
         rows: list[list[str]] = []
         for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
             if not row:
@@ -80,7 +80,7 @@ def _csv(file: Path) -> dict[str, Any]:
     return table
 
 
-def _netcdf(file: Path) -> dict[str, Any]:
+def _netcdf(file: Path, known: Container[str]) -> dict[str, Any]:
     import xarray
 
     # From memory: a mapped file stays open where its reading fails.
@@ -91,19 +91,19 @@ def _netcdf(file: Path) -> dict[str, Any]:
     with xarray.open_dataset(io.BytesIO(content), engine=engine, decode_timedelta=False) as data:
         table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
         for name in table:
-            known = _WANTED.get(name.lower())
-            if known is None:
+            if name.lower() not in known:
                 continue
+            meant = _WANTED.get(name.lower(), "")
             if data[name].size > MOST_ROWS:
                 raise _rows_refused(data[name].size)
             unit = str(data[name].attrs.get("units", ""))
-            if unit and known in UNITS and unit not in UNITS[known]:
-                raise ValueError(f"{name} is in {unit!r}, and {UNITS[known][0]!r} is expected")
+            if unit and meant in UNITS and unit not in UNITS[meant]:
+                raise ValueError(f"{name} is in {unit!r}, and {UNITS[meant][0]!r} is expected")
             table[name] = data[name].values
     return table
 
 
-def _parquet(file: Path) -> dict[str, Any]:
+def _parquet(file: Path, known: Container[str]) -> dict[str, Any]:
     try:
         from pyarrow import parquet
     except ImportError as error:
@@ -112,12 +112,12 @@ def _parquet(file: Path) -> dict[str, Any]:
         table: dict[str, Any] = dict.fromkeys(data.schema_arrow.names)
         if data.metadata.num_rows > MOST_ROWS:
             raise _rows_refused(data.metadata.num_rows)
-        wanted = [name for name in table if name.lower() in _WANTED]
+        wanted = [name for name in table if name.lower() in known]
         found = data.read(columns=wanted)
     return table | {name: found.column(name).to_numpy() for name in wanted}
 
 
-def _json(file: Path) -> dict[str, Any]:
+def _json(file: Path, known: Container[str]) -> dict[str, Any]:
     with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as content:
         text = content.read(MOST_BYTES + 1)
     if len(text) > MOST_BYTES:
@@ -135,7 +135,7 @@ def _json(file: Path) -> dict[str, Any]:
         raise _rows_refused(len(rows))
     table: dict[str, Any] = dict.fromkeys(name for row in rows for name in row)
     for name in table:
-        if name.lower() in _WANTED:
+        if name.lower() in known:
             table[name] = numpy.array([row.get(name) for row in rows], dtype=object)
     return table
 
@@ -149,8 +149,12 @@ def suffix_of(file: Path) -> str:
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
-def read_table(file: Path) -> dict[str, Any]:
+def read_table(file: Path, known: Container[str] | None = None) -> dict[str, Any]:
     """Return all columns of a file by their names; those that are not known are None.
+
+    Args:
+        file: of one of ``FLIGHT_SUFFIXES``.
+        known: names in lower case; default: those of flights.
 
     Raises:
         ValueError: if it cannot be read, or is too large.
@@ -160,7 +164,7 @@ def read_table(file: Path) -> dict[str, Any]:
             raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
         if file.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        return _TABLES[suffix_of(file)](file)
+        return _TABLES[suffix_of(file)](file, _WANTED if known is None else known)
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over

@@ -221,7 +221,7 @@ def _traffic_sample(name: str) -> Path:
     return samples[name]
 
 
-def _files(source: str | Path) -> list[Path]:
+def files_of(source: str | Path) -> list[Path]:
     """Files that a path or a pattern stands for, in the order of their names."""
     if isinstance(source, str) and source.startswith(TRAFFIC):
         return [_traffic_sample(source.removeprefix(TRAFFIC))]
@@ -299,7 +299,7 @@ def read_flights(
         elif isinstance(item, Mapping):
             own.append(trajectory_of(item))
         elif isinstance(item, str | Path):
-            files += _files(item)
+            files += files_of(item)
         else:
             raise ValueError(f"a set of flights holds files and trajectories, got {item!r}")
     sources += [Source(trajectory.name, (trajectory,)) for trajectory in _told_apart(own)]

@@ -171,7 +171,8 @@ class Picture:
 
 def picture_of(task: Task) -> Picture:
     """Return the picture made for a task, or the general one."""
-    return task.picture() or Picture(task)
+    own = task.picture() if task.recording is None else None
+    return own or Picture(task)
 
 
 class _StripPanel:
@@ -309,7 +310,8 @@ class EpisodePicture:
             action: ``(A,)`` or a scalar, what was applied.
             observation: ``(len(task.fields),)``, what it answered.
         """
-        error = self.task.error(state)[:, 0]
+        nothing = numpy.full(len(self.task.components), numpy.nan)
+        error = self.task.error(state)[:, 0] if self.task.has_truth else nothing
         variance = numpy.diagonal(self.task.covariance(state)[:, :, 0])
         sigma = numpy.sqrt(numpy.maximum(variance, 0.0))
         names = [component.name for component in self.task.components]
@@ -517,7 +519,7 @@ class EpisodePictures:
     def __init__(self, task: Task, scenario: str, count: int, frames_per_second: float) -> None:
         self.count = count
         if task.backend == "torch":
-            task = type(task)(task.parameters, task.control)
+            task = task.on_numpy()
         self.pictures = [
             EpisodePicture(task, scenario, "rgb_array", frames_per_second) for _ in range(min(count, DRAWN))
         ]

@@ -39,13 +39,21 @@ def log_likelihood_reward(task: Task, state: Any) -> Array:
     return log_density(task.error(state), task.covariance(state))[0]
 
 
+def no_reward(task: Task, state: Any) -> Array:
+    """Zero, ``(N,)``: nobody knows the truth."""
+    return 0.0 * task.mean(state)[0]
+
+
 OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "relative": cost_reward,
+    "none": no_reward,
 }
-"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away."""
-REWARDS = tuple(OWN_PAY)
+"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away. "none"
+is that of recordings without truth."""
+REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
+"""Those that can be asked for."""
 
 
 def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: Any) -> Array:

@@ -9,6 +9,7 @@ import numpy
 from gymnasium.envs.registration import EnvSpec
 
 from .flights import Flights
+from .recording import Recording
 from .trajectory import Trajectory
 
 
@@ -34,6 +35,9 @@ def plain(value: Any) -> Any:
     if isinstance(value, Flights):
         flown = [plain(trajectory) for trajectory in value.trajectories]
         return {"trajectories": flown, "name": value.name, "fewest_scans": value.fewest_scans}
+    if isinstance(value, Recording):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        return {name: plain(item) for name, item in fields.items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, numpy.ndarray | numpy.generic):

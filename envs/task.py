@@ -73,6 +73,8 @@ class Scenario:
     times."""
     notes: tuple[str, ...] = ()
     """What is to be told of where it comes from, a line each."""
+    recording: Any = None
+    """A :class:`~.recording.Recording` that is replayed in place of a simulated world."""
 
 
 class NoiseLayout(NamedTuple):
@@ -169,17 +171,26 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """True values of the task's components, ``(C, N)``."""
 
-    @abstractmethod
+    def error_cost(self, error: Array) -> Array:
+        """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
+        written, and recordings of the task can be judged.
+
+        Args:
+            error: estimate minus truth, ``(C, N)``, in the units of the task's components.
+        """
+        raise NotImplementedError(f"{type(self).__name__} needs error_cost, or a cost of its own")
+
     def cost(self, truth: Truth, mean: Array) -> Array:
         """Step 5: what an estimate costs, uncapped, ``(N,)``.
 
-        A squared error in units of the sensor's nominal variance, or, where the estimate drives a control
-        loop, the quadratic cost of the loop in a fixed unit.
+        A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
+        control loop, the quadratic cost of the loop in a fixed unit.
 
         Args:
             truth: at the measurement that the estimate is for.
             mean: of the estimate, ``(C, N)``.
         """
+        return self.error_cost(mean - self.state(truth))
 
     def charge(self, truth: Truth, mean: Array) -> Array:
         """What the reward charges for an estimate, not below zero, ``(N,)``: its cost, unless part of that is known to
@@ -333,6 +344,11 @@ class Task(ABC):
     """Names of ``banks``."""
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
+    of_world_only: ClassVar[tuple[str, ...]] = ()
+    """Parameters that only the simulated world reads and that are too much for a recording, such as tables."""
+    recorded_columns: ClassVar[Mapping[str, str]] = {}
+    """Columns of a table of what sensors really said that :meth:`recorded` knows, beside ``time``, with what they are;
+    empty where tables cannot be read."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
@@ -355,6 +371,10 @@ class Task(ABC):
     """Measurements acted on in one episode."""
     decision_interval: int
     """Measurements for which one action holds."""
+    recording: Any
+    """The :class:`~.recording.Recording` that is replayed in place of a simulated world; None where there is none."""
+    has_truth: bool
+    """Whether the true values are known: a recording may lack them, and then there are no errors and no costs."""
     flights: tuple[int, ...] = ()
     """Where every episode flies one of several, measurements acted on in each of them, all multiples of
     ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
@@ -369,8 +389,17 @@ class Task(ABC):
         if hasattr(cls, "banks"):
             cls.controls = tuple(cls.banks)
 
-    def __init__(self, parameters: Any, control: str, xp: ModuleType = numpy, device: Any = None) -> None:
+    def __init__(
+        self,
+        parameters: Any,
+        control: str,
+        xp: ModuleType = numpy,
+        device: Any = None,
+        recording: Any = None,
+    ) -> None:
         self.parameters = parameters
+        self.recording = recording
+        self.has_truth = recording is None or recording.truth is not None
         self.control = control
         self.horizon = parameters.horizon
         self.decision_interval = parameters.decision_interval
@@ -378,7 +407,11 @@ class Task(ABC):
         self.device = device
         self.backend = "torch" if "torch" in xp.__name__ else "numpy"
         self.set_up()
-        self.world = self.World(self)
+        if recording is None:
+            self.world = self.World(self)
+        else:
+            self.flights = recording.lengths_within(self.horizon, self.decision_interval)
+            self.world = recording.world(self)
         self.bank = self.banks[control](self)
         self._outside = OutsideBank(self)
         self.noise = self._noise_layout()
@@ -398,7 +431,13 @@ class Task(ABC):
 
     def __reduce__(self) -> Any:
         """Pickle what it is made of; a module, its array namespace, cannot be."""
-        return _made_again, (type(self), self.parameters, self.control, self.xp.__name__, self.device)
+        named = (self.parameters, self.control, self.xp.__name__, self.device)
+        return _made_again, (type(self), *named, *self._replayed)
+
+    @property
+    def _replayed(self) -> tuple[Any, ...]:
+        """Last argument of the constructor, where there is a recording."""
+        return () if self.recording is None else (self.recording,)
 
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""
@@ -423,6 +462,42 @@ class Task(ABC):
     def scenario_from_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
         """Make a scenario of a set of flights of which every episode flies one; see :attr:`flights`."""
         raise ValueError(f"{cls.id} does not take flights as scenario")
+
+    @classmethod
+    def recorded(cls, columns: Any) -> Any:
+        """Make measurements and a start of the track of one table of what sensors really said.
+
+        Args:
+            columns: :class:`~.recorded_tables.Columns`, of the names in :attr:`recorded_columns`.
+
+        Returns:
+            :class:`~.recorded_tables.Recorded`.
+
+        Raises:
+            ValueError: for what lacks, or cannot be.
+        """
+        raise NotImplementedError(f"{cls.__name__} has recorded_columns and no method for them")
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Any:
+        """Make the start of the track of the first measurements, where a recording has none; few tasks can.
+
+        Args:
+            measurements: by name, ``(E, T, ...)``.
+            seconds: ``(E, T)``.
+            parameters: of the task.
+
+        Returns:
+            :class:`~.recording.Started`.
+
+        Raises:
+            ValueError: if that cannot be.
+        """
+        raise ValueError(
+            f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
+        )
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
         """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.
@@ -469,7 +544,11 @@ class Task(ABC):
 
     def under(self, control: str) -> "Task":
         """Return the same problem with another control."""
-        return type(self)(self.parameters, control, self.xp, self.device)
+        return type(self)(self.parameters, control, self.xp, self.device, *self._replayed)
+
+    def on_numpy(self) -> "Task":
+        """Return the same problem on NumPy arrays, not compiled."""
+        return type(self)(self.parameters, self.control, numpy, None, *self._replayed)
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
         """Call ``function(task, *parts)`` on this task's backend.
@@ -548,12 +627,13 @@ class Task(ABC):
         return self._estimating(episode).covariance(episode.bank)
 
     def track(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from: ``truth`` and ``estimate`` ``(C, N)``, ``covariance`` ``(C, C, N)``, and every
-        array of the measurement, named ``measurement_NAME``.
+        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
+        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
         """
-        said = {f"measurement_{name}": values for name, values in _named_arrays(episode.measurement)}
+        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        true = {"truth": self.world.state(episode.truth)} if self.has_truth else {}
         return {
-            "truth": self.world.state(episode.truth),
+            **true,
             "estimate": self.mean(episode),
             "covariance": self.covariance(episode),
             **said,
@@ -565,14 +645,16 @@ class Task(ABC):
         return {**own, **self.world.records(episode.truth)}
 
 
-def _made_again(cls: type[Task], parameters: Any, control: str, namespace: str, device: Any) -> Task:
-    return cls(parameters, control, importlib.import_module(namespace), device)
+def _made_again(
+    cls: type[Task], parameters: Any, control: str, namespace: str, device: Any, *replayed: Any
+) -> Task:
+    return cls(parameters, control, importlib.import_module(namespace), device, *replayed)
 
 
-def _named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
+def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:
     """Arrays of nested NamedTuples, with the names that lead to them."""
     for name, value in part._asdict().items():
         if isinstance(value, tuple):
-            yield from _named_arrays(value, f"{prefix}{name}_")
+            yield from named_arrays(value, f"{prefix}{name}_")
         elif value is not None:
             yield prefix + name, value

@@ -3,6 +3,7 @@
 One object an episode, each asked in turn: honest, and slow.
 """
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -72,7 +73,8 @@ class SingleTrackEstimator(ABC):
     def reading(self, measurement: Any) -> tuple[Array, Array]:
         """What is measured of a linear function of the state, ``(m,)`` or None, and its covariance, ``(m, m)``.
 
-        Here the position, for tasks whose measurement has ``position`` and ``variance``.
+        Here the position, for tasks whose measurement has ``position`` and ``variance``; None where it is not
+        ``available``.
 
         Raises:
             ValueError: if it has not.
@@ -82,7 +84,8 @@ class SingleTrackEstimator(ABC):
                 f"{self.task.id} measures {', '.join(measurement._fields)}: {type(self).__name__} must say by a method "
                 "`reading` or `step` what that means"
             )
-        return measurement.position, numpy.diag(measurement.variance)
+        missed = getattr(measurement, "available", 1.0) == 0.0
+        return None if missed else measurement.position, numpy.diag(measurement.variance)
 
     def start(self, initial: Any, N: int) -> list[Any]:
         """Begin the tracks; see :meth:`.Estimator.start`."""
@@ -122,18 +125,42 @@ class FilterpyEstimator(SingleTrackEstimator):
     """Filters of filterpy: KalmanFilter, ExtendedKalmanFilter, UnscentedKalmanFilter, IMMEstimator.
 
     Subclasses return in :meth:`begin` a filter whose ``x`` and ``P`` are at the start of the track, of an IMMEstimator
-    those of each of its filters. Where a measurement is more than :meth:`reading` and the filter's H, such as
+    those of each of its filters. Where measurements come at irregular times :meth:`predict` says what that means. Where
+    a measurement is more than :meth:`reading` and the filter's H, such as
     with a control or in an ExtendedKalmanFilter, they define :meth:`step` in filterpy's own calls.
     """
 
     def step(self, track: Any, measurement: Any) -> None:
         """Predict, and update with the measurement and its covariance; without a measurement only predict."""
         z, R = self.reading(measurement)
-        track.predict()
+        self.predict(track, getattr(measurement, "interval", None))
         for model in getattr(track, "filters", [track]):
             model.R = R
         if z is not None:
             track.update(z)
+        elif hasattr(track, "filters"):
+            # filterpy takes over the predicted probabilities of its modes in an update only.
+            track.mu = track.cbar.copy()
+            track._compute_mixing_probabilities()
+            track._compute_state_estimate()
+
+    def predict(self, track: Any, interval: float | None) -> None:
+        """Predict to a measurement, here over ``sampling_interval``, which the filter's F and Q are for.
+
+        Args:
+            track: filter of filterpy.
+            interval: s since the measurement before; None where the measurement does not say.
+
+        Raises:
+            ValueError: for another interval: a subclass sets F and Q for it first, or ``dt`` of an unscented filter.
+        """
+        usual = getattr(self.task.parameters, "sampling_interval", None)
+        if interval is not None and usual is not None and not math.isclose(interval, usual, rel_tol=1e-9):
+            raise ValueError(
+                f"{type(self).__name__} predicts over {usual:g} s, and a measurement comes after {interval:g} s: it "
+                "must say by a method `predict(track, interval)` what that means"
+            )
+        track.predict()
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
         """``x`` and ``P``."""

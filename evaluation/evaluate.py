@@ -16,7 +16,7 @@ from ..envs.catalogue import find_scenario, make_task, nearest, opened, task_cla
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
-from .competitors import Kind, check_competitor, kind_of, made
+from .competitors import RANKED, Kind, check_competitor, kind_of, made
 from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference, told
 from .seeds import episode_seeds
 
@@ -92,6 +92,15 @@ def _measured(task: Task, episode: Episode) -> dict[str, Any]:
     }
 
 
+def _said(task: Task, episode: Episode) -> dict[str, Any]:
+    """What is kept where nobody knows the truth."""
+    return task.records(episode)
+
+
+def _said_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
+    return {**_said(task, episode), **task.track(episode)}
+
+
 def _measured_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
     return {**_measured(task, episode), **task.track(episode)}
 
@@ -112,7 +121,10 @@ def _run_chunk(
     def keep(name: str, values: numpy.ndarray) -> None:
         series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
 
-    report = _measured_and_tracked if tracks else _measured
+    if task.has_truth:
+        report = _measured_and_tracked if tracks else _measured
+    else:
+        report = _said_and_tracked if tracks else _said
 
     def keep_all(found: dict[str, numpy.ndarray]) -> None:
         for name, values in found.items():
@@ -155,9 +167,10 @@ def evaluate(
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: by the name that stands in the tables: each a class or function that makes it for a task,
             or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
-        scenario: name of a scenario, a trajectory, or a set of flights; default: the environment's training
-            distribution.
-        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up.
+        scenario: name of a scenario, a trajectory, a set of flights, or a recording; default: the environment's
+            training distribution.
+        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up. Of a recording
+            every episode is replayed once, whatever is asked for.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
         control: demand this control; by default every policy runs in its own.
@@ -174,7 +187,8 @@ def evaluate(
         truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
         ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes. Of a set of
         flights the coordinates ``flight`` and ``length`` say which each episode flies and its measurements; what lies
-        beyond is NaN. The attribute ``notes`` tells what was left out.
+        beyond is NaN. The attribute ``notes`` tells what was left out. Of a recording likewise, where ``flight`` names
+        the episode of the recording; without truth there are neither ``error``, ``cost``, ``charge`` nor ``nees``.
 
     Raises:
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
@@ -203,10 +217,16 @@ def evaluate(
     for name, task in tasks.items():
         check_shown(task, competitors[name], name)
     first = next(iter(tasks.values()))
+    if chosen.recording is not None:
+        _check_told(kinds, chosen.name)
+        episodes = len(first.flights)  # nothing is random: each once
     flown, lengths = None, None
     if first.flights:
         seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
         episodes = len(seeds)
+    if chosen.recording is not None and flown is not None and lengths is not None:
+        order = numpy.argsort(flown)
+        seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
     tick = progress or (lambda _: None)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in competitors.items():
@@ -230,7 +250,23 @@ def evaluate(
         dataset = dataset.where(there).assign_coords(
             flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths)
         )
-    return dataset.assign_attrs(paper=paper, reference=reference, notes=list(chosen.notes))
+    return dataset.assign_attrs(
+        paper=paper,
+        reference=reference,
+        notes=list(chosen.notes),
+        recorded=chosen.recording is not None,
+        truth=first.has_truth,
+    )
+
+
+def _check_told(kinds: Mapping[str, Kind], name: str) -> None:
+    """Raise ValueError for whoever is told more than a recording holds."""
+    for competitor, kind in kinds.items():
+        if kind not in RANKED:
+            raise ValueError(
+                f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
+                "components: leave it out"
+            )
 
 
 def _flights_in_turn(

@@ -113,7 +113,8 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
     groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
     is_bound = str(run["kind"].values) == "bound"
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
-    for component, unit in reported_components(dataset).items():
+    judged = dataset.attrs.get("truth", True)
+    for component, unit in reported_components(dataset).items() if judged else ():
         squares = squared_errors(run, component, groups)
         over_time = numpy.sqrt(bootstrap.means(squares))
         for window, times in slices.items():
@@ -136,7 +137,12 @@ def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Itera
             for window, times in slices.items():
                 value = bootstrap.estimate(mean_over_time(run, probability[:, times]))
                 yield Measure("mean_mode_probability", mode, window, value, "1")
-    if not is_bound:
+    says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
+    if says or not judged:  # there is nothing else of an estimator of one's own then
+        for window, times in slices.items():
+            value = mean_of_present(run["log_likelihood"].values[:, times], bootstrap) if says else NOTHING
+            yield Measure("log_likelihood", "measurement", window, value, "nat")
+    if not is_bound and judged:
         cost = run["cost"].values
         for window, times in slices.items():
             value = bootstrap.estimate(mean_over_time(run, cost[:, times]))
@@ -159,6 +165,20 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Boots
     low, high = chi_square_band(degrees)
     inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
     yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
+    if metric == "nis":
+        yield Measure("anis_band", component, window, _band(degrees[~numpy.isnan(normalised)]), "1")
+
+
+def _band(degrees: numpy.ndarray) -> Estimate:
+    """Where the mean of that many chi-square numbers, each over its degrees of freedom, lies with 95 %.
+
+    The chi-square distribution of the same variance; the very one where all degrees are equal.
+    """
+    if not degrees.size:
+        return NOTHING
+    total = numpy.array([degrees.size**2 / (1.0 / degrees).sum()])
+    low, high = chi_square_band(total)
+    return Estimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
 
 
 def consistency_metrics(run: xarray.Dataset) -> list[str]:
@@ -193,9 +213,9 @@ def score(
 
 
 def best_of(dataset: xarray.Dataset) -> str:
-    """Name of the ranked competitor with the lowest mean cost; empty where none is ranked."""
+    """Name of the ranked competitor with the lowest mean cost; empty where none is ranked, or nobody knows costs."""
     ranked = dataset.isel(policy=numpy.isin(dataset["kind"].values, RANKED))
-    if not ranked.sizes["policy"]:
+    if "cost" not in dataset or not ranked.sizes["policy"]:
         return ""
     costs = [mean_cost(ranked, name).mean() for name in ranked["policy"].values.tolist()]
     return str(ranked["policy"].values[numpy.argmin(costs)])
@@ -218,7 +238,11 @@ def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> It
     """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
     paper_name, reference_name = dataset.attrs["paper"], dataset.attrs["reference"]
     present = dataset["policy"].values.tolist()
-    if paper_name not in present or str(dataset["kind"].sel(policy=name).values) == "bound":
+    if (
+        "cost" not in dataset
+        or paper_name not in present
+        or str(dataset["kind"].sel(policy=name).values) == "bound"
+    ):
         return
     each = {p: mean_cost(dataset, p) for p in {name, paper_name, reference_name} & set(present)}
     cost = {p: bootstrap.means(values) for p, values in each.items()}
@@ -264,8 +288,10 @@ def tidy_records(
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
-    and ``nis_inside`` (share inside the 95 % chi-square interval); ``mean_mode_probability``; ``cost`` (uncapped mean),
-    ``return`` (sum of the ``cost`` rewards).
+    and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
+    is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
+    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards). Without truth what
+    needs it is left out.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -273,7 +299,7 @@ def tidy_records(
 
     Args:
         dataset: from an evaluation.
-        metrics: the environment's own, from one policy's part of the dataset.
+        metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
     bootstrap, best = bootstrap_of(dataset), best_of(dataset)
     attrs = dataset.attrs
@@ -285,7 +311,8 @@ def tidy_records(
     for name in dataset["policy"].values.tolist():
         measures: list[Any] = [*_measures(dataset, name, bootstrap), *_comparisons(dataset, name, bootstrap)]
         measures += _behind_best(dataset, name, best, bootstrap)
-        if metrics is not None:
+        # Of a recording, they would ask for more of the truth than it holds.
+        if metrics is not None and not attrs.get("recorded"):
             measures += metrics(dataset.sel(policy=name), bootstrap)
         for m in measures:
             records.append(

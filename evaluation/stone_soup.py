@@ -30,7 +30,9 @@ class StoneSoupEstimator(SingleTrackEstimator):
 
     @property
     def interval(self) -> float:
-        """Seconds from one measurement to the next; where the parameters leave it open a subclass must say."""
+        """Seconds from one measurement to the next, where these do not say; where the parameters leave it open a
+        subclass must.
+        """
         return self.task.parameters.sampling_interval
 
     def begin(self, initial: Any) -> Any:
@@ -38,22 +40,28 @@ class StoneSoupEstimator(SingleTrackEstimator):
         return GaussianState(initial.mean[:, None], initial.covariance, timestamp=START)
 
     def detection(self, measurement: Any, timestamp: datetime) -> Any:
-        """Detection of the position, with the covariance of this measurement in its model.
+        """Detection of the position, with the covariance of this measurement in its model; None where there is none.
 
         Args:
             measurement: of this track.
             timestamp: of the measurement.
         """
         z, R = self.reading(measurement)
+        if z is None:
+            return None
         places = [self.state.index(name) for name in self.task.groups["position"]]
         model = LinearGaussian(ndim_state=len(self.state), mapping=places, noise_covar=R)
         return Detection(z[:, None], timestamp=timestamp, measurement_model=model)
 
     def step(self, track: Any, measurement: Any) -> Any:
-        """Predict to the time of the measurement and update with its detection."""
-        timestamp = track.timestamp + timedelta(seconds=self.interval)
+        """Predict to the time of the measurement and update with its detection, if there is one."""
+        interval = measurement.interval if hasattr(measurement, "interval") else self.interval
+        timestamp = track.timestamp + timedelta(seconds=float(interval))
         prediction = self.predictor.predict(track, timestamp=timestamp)
-        return self.updater.update(SingleHypothesis(prediction, self.detection(measurement, timestamp)))
+        detection = self.detection(measurement, timestamp)
+        if detection is None:
+            return prediction
+        return self.updater.update(SingleHypothesis(prediction, detection))
 
     def estimate(self, track: Any) -> tuple[Array, Array]:
         """``mean`` and ``covar``."""

@@ -8,24 +8,28 @@ from typing import TYPE_CHECKING, Any
 
 from .baselines.catalogue import add_baselines
 from .baselines.table import Baselines
-from .envs.catalogue import register
+from .envs.catalogue import read_recording, register
 from .envs.flights import Flights, read_flights
+from .envs.recording import Recording
 from .envs.registration import add_task
 from .envs.task import Task
 from .envs.trajectory import Trajectory
 from .evaluation.competitors import FunctionPolicy
 
 if TYPE_CHECKING:
-    from .names import evaluate, make_policy, tidy_records
+    from .names import evaluate, make_policy, record, tidy_records
 
 __version__ = "0.1.0"
 __all__ = [
     "Flights",
     "FunctionPolicy",
+    "Recording",
     "Trajectory",
     "evaluate",
     "make_policy",
     "read_flights",
+    "read_recording",
+    "record",
     "register",
     "register_task",
     "tidy_records",
@@ -59,7 +63,7 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
 
 def __getattr__(name: str) -> Any:
     # On first use: an evaluation brings xarray, and making environments needs none of it.
-    if name not in ("evaluate", "make_policy", "tidy_records"):
+    if name not in ("evaluate", "make_policy", "record", "tidy_records"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import names
 

@@ -19,6 +19,7 @@ from .compiler.cache import SWITCH
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
     "evaluate": measure.evaluate_policies,
+    "record": measure.record_scenario,
     "benchmark": measure.benchmark,
     "comparison": report.comparison_page,
     "tune": improve.tune_policy,

@@ -16,6 +16,7 @@ from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
 from .evaluation.evaluate import check_shown, control_of
 from .evaluation.metrics import Record
+from .evaluation.recording import record as record
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
 

@@ -14,6 +14,11 @@ belongs to the gains that were used. Reading: the paper needs a covariance for t
 none; of the readings tried this is the only one that reproduces its claim about the best gains, and
 (I - K H) P with a gain that is not Kalman's is indefinite.
 
+**Scans that are missed or come early.** Over an interval Delta the prediction is ``x' = x + Delta v``, and a scan that
+has no measurement ends there: state and covariance are those predicted. The innovation of the next one has grown since
+the last measurement, for ``t = sum Delta`` s, so the velocity's gain is ``beta / t``: what (19), (20) make of a filter
+whose scan period is t. T of the functions below is Delta in a prediction, t in an update, a number or ``(N,)``.
+
 All arrays are elementwise in the batch; axes of space are just more batch.
 """
 
@@ -41,25 +46,25 @@ def benedict_bordner_beta(alpha: Array) -> Array:
     return alpha * alpha / (2.0 - alpha)
 
 
-def predict(position: Array, velocity: Array, T: float) -> Array:
+def predict(position: Array, velocity: Array, T: float | Array) -> Array:
     """Predicted position, ``x + T v``; the predicted velocity is the velocity."""
     return position + T * velocity
 
 
 def update(
-    predicted: Array, velocity: Array, innovation: Array, alpha: Array, beta: Array, T: float
+    predicted: Array, velocity: Array, innovation: Array, alpha: Array, beta: Array, T: float | Array
 ) -> tuple[Array, Array]:
     """Position and velocity after the innovation, equations (19) and (20)."""
     return predicted + alpha * innovation, velocity + (beta / T) * innovation
 
 
-def predict_covariance(P: Covariance, T: float) -> Covariance:
+def predict_covariance(P: Covariance, T: float | Array) -> Covariance:
     """Covariance of the prediction, ``F P F^T`` with ``F = [[1, T], [0, 1]]`` and no process noise."""
     cross = P.cross + T * P.velocity
     return Covariance(P.position + T * (P.cross + cross), cross, P.velocity)
 
 
-def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: float) -> Covariance:
+def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: float | Array) -> Covariance:
     """Covariance after an update with any gains (Joseph form).
 
     Args:
@@ -67,7 +72,7 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
         R: variance of the measurement, m^2.
         alpha: position gain.
         beta: velocity gain; ``beta / T`` enters the filter.
-        T: sampling interval, s.
+        T: s since the last measurement.
     """
     rate = beta / T
     rest = 1.0 - alpha
@@ -80,21 +85,26 @@ def update_covariance(P: Covariance, R: Array, alpha: Array, beta: Array, T: flo
 
 
 def left_by_acceleration(
-    P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float
+    P: Covariance, mean_square: Array, alpha: Array, beta: Array, T: float | Array, since: float | Array = 0.0
 ) -> Covariance:
     """Covariance after an update when the target has accelerated since the measurement before.
 
-    An acceleration ``a`` over one interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
-    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``.
+    An acceleration ``a`` over an interval moves the position by ``d = a T^2 / 2`` and the velocity by ``2 d / T``, of
+    which the update (19), (20) leaves ``(1 - alpha) d`` and ``(2 - beta) d / T``. Where it goes on for ``since`` s
+    after the update, without a measurement, these become, with ``r = since / T``,
+    ``(1 - alpha + (2 - beta) r + r^2) d`` and ``(2 - beta + 2 r) d / T``.
 
     Args:
-        P: covariance after the update without it.
+        P: covariance without it, after the update, or predicted from there by ``since``.
         mean_square: of ``d``, m^2.
         alpha: position gain of the update.
         beta: its velocity gain.
-        T: sampling interval, s.
+        T: s from the measurement before to the update.
+        since: s after the update.
     """
-    rest, rate = 1.0 - alpha, (2.0 - beta) / T
+    ratio = since / T
+    left = 2.0 - beta
+    rest, rate = 1.0 - alpha + ratio * (left + ratio), (left + 2.0 * ratio) / T
     return Covariance(
         P.position + rest * rest * mean_square,
         P.cross + rest * rate * mean_square,
@@ -164,12 +174,12 @@ def propagate_error(
     return ErrorMoments((1.0 - alpha) * position, velocity - (beta / T) * position, covariance)
 
 
-def predict_joint_covariance(P: Array, T: float) -> Array:
+def predict_joint_covariance(P: Array, T: float | Array) -> Array:
     """``F P F^T`` for several coordinates at once, cross terms kept, no process noise.
 
     Args:
         P: covariance of (positions, velocities), ``(2 d, 2 d, ...)``.
-        T: sampling interval, s.
+        T: interval, s; one for all, or broadcasting against the trailing axes.
     """
     xp = namespace(P)
     d = P.shape[0] // 2
@@ -177,7 +187,7 @@ def predict_joint_covariance(P: Array, T: float) -> Array:
     return xp.concat([rows[:, :d] + T * rows[:, d:], rows[:, d:]], axis=1)
 
 
-def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: float) -> Array:
+def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: float | Array) -> Array:
     """Joseph form for several coordinates at once with the same gains in each.
 
     Args:
@@ -185,7 +195,7 @@ def update_joint_covariance(P: Array, R: Array, alpha: Array, beta: Array, T: fl
         R: measurement variance of each coordinate, ``(d, ...)``; coordinates are measured independently.
         alpha: position gain, broadcasting against the trailing axes.
         beta: velocity gain; ``beta / T`` enters the filter.
-        T: sampling interval, s.
+        T: s since the last measurement; one for all, or broadcasting likewise.
     """
     xp = namespace(P)
     d = P.shape[0] // 2

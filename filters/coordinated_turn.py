@@ -63,7 +63,7 @@ def turned(state: Array, T: float | Array) -> Array:
     )
 
 
-def jacobian(state: Array, T: float) -> Array:
+def jacobian(state: Array, T: float | Array) -> Array:
     """Derivative of :func:`turned` with respect to the state, ``(5, 5, ...)``; arguments as there."""
     xp = namespace(state)
     vx, vy, omega = state[2], state[3], state[4]
@@ -95,13 +95,13 @@ def process_noise(T: float, acceleration_sigma: float, turn_acceleration_sigma: 
     return [*([*row, 0.0] for row in Q), [0.0, 0.0, 0.0, 0.0, (T * turn_acceleration_sigma) ** 2]]
 
 
-def predict(mean: Array, covariance: Array, T: float, Q: Array) -> tuple[Array, Array]:
+def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple[Array, Array]:
     """Time update of the extended Kalman filter, ``P' = F P F^T + Q`` with the Jacobian F at the estimate.
 
     Args:
         mean: ``(5, N)``.
         covariance: ``(5, 5, N)``.
-        T: interval, s.
+        T: interval, s; one for all, or ``(N,)``.
         Q: covariance of the process noise, ``(5, 5, 1)`` or ``(5, 5, N)``.
     """
     F = jacobian(mean, T)

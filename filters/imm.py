@@ -100,6 +100,19 @@ def normalised_exponential(logarithms: Array) -> Array:
     return scaled / ordered_sum(scaled)
 
 
+def log_mixture_density(log_weights: Array, log_likelihood: Array) -> Array:
+    """Logarithm of a mixture's density, ``log sum_j w_j Lambda_j``, ``(N,)``.
+
+    Args:
+        log_weights: of the components, ``(M, N)``; the weights sum to one.
+        log_likelihood: logarithms of their densities, ``(M, N)``.
+    """
+    xp = namespace(log_likelihood)
+    logarithms = log_weights + log_likelihood
+    largest = xp.max(logarithms, axis=0)
+    return largest + xp.log(ordered_sum(xp.exp(logarithms - largest)))
+
+
 def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:
     """Posterior mode probabilities, equations (12) and (14), in logarithms.
 

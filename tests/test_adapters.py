@@ -60,39 +60,39 @@ def compare(one, other, growth=1.0, **keywords):
 class OurKalman(KalmanModel):
     """filters/kalman.py over the model of the examples."""
 
-    def __init__(self, task):
-        super().__init__(task)
-        self.Q = 2.0**2 * self.unit_Q
-
     def start(self, initial, N):
         return initial.mean, initial.covariance
 
+    def model(self, interval):
+        F, Q = self.motion(interval)
+        return F, 2.0**2 * Q
+
     def update(self, measurement, memory):
-        predicted = kalman.predict(*memory, self.F, self.Q)
-        result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
+        predicted = kalman.predict(*memory, *self.model(measurement.interval))
+        result = self.updated(predicted, measurement)
         return result.mean, result.covariance, (result.mean, result.covariance)
 
 
 class OurContinuousKalman(OurKalman):
     """The same for acceleration that is white in continuous time, of 24 m^2/s^3."""
 
-    def __init__(self, task):
-        super().__init__(task)
-        T, identity = task.parameters.sampling_interval, np.eye(2)
-        third, half = T**3 / 3 * identity, T**2 / 2 * identity
-        self.Q = 24.0 * np.block([[third, half], [half, T * identity]])
+    def model(self, interval):
+        powers = [[interval**3 / 3, interval**2 / 2], [interval**2 / 2, interval]]
+        Q = [[24.0 * powers[i // 2][j // 2] * (i % 2 == j % 2) for j in range(4)] for i in range(4)]
+        return self.motion(interval)[0], np.array(Q)
 
 
-@pytest.mark.parametrize("scenario", ["random", "paper", "cruise"])
+@pytest.mark.parametrize("scenario", ["random", "paper", "cruise", "missed-detections", "irregular-scans"])
 def test_imm_of_filterpy_is_ours_at_every_step(scenario):
     """An IMM amplifies rounding: 7e-10 m were the most in 32 flights of each scenario."""
     ours = baselines_of(ID).estimators["kalman-imm"]
     compare(example("filterpy_filters").Imm, ours, growth=20.0, scenario=scenario)
 
 
-def test_kalman_filters_are_ours():
+@pytest.mark.parametrize("scenario", ["random", "missed-detections", "irregular-scans"])
+def test_kalman_filters_are_ours(scenario):
     filters = example("filterpy_filters")
-    compare(filters.Kalman, OurKalman)
+    compare(filters.Kalman, OurKalman, scenario=scenario)
 
     class Extended(filters.Kalman):
         """Of a linear measurement."""
@@ -104,10 +104,11 @@ def test_kalman_filters_are_ours():
 
         def step(self, track, measurement):
             z, R = self.reading(measurement)
-            track.predict()
-            track.update(z, lambda x: np.eye(2, 4), lambda x: x[:2], R)
+            self.predict(track, measurement.interval)
+            if z is not None:
+                track.update(z, lambda x: np.eye(2, 4), lambda x: x[:2], R)
 
-    compare(Extended, OurKalman)
+    compare(Extended, OurKalman, scenario=scenario)
 
     class Unscented(filters.Kalman):
         """Of a linear motion and measurement, and a state in another order."""
@@ -115,22 +116,40 @@ def test_kalman_filters_are_ours():
         state = ("velocity_x", "position_x", "velocity_y", "position_y")
 
         def begin(self, initial):
-            T, G = 6.0, np.array([6.0, 18.0])
-            F, Q = np.kron(np.eye(2), [[1.0, 0.0], [T, 1.0]]), np.kron(np.eye(2), 4.0 * np.outer(G, G))
             points = filters.MerweScaledSigmaPoints(4, 1.0, 2.0, -1.0)
-            ukf = filters.UnscentedKalmanFilter(4, 2, T, lambda x: x[[1, 3]], lambda x, T: F @ x, points)
-            ukf.x, ukf.P, ukf.Q = initial.mean, initial.covariance, Q
+
+            def moved(x, T):
+                return np.kron(np.eye(2), [[1.0, 0.0], [T, 1.0]]) @ x
+
+            ukf = filters.UnscentedKalmanFilter(4, 2, 6.0, lambda x: x[[1, 3]], moved, points)
+            ukf.x, ukf.P = initial.mean, initial.covariance
             return ukf
 
-    compare(Unscented, OurKalman, growth=20.0)  # sums over sigma points cancel
+        def predict(self, track, interval):
+            G = np.array([interval, interval**2 / 2])
+            track.Q = np.kron(np.eye(2), 4.0 * np.outer(G, G))
+            track.predict(dt=interval)
+
+    compare(Unscented, OurKalman, growth=20.0, scenario=scenario)  # sums over sigma points cancel
 
 
-def test_kalman_filter_of_stone_soup_is_ours():
-    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman)
+@pytest.mark.parametrize("scenario", ["random", "missed-detections"])
+def test_kalman_filter_of_stone_soup_is_ours(scenario):
+    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman, scenario=scenario)
 
 
-def test_plain_kalman_filter_of_the_page_is_ours():
-    compare(example("mine").Mine, OurKalman)
+def test_kalman_filter_of_stone_soup_is_ours_at_irregular_times():
+    """Its clock counts microseconds, in which a target flies 0.3 mm."""
+    stone_soup = example("stone_soup_kalman")
+    mean, expected = (
+        estimates(one, "irregular-scans")[0] for one in (stone_soup.Kalman, OurContinuousKalman)
+    )
+    np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("scenario", ["random", "missed-detections", "irregular-scans"])
+def test_plain_kalman_filter_of_the_page_is_ours(scenario):
+    compare(lambda task: example("mine").Mine(), OurKalman, scenario=scenario)
 
 
 def test_extended_filter_follows_a_radar_that_measures_range_and_azimuth():
@@ -152,13 +171,18 @@ def test_filterpy_closes_the_loop_like_the_papers_filter(plant):
 
 
 def test_every_example_is_tried():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {*LIBRARIES, "mine", "inverted_pendulum"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == {
+        *LIBRARIES,
+        "mine",
+        "inverted_pendulum",
+        "flights",
+    }
 
 
-def test_unscented_filter_of_the_page_runs():
-    result = filtergym.evaluate(
-        ID, {"ukf": example("filterpy_filters").Unscented, "imm": "imm"}, episodes=2, horizon=20
-    )
+@pytest.mark.parametrize("irregular", [{}, {"detection_probability": (0.5, 0.5), "scan_jitter": (0.9, 0.9)}])
+def test_unscented_filter_of_the_page_runs(irregular):
+    competitors = {"ukf": example("filterpy_filters").Unscented, "imm": "imm"}
+    result = filtergym.evaluate(ID, competitors, episodes=2, horizon=20, **irregular)
     assert np.isfinite(result.nees.values[0]).all()
 
 
@@ -238,10 +262,23 @@ def test_without_a_measurement_filterpy_only_predicts():
 
     class Predicting(OurKalman):
         def update(self, measurement, memory):
-            memory = kalman.predict(*memory, self.F, self.Q)
+            memory = kalman.predict(*memory, *self.model(measurement.interval))
             return *memory, memory
 
     compare(Deaf, Predicting, horizon=5)
+
+
+def test_a_filter_for_one_interval_refuses_another():
+    filters = example("filterpy_filters")
+
+    class Rigid(filters.Kalman):
+        predict = adapters.FilterpyEstimator.predict
+
+    compare(Rigid, OurKalman, scenario="missed-detections", horizon=5)
+    with pytest.raises(
+        ValueError, match=r"Rigid predicts over 6 s, and a measurement comes after .* s: it must"
+    ):
+        filtergym.evaluate(ID, {"mine": Rigid}, "irregular-scans", episodes=1, horizon=5)
 
 
 @pytest.mark.parametrize(

@@ -279,7 +279,7 @@ def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
     with pytest.raises(ValueError, match="holds a run with seed 0, not 3"):
         resumed_run(tmp_path, small_run(algorithm, 400, seed=3))
     later = dataclasses.replace(small_run(algorithm, 400), interface=7)
-    with pytest.raises(ValueError, match="holds a run with interface 1, not 7"):
+    with pytest.raises(ValueError, match="holds a run with interface 2, not 7"):
         resumed_run(tmp_path, later)
     for file in (tmp_path / "checkpoint").iterdir():
         file.write_bytes(b"\x80garbage" * 20)

@@ -26,14 +26,24 @@ from filtergym import evaluate
 
 ID = "filtergym/ManeuveringTarget-v0"
 T, LANES = 6.0, 8
-F = np.kron([[1.0, T], [0.0, 1.0]], np.eye(2))
-UNIT_Q = np.kron(np.outer([T**2 / 2, T], [T**2 / 2, T]), np.eye(2))
 H, H5 = np.eye(2, 4), np.eye(2, 5)
 
 
-@pytest.fixture(scope="module")
-def task():
-    return make_task(ID, None, "random")
+def transition(dt):
+    """Of position and velocity over dt seconds."""
+    return np.kron([[1.0, dt], [0.0, 1.0]], np.eye(2))
+
+
+def unit_noise(dt):
+    """Covariance of what an acceleration of 1 m/s^2 does in dt seconds."""
+    return np.kron(np.outer([dt**2 / 2, dt], [dt**2 / 2, dt]), np.eye(2))
+
+
+@pytest.fixture(scope="module", params=["regular", "irregular"])
+def task(request):
+    """Scans that all see the target, every six seconds; and such that miss it and come early."""
+    irregular = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
+    return make_task(ID, None, "random", **(irregular if request.param == "irregular" else {}))
 
 
 def estimates(task, estimator, horizon=100):
@@ -62,13 +72,16 @@ def compare(task, estimator, naive, rtol=1e-9):
         track = naive(initial.mean[:, b], initial.covariance[..., b])
         next(track)
         for k, m in enumerate(measurements):
-            x, P = track.send((m.position[:, b], np.diag(m.variance[:, b])))
+            z = m.position[:, b] if m.available[b] else None
+            x, P = track.send((z, np.diag(m.variance[:, b]), m.interval[b]))
             # Some 20 km, and rounding that filters of long memory keep.
             np.testing.assert_allclose(means[k, :, b], x, rtol=rtol, atol=1e4 * rtol)
             np.testing.assert_allclose(covariances[k, ..., b], P, rtol=10 * rtol, atol=1e4 * rtol)
 
 
 def kalman_update(x, P, z, R, matrix=H):
+    if z is None:
+        return x, P, 0.0
     S = matrix @ P @ matrix.T + R
     K = P @ matrix.T @ np.linalg.inv(S)
     likelihood = multivariate_normal.logpdf(z, matrix @ x, S)
@@ -85,30 +98,29 @@ def padded(x, P, variance):
 def naive_imm_turn(accelerations, start_rate, change, stay):
     """Equations of the IMM paper, mixed in five states."""
     variance = math.radians(start_rate) ** 2
-    Q5 = np.zeros((5, 5))
-    Q5[:4, :4] = accelerations[2] ** 2 * UNIT_Q
-    Q5[4, 4] = math.radians(change) ** 2
-    transition = [[stay[i] if i == j else (1 - stay[i]) / 2 for j in range(3)] for i in range(3)]
+    chain = [[stay[i] if i == j else (1 - stay[i]) / 2 for j in range(3)] for i in range(3)]
 
     def track(x, P):
         bank = [padded(x, P, variance)] * 3
         mu = np.array([1 / (1 - s) for s in stay])
         mu = mu / mu.sum()
-        z, R = yield
+        z, R, dt = yield
         while True:
-            predicted = mu @ transition
+            predicted = mu @ chain
             updated, log_weights = [], []
             for j in range(3):
-                w = [transition[i][j] * mu[i] / predicted[j] for i in range(3)]
+                w = [chain[i][j] * mu[i] / predicted[j] for i in range(3)]
                 x = sum(w[i] * bank[i][0] for i in range(3))
                 P = sum(w[i] * (bank[i][1] + np.outer(bank[i][0] - x, bank[i][0] - x)) for i in range(3))
                 if j < 2:
-                    x, P = F @ x[:4], F @ P[:4, :4] @ F.T + accelerations[j] ** 2 * UNIT_Q
+                    F = transition(dt)
+                    x, P = F @ x[:4], F @ P[:4, :4] @ F.T + accelerations[j] ** 2 * unit_noise(dt)
                     x, P, likelihood = kalman_update(x, P, z, R)
                     x, P = padded(x, P, variance)
                 else:
-                    A = coordinated_turn.jacobian(x, T)
-                    x, P = coordinated_turn.turned(x, T), A @ P @ A.T + Q5
+                    A = coordinated_turn.jacobian(x, dt)
+                    Q = coordinated_turn.process_noise(dt, accelerations[2], math.radians(change) / T)
+                    x, P = coordinated_turn.turned(x, dt), A @ P @ A.T + Q
                     x, P, likelihood = kalman_update(x, P, z, R, H5)
                 updated.append((x, P))
                 log_weights.append(math.log(predicted[j]) + likelihood)
@@ -117,7 +129,7 @@ def naive_imm_turn(accelerations, start_rate, change, stay):
             mu = mu / mu.sum()
             x = sum(mu[j] * bank[j][0] for j in range(3))
             P = sum(mu[j] * (bank[j][1] + np.outer(bank[j][0] - x, bank[j][0] - x)) for j in range(3))
-            z, R = yield x[:4], P[:4, :4]
+            z, R, dt = yield x[:4], P[:4, :4]
 
     return track
 
@@ -146,18 +158,23 @@ def test_imm_equals_filterpys(task):
         filters = []
         for sigma in sigmas:
             one = filterpy.KalmanFilter(dim_x=4, dim_z=2)
-            one.x, one.P, one.F, one.H, one.Q = x.copy(), P.copy(), F, H, sigma**2 * UNIT_Q
+            one.x, one.P, one.H, one.sigma = x.copy(), P.copy(), H, sigma
             filters.append(one)
         mu = [1 / (1 - s) for s in stay]
-        transition = np.array([[stay[0], 1 - stay[0]], [1 - stay[1], stay[1]]])
-        peer = filterpy.IMMEstimator(filters, np.array(mu) / sum(mu), transition)
-        z, R = yield
+        chain = np.array([[stay[0], 1 - stay[0]], [1 - stay[1], stay[1]]])
+        peer = filterpy.IMMEstimator(filters, np.array(mu) / sum(mu), chain)
+        z, R, dt = yield
         while True:
             for one in filters:
-                one.R = R
+                one.R, one.F, one.Q = R, transition(dt), one.sigma**2 * unit_noise(dt)
             peer.predict()
-            peer.update(z)
-            z, R = yield peer.x, peer.P
+            if z is not None:
+                peer.update(z)
+            else:  # the predicted probabilities are in force, which filterpy learns in an update only
+                peer.mu = peer.cbar
+                peer._compute_mixing_probabilities()
+                peer._compute_state_estimate()
+            z, R, dt = yield peer.x, peer.P
 
     compare(task, KalmanInteractingMultipleModel(task, sigmas, stay), track, rtol=1e-8)
 
@@ -165,7 +182,6 @@ def test_imm_equals_filterpys(task):
 def test_unscented_filter_equals_filterpys(task):
     filterpy = pytest.importorskip("filterpy.kalman")
     acceleration, change, start_rate = 0.5, 0.4, 1.5
-    Q = np.array(coordinated_turn.process_noise(T, acceleration, math.radians(change) / T))
 
     def track(x, P):
         points = filterpy.MerweScaledSigmaPoints(5, alpha=1.0, beta=2.0, kappa=0.0)
@@ -173,14 +189,15 @@ def test_unscented_filter_equals_filterpys(task):
             5, 2, T, hx=lambda s: s[:2], fx=coordinated_turn.turned, points=points
         )
         peer.x, peer.P = padded(x, P, math.radians(start_rate) ** 2)
-        peer.Q = Q
-        z, R = yield
+        z, R, dt = yield
         while True:
-            peer.predict()
+            peer.Q = np.array(coordinated_turn.process_noise(dt, acceleration, math.radians(change) / T))
+            peer.predict(dt=dt)
             # Drawn anew, so that they hold the process noise: then its update is Kalman's.
             peer.sigmas_f = points.sigma_points(peer.x, peer.P)
-            peer.update(z, R=R)
-            z, R = yield peer.x[:4], peer.P[:4, :4]
+            if z is not None:
+                peer.update(z, R=R)
+            z, R, dt = yield peer.x[:4], peer.P[:4, :4]
 
     compare(task, UnscentedTurn(task, acceleration, change, start_rate), track)
 
@@ -190,16 +207,20 @@ def test_sage_husa_equals_the_papers_recursion(task):
 
     def track(x, P):
         level, k = acceleration**2, 0
-        z, R = yield
+        z, R, dt = yield
         while True:
-            k += 1
-            d = (1 - forgetting) / (1 - forgetting ** (k + 1))
+            F, unit = transition(dt), unit_noise(dt)
             carried = F @ P @ F.T
             before = F @ x
-            x, P, _ = kalman_update(before, carried + level * UNIT_Q, z, R)
-            sample = np.diag(np.outer(x - before, x - before) + P - carried) / np.diag(UNIT_Q)
+            x, P, _ = kalman_update(before, carried + level * unit, z, R)
+            if z is None:
+                z, R, dt = yield x, P
+                continue
+            k += 1
+            d = (1 - forgetting) / (1 - forgetting ** (k + 1))
+            sample = np.diag(np.outer(x - before, x - before) + P - carried) / np.diag(unit)
             level = max((1 - d) * level + d * sample.mean(), least**2)
-            z, R = yield x, P
+            z, R, dt = yield x, P
 
     compare(task, SageHusa(task, acceleration, forgetting, least), track)
 
@@ -209,16 +230,21 @@ def test_variational_bayes_equals_the_papers_recursion(task):
 
     def track(x, P):
         alpha, beta = np.full(2, shape), np.full(2, shape)
-        z, R = yield
+        z, R, dt = yield
         while True:
-            before, P = F @ x, F @ P @ F.T + acceleration**2 * UNIT_Q
+            F = transition(dt)
+            before, P = F @ x, F @ P @ F.T + acceleration**2 * unit_noise(dt)
+            if z is None:
+                x = before
+                z, R, dt = yield x, P
+                continue
             alpha = rho * alpha + 0.5
             faded = beta = rho * beta
             for _ in range(VariationalBayes.iterations):
                 x, after, _ = kalman_update(before, P, z, np.diag(beta / alpha) @ R)
                 beta = faded + 0.5 * ((z - x[:2]) ** 2 + np.diag(after)[:2]) / np.diag(R)
             P = after
-            z, R = yield x, P
+            z, R, dt = yield x, P
 
     compare(task, VariationalBayes(task, acceleration, rho, shape), track)
 
@@ -227,14 +253,16 @@ def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(task):
     acceleration, tau = 0.6, 2.0
 
     def track(x, P):
-        z, R = yield
+        z, R, dt = yield
         while True:
-            before, nominal = F @ x, F @ P @ F.T + acceleration**2 * UNIT_Q
+            F = transition(dt)
+            before, nominal = F @ x, F @ P @ F.T + acceleration**2 * unit_noise(dt)
             estimated = nominal
             for _ in range(VariationalBayesPrediction.iterations):
                 x, P, _ = kalman_update(before, estimated, z, R)
-                estimated = (tau * nominal + P + np.outer(x - before, x - before)) / (tau + 1)
-            z, R = yield x, P
+                if z is not None:
+                    estimated = (tau * nominal + P + np.outer(x - before, x - before)) / (tau + 1)
+            z, R, dt = yield x, P
 
     compare(task, VariationalBayesPrediction(task, acceleration, tau), track)
 

@@ -77,6 +77,7 @@ CALLS = [
     (imm.log_probabilities, (np.array([[0.0], [1.0]]),)),
     (imm.normalised_exponential, (MEANS[:, 0],)),
     (imm.mode_posterior, (np.log(MU), -1e5 + MEANS[0])),
+    (imm.log_mixture_density, (np.log(MU), -1e5 + MEANS[0])),
     (kalman.predict, (X4, P4, F4, Q4, X4)),
     (kalman.update, (X4, P4, Z2, H24, R2)),
     (noise_adaptation.faded, (LEVEL, Z2, 0.9, THERE)),

@@ -1,4 +1,7 @@
-"""Single Kalman filters of constant velocity that estimate their noise from the innovations."""
+"""Single Kalman filters of constant velocity that estimate their noise from the innovations.
+
+A scan that missed the target says nothing of any noise: what is estimated holds.
+"""
 
 from typing import NamedTuple
 
@@ -46,14 +49,15 @@ class SageHusa(KalmanModel):
         self, measurement: Measurement, memory: ProcessNoiseTrack
     ) -> tuple[Array, Array, ProcessNoiseTrack]:
         """Predict with the noise estimated so far, update, and estimate it anew."""
-        mean, carried = kalman.predict(memory.mean, memory.covariance, self.F, 0.0 * self.unit_Q)
-        predicted = carried + self.unit_Q[:, :, None] * memory.level.value
+        F, unit = self.motion(measurement.interval)
+        mean, carried = kalman.predict(memory.mean, memory.covariance, F, 0.0 * unit)
+        predicted = carried + unit * memory.level.value
         result = self.updated((mean, predicted), measurement)
         sample = noise_adaptation.process_noise_factor(
             result.mean - mean,
-            *(self.diagonal(P) for P in (result.covariance, carried, self.unit_Q[:, :, None])),
+            *(self.diagonal(P) for P in (result.covariance, carried, unit)),
         )
-        level = noise_adaptation.faded(memory.level, sample, self.forgetting)
+        level = noise_adaptation.faded(memory.level, sample, self.forgetting, measurement.available)
         level = level._replace(value=self.xp.clip(level.value, self.least, None))
         return result.mean, result.covariance, ProcessNoiseTrack(result.mean, result.covariance, level)
 
@@ -93,7 +97,7 @@ class VariationalBayes(KalmanModel):
         shape: float = 5.0,
     ) -> None:
         super().__init__(task)
-        self.Q, self.forgetting, self.shape = acceleration**2 * self.unit_Q, forgetting, shape
+        self.variance, self.forgetting, self.shape = acceleration**2, forgetting, shape
 
     def start(self, initial: Initial, N: int) -> MeasurementNoiseTrack:
         """Start where everyone starts, and believe the radar."""
@@ -106,8 +110,9 @@ class VariationalBayes(KalmanModel):
         self, measurement: Measurement, memory: MeasurementNoiseTrack
     ) -> tuple[Array, Array, MeasurementNoiseTrack]:
         """Predict, and update state and noise together."""
-        xp, variance = self.xp, measurement.variance
-        predicted = kalman.predict(memory.mean, memory.covariance, self.F, self.Q)
+        xp, variance, available = self.xp, measurement.variance, measurement.available
+        F, unit = self.motion(measurement.interval)
+        predicted = kalman.predict(memory.mean, memory.covariance, F, self.variance * unit)
 
         def update(factor: Array) -> tuple[Array, Array, kalman.Update]:
             result = self.updated(predicted, measurement._replace(variance=factor * variance))
@@ -116,7 +121,10 @@ class VariationalBayes(KalmanModel):
             return residual / xp.sqrt(variance), updated / variance, result
 
         noise, result = noise_adaptation.variational_bayes(
-            noise_adaptation.forget(memory.noise, self.forgetting), update, self.iterations
+            noise_adaptation.forget(memory.noise, self.forgetting, available),
+            update,
+            self.iterations,
+            available,
         )
         return result.mean, result.covariance, MeasurementNoiseTrack(result.mean, result.covariance, noise)
 
@@ -135,7 +143,7 @@ class VariationalBayesPrediction(KalmanModel):
 
     def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, strength: float = 3.0) -> None:
         super().__init__(task)
-        self.Q, self.strength = acceleration**2 * self.unit_Q, strength
+        self.variance, self.strength = acceleration**2, strength
 
     def start(self, initial: Initial, N: int) -> Initial:
         """Start where everyone starts."""
@@ -143,12 +151,15 @@ class VariationalBayesPrediction(KalmanModel):
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial]:
         """Predict, and update state and predicted covariance together."""
+        F, unit = self.motion(measurement.interval)
+        predicted = Initial(*kalman.predict(memory.mean, memory.covariance, F, self.variance * unit))
         result = predicted_covariance.update(
-            *kalman.predict(memory.mean, memory.covariance, self.F, self.Q),
+            *predicted,
             measurement.position,
             self.H,
             self.identity * measurement.variance,
             self.strength,
             self.iterations,
         )
-        return result.mean, result.covariance, Initial(result.mean, result.covariance)
+        estimate = self.seen(measurement, Initial(result.mean, result.covariance), predicted)
+        return *estimate, estimate

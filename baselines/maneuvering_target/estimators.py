@@ -1,29 +1,56 @@
-"""Estimators of ManeuveringTarget: what the measurements allow beyond the filters that an action steers."""
+"""Estimators of ManeuveringTarget: what the measurements allow beyond the filters that an action steers.
+
+They predict over the time between two scans, whatever it is, and a scan that missed the target is prediction only.
+"""
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
 from ...envs.observation import Array
 from ...envs.task import Initial
 from ...filters import coordinated_turn, imm, kalman, unscented
+from ...filters.small_matrices import outer
 
 
 class KalmanModel:
-    """Matrices of the constant-velocity model in x and y."""
+    """The constant-velocity model in x and y."""
 
     def __init__(self, task: ManeuveringTarget) -> None:
         self.task, self.xp = task, task.xp
-        F, Q = kalman.white_acceleration(task.parameters.sampling_interval, 1.0, axes=2)
-        self.F, self.unit_Q = task.constant(F), task.constant(Q)
+        moved, noise = kalman.white_acceleration(1.0, 1.0, axes=2)
+        self.unmoved = task.constant(kalman.white_acceleration(0.0, 1.0, axes=2)[0])[:, :, None]
+        self.moved = task.constant(moved)[:, :, None] - self.unmoved
+        self.correlated = task.constant([[float(entry > 0.0) for entry in row] for row in noise])[:, :, None]
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
         self.identity = task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None]
 
+    def motion(self, T: Array) -> tuple[Array, Array]:
+        """Transition matrix, and covariance of the process noise by an acceleration of 1 m/s^2, over intervals.
+
+        Args:
+            T: s, ``(N,)``.
+
+        Returns:
+            :func:`.kalman.white_acceleration` of each, ``(4, 4, N)``.
+        """
+        by_acceleration = self.xp.stack([0.5 * T**2, 0.5 * T**2, T, T])
+        return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
+
+    def seen(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
+        """One of two tuples of arrays where the scan saw the target, the other where it missed it."""
+        there = measurement.available > 0.0
+        parts = zip(then, otherwise, strict=True)
+        return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
+
     def updated(self, predicted: tuple[Array, Array], measurement: Measurement) -> kalman.Update:
-        """Kalman's update of a predicted mean and covariance with the measured position."""
-        return kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
+        """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
+        nothing of how likely they are.
+        """
+        result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
+        return self.seen(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
 
 
 class KalmanBank(NamedTuple):
@@ -53,7 +80,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
     ) -> None:
         super().__init__(task)
         modes = range(len(stay))
-        self.Q = [sigma**2 * self.unit_Q for sigma in accelerations]
+        self.variances = [sigma**2 for sigma in accelerations]
         self.transition = task.constant(
             [[stay[i] if i == j else (1.0 - stay[i]) / (len(stay) - 1) for j in modes] for i in modes]
         )
@@ -67,9 +94,10 @@ class KalmanInteractingMultipleModel(KalmanModel):
 
     def filtered(self, mean: Array, covariance: Array, measurement: Measurement) -> list[kalman.Update]:
         """Predict and update every filter from its mixed state ``(n, M, N)``."""
+        F, Q = self.motion(measurement.interval)
         return [
-            self.updated(kalman.predict(mean[:, j], covariance[:, :, j], self.F, Q), measurement)
-            for j, Q in enumerate(self.Q)
+            self.updated(kalman.predict(mean[:, j], covariance[:, :, j], F, variance * Q), measurement)
+            for j, variance in enumerate(self.variances)
         ]
 
     def start(self, initial: Initial, N: int) -> KalmanBank:
@@ -110,14 +138,18 @@ class TurnModel(KalmanModel):
 
     def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
         super().__init__(task)
-        self.T = task.parameters.sampling_interval
-        change = math.radians(turn_rate_change) / self.T
-        self.Q = task.constant(coordinated_turn.process_noise(self.T, acceleration, change))[:, :, None]
+        self.variance = acceleration**2
+        self.change = math.radians(turn_rate_change) / task.parameters.sampling_interval
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
-    def predicted(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
-        """Time update by the extended Kalman filter."""
-        return coordinated_turn.predict(mean, covariance, self.T, self.Q)
+    def noise(self, T: Array) -> Array:
+        """Covariance of the process noise over intervals, s, ``(5, 5, N)``."""
+        Q = self.variance * self.motion(T)[1]
+        return coordinated_turn.augmented(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
+
+    def predicted(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
+        """Time update over intervals, s, by the extended Kalman filter."""
+        return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
 
 class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
@@ -158,7 +190,7 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         for straight in super().filtered(mean[:4], covariance[:4, :4], measurement):
             mean5, covariance5 = self.augmented(straight.mean, straight.covariance)
             results.append(straight._replace(mean=mean5, covariance=covariance5))
-        predicted = self.turn.predicted(mean[:, 2], covariance[:, :, 2])
+        predicted = self.turn.predicted(mean[:, 2], covariance[:, :, 2], measurement.interval)
         return [*results, self.turn.updated(predicted, measurement)]
 
 
@@ -192,8 +224,9 @@ class UnscentedTurn(TurnModel):
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial]:
         """Carry the sigma points through the turn and update with the measured position."""
+        T = measurement.interval
         mean, covariance = unscented.transform(
-            memory.mean, memory.covariance, lambda points: coordinated_turn.turned(points, self.T)
+            memory.mean, memory.covariance, lambda points: coordinated_turn.turned(points, T)
         )
-        result = self.updated((mean, covariance + self.Q), measurement)
+        result = self.updated((mean, covariance + self.noise(T)), measurement)
         return result.mean[:4], result.covariance[:4, :4], Initial(result.mean, result.covariance)

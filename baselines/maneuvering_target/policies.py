@@ -121,16 +121,16 @@ class AdaptiveGain(Policy):
         self.threshold = -2.0 * math.log(false_alarm_probability)
         self.ramp_scans = ramp_scans
         self.low, self.high = min(task.parameters.gains), max(task.parameters.gains)
-        self.squared = task.reader("log_squared_innovation")
+        self.squared, self.available = task.reader("log_squared_innovation"), task.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Go down the ramp, or start it again at an alarm."""
-        step = numpy.where(start, 0, 0 if state is None else state + 1)
+        """Go down the ramp, or start it again at an alarm; a scan that missed the target is no step of it."""
+        step = numpy.where(start, 0, 0 if state is None else state)
         alarm = self.squared(observation)[:, 0] > self.threshold
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)
         step = numpy.where(alarm & may & ~start, 0, step)
         alpha = self.high - (self.high - self.low) * numpy.minimum(step, self.ramp_scans) / self.ramp_scans
-        return gain_bank(self.task).action_for_alpha(alpha)[:, None], step
+        return gain_bank(self.task).action_for_alpha(alpha)[:, None], step + self.available(observation)[:, 0]
 
 
 class RearmingAdaptiveGain(AdaptiveGain):

@@ -1,10 +1,21 @@
 """Reference estimators and the bound of ManeuveringTarget."""
 
-from ...envs.maneuvering_target.world import Legs, Measurement, RadarWorld, Tracks, Truth
+from typing import NamedTuple
+
+from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...envs.observation import Array
 from ...envs.task import Initial
 from ...filters import bounds, kalman, polar
 from .estimators import KalmanModel
+
+
+class TurnMemory(NamedTuple):
+    """Memory of :class:`KnownTurn`."""
+
+    mean: Array
+    covariance: Array
+    velocity: Array
+    """True one at the last scan, ``(2, N)``."""
 
 
 class KnownTurn(KalmanModel):
@@ -16,45 +27,23 @@ class KnownTurn(KalmanModel):
     kind = "reference"
     knows = "the scans of every manoeuvre and the size of its acceleration"
 
-    def start(self, initial: Initial, truth: Truth) -> Initial:
+    def start(self, initial: Initial, truth: Truth) -> TurnMemory:
         """Start where everyone starts."""
-        return initial
+        return TurnMemory(*initial, truth.velocity)
 
-    def acceleration_sigma(self, truth: Truth) -> Array:
-        """Size per axis of the acceleration in this scan, zero on straight flight, ``(N,)``."""
-        xp, world, T = self.xp, self.task.world, self.task.parameters.sampling_interval
-        assert isinstance(world, RadarWorld)
-        if truth.maneuvers is None:
-            rate = world.table[2:, 1:] - world.table[2:, :-1]
-            row = xp.clip(xp.astype(truth.scan, xp.int64) - 1, None, rate.shape[1] - 1)
-            change = rate[:, row] / T
-            return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
-        if isinstance(truth.maneuvers, Tracks):
-            tracks = truth.maneuvers
-            before = xp.astype(xp.minimum(tracks.first + truth.scan, tracks.last) - 1.0, xp.int64)
-            change = (truth.velocity - world.table[2:, before]) / T
-            return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
-        if isinstance(truth.maneuvers, Legs):
-            change = (truth.velocity - world.on_legs(truth.maneuvers, truth.scan - 1.0)[1]) / T
-            return xp.sqrt(0.5 * (change[0] ** 2 + change[1] ** 2))
-        m = truth.maneuvers
-        total = 0.0 * truth.scan
-        for slot in range(world.slots):
-            active = xp.astype((truth.scan >= m.first[slot]) & (truth.scan <= m.last[slot]), total.dtype)
-            speed2 = truth.velocity[0] ** 2 + truth.velocity[1] ** 2
-            turn2 = (m.velocity_along[slot] ** 2 + m.velocity_across[slot] ** 2) * speed2 / T**2
-            thrust2 = m.acceleration[0, slot] ** 2 + m.acceleration[1, slot] ** 2
-            total = total + active * 0.5 * (thrust2 + turn2)
-        return xp.sqrt(total)
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: TurnMemory
+    ) -> tuple[Array, Array, TurnMemory]:
+        """Predict with the noise of this scan and update with its measurement.
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Initial) -> tuple[Array, Array, Initial]:
-        """Predict with the noise of this scan and update with its measurement."""
-        Q = self.unit_Q[:, :, None] * self.acceleration_sigma(truth) ** 2
-        mean, covariance = kalman.predict(memory.mean, memory.covariance, self.F, Q)
-        result = kalman.update(
-            mean, covariance, measurement.position, self.H, self.identity * measurement.variance
-        )
-        return result.mean, result.covariance, Initial(result.mean, result.covariance)
+        The acceleration is the change of the velocity since the scan before, as large along x as along y.
+        """
+        T = measurement.interval
+        F, unit = self.motion(T)
+        change = (truth.velocity - memory.velocity) / T
+        variance = 0.5 * (change[0] ** 2 + change[1] ** 2)
+        result = self.updated(kalman.predict(memory.mean, memory.covariance, F, variance * unit), measurement)
+        return result.mean, result.covariance, TurnMemory(result.mean, result.covariance, truth.velocity)
 
 
 class KnownInputBound(KalmanModel):
@@ -68,10 +57,13 @@ class KnownInputBound(KalmanModel):
         return initial.covariance
 
     def update(self, measurement: Measurement, truth: Truth, memory: Array) -> tuple[Array, Array]:
-        """Bound after this scan: the diagonal of the covariance recursion at the true position."""
+        """Bound after this scan: the diagonal of the covariance recursion at the true position. A scan that missed the
+        target adds no information.
+        """
         world, p = self.task.world, self.task.parameters
         assert isinstance(world, RadarWorld)
-        P = bounds.predicted_bound(memory, self.F[:, :, None])
+        predicted = bounds.predicted_bound(memory, self.motion(measurement.interval)[0])
         variance = polar.cartesian_variances(truth.position, p.range_sigma, world.bearing_sigma)
-        P = bounds.posterior_cramer_rao_bound(P, self.H, self.identity * variance)
+        P = bounds.posterior_cramer_rao_bound(predicted, self.H, self.identity * variance)
+        P = self.xp.where(measurement.available > 0.0, P, predicted)
         return self.xp.stack([P[i, i] for i in range(4)]), P

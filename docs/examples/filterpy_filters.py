@@ -32,17 +32,27 @@ class Kalman(FilterpyEstimator):
         kalman.x, kalman.P = initial.mean, initial.covariance
         return kalman
 
+    def predict(self, track, interval):
+        constant_velocity(track, interval, 2.0).predict()
+
 
 class Imm(FilterpyEstimator):
     """Two Kalman filters: no manoeuvre, and white acceleration of 2.775 m/s^2, as `kalman-imm` has them."""
 
+    sigmas = (0.0, 2.775)
+
     def begin(self, initial):
         models = []
-        for sigma in (0.0, 2.775):
+        for sigma in self.sigmas:
             model = constant_velocity(KalmanFilter(4, 2), self.task.parameters.sampling_interval, sigma)
             model.x, model.P = initial.mean, initial.covariance
             models.append(model)
         return IMMEstimator(models, (0.5, 0.5), numpy.array([[0.9, 0.1], [0.1, 0.9]]))
+
+    def predict(self, track, interval):
+        for model, sigma in zip(track.filters, self.sigmas):
+            constant_velocity(model, interval, sigma)
+        track.predict()
 
 
 class Unscented(FilterpyEstimator):
@@ -56,9 +66,12 @@ class Unscented(FilterpyEstimator):
         ukf = UnscentedKalmanFilter(5, 2, T, lambda x: x[[0, 2]], coordinated_turn, points)
         ukf.x, ukf.P = initial.mean, initial.covariance
         ukf.P[4, 4] = 0.01**2
-        axis = 1.0**2 * numpy.outer([T**2 / 2, T], [T**2 / 2, T])
-        ukf.Q = block_diag(axis, axis, 0.003**2)
         return ukf
+
+    def predict(self, track, interval):
+        axis = 1.0**2 * numpy.outer([interval**2 / 2, interval], [interval**2 / 2, interval])
+        track.Q = block_diag(axis, axis, (0.0005 * interval) ** 2)
+        track.predict(dt=interval)
 
 
 def coordinated_turn(x, T):
@@ -82,8 +95,9 @@ class Extended(FilterpyEstimator):
         return ekf
 
     def step(self, track, measurement):
-        track.predict()
-        track.update(polar(measurement.position), jacobian, polar, residual=wrapped)
+        constant_velocity(track, measurement.interval, 2.0).predict()
+        if measurement.available:
+            track.update(polar(measurement.position), jacobian, polar, residual=wrapped)
 
 
 def polar(x):

@@ -39,6 +39,8 @@ class Innovations(NamedTuple):
     """Of its square."""
     average_product: Array
     """Of its product with the one before."""
+    deviation: Array
+    """Standard deviation that is predicted for the innovation at hand, m."""
 
 
 class Steered(NamedTuple):
@@ -197,7 +199,23 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
 
     def none_seen(self, zero: Array) -> Innovations:
         """Innovations at the start of the track, of the shape of ``zero``."""
-        return Innovations(zero, zero, zero, zero + 1.0, zero)
+        return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
+
+    def log_density(self, seen: Innovations) -> Array:
+        """Log-density of the innovations of each axis."""
+        return -0.5 * seen.normalised * seen.normalised - self.xp.log(
+            math.sqrt(2.0 * math.pi) * seen.deviation
+        )
+
+    def consistency(self, state: Any, measurement: Measurement) -> dict[str, Array]:
+        """NIS and log-density of one filter, NaN without a measurement."""
+        xp, there = self.xp, measurement.available > 0.0
+        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
+        return {
+            "nis": xp.where(there, nis, math.nan),
+            "nis_degrees": self.parameters.axes * measurement.available,
+            "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.seen)), math.nan),
+        }
 
     def compared(
         self, before: Innovations, measurement: Measurement, position: Array, variance: Array
@@ -212,7 +230,8 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
         """
         xp, available, reported = self.xp, measurement.available, measurement.reported_deviation
         innovation = available * (measurement.fix - position)
-        normalised = innovation / xp.sqrt(variance + reported * reported)
+        deviation = xp.sqrt(variance + reported * reported)
+        normalised = innovation / deviation
         rate = self.forgetting * available
         square, product = normalised * normalised, normalised * before.normalised
         return Innovations(
@@ -221,6 +240,7 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
             before.average + rate * (normalised - before.average),
             before.average_square + rate * (square - before.average_square),
             before.average_product + rate * (product - before.average_product),
+            deviation + 0.0 * innovation,
         )
 
 
@@ -313,12 +333,8 @@ class NoiseBank(_KalmanBucyBank):
         return self.eye * state.covariance.position
 
     def records(self, state: Augmented, measurement: Measurement) -> dict[str, Array]:
-        """NIS (NaN without a measurement)."""
-        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
-        return {
-            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
-            "nis_degrees": self.parameters.axes * measurement.available,
-        }
+        """NIS and log-density (NaN without a measurement)."""
+        return self.consistency(state, measurement)
 
 
 class GainBank(_KalmanBucyBank):
@@ -399,12 +415,8 @@ class GainBank(_KalmanBucyBank):
         return self.eye * state.variance.modelled
 
     def records(self, state: Steered, measurement: Measurement) -> dict[str, Array]:
-        """NIS (NaN without a measurement), gain and K."""
-        nis = ordered_sum(state.seen.normalised * state.seen.normalised)
-        found = {
-            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
-            "nis_degrees": self.parameters.axes * measurement.available,
-        }
+        """NIS and log-density (NaN without a measurement), gain and K."""
+        found = self.consistency(state, measurement)
         for i, ending in enumerate([f"_{axis}" for axis in self.axes] or [""]):
             found[f"gain{ending}"] = state.gain[i]
             found[f"gain_rate{ending}"] = state.gain[i] / self.parameters.sampling_interval
@@ -499,11 +511,17 @@ class SchemeBank(_KalmanBucyBank):
         return imm.combine(position, self.eye[..., None] * variance, state.weights)[1]
 
     def records(self, state: Schemes, measurement: Measurement) -> dict[str, Array]:
-        """Weights, and the mean of the filters' NIS by them (NaN without a measurement): of the filter believed."""
+        """Weights, the mean of the filters' NIS by them, of the filter believed, and the log-density of their mixture
+        (NaN without a measurement).
+        """
+        there = measurement.available > 0.0
+        of_each = ordered_sum(self.xp.moveaxis(self.log_density(state.seen), 1, 0))
+        log_likelihood = imm.log_mixture_density(imm.log_probabilities(state.weights), of_each)
         squares = self.xp.moveaxis(state.seen.normalised * state.seen.normalised, 1, 0)
         nis = weighted_sum(state.weights, ordered_sum(squares))
         return {
-            "nis": self.xp.where(measurement.available > 0.0, nis, math.nan),
+            "nis": self.xp.where(there, nis, math.nan),
             "nis_degrees": self.parameters.axes * measurement.available,
+            "log_likelihood": self.xp.where(there, log_likelihood, math.nan),
             "mode_probability": state.weights,
         }

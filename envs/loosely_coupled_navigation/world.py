@@ -205,9 +205,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         """Position, ``(A, N)``."""
         return truth.reference
 
-    def cost(self, truth: Truth, mean: Array) -> Array:
+    def error_cost(self, error: Array) -> Array:
         """Squared error of position, summed over the axes, over the nominal variance of a measurement."""
-        error = mean - truth.reference
         return ordered_sum(error * error) / self.parameters.receiver_variance
 
     def records(self, truth: Truth) -> dict[str, Array]:

@@ -1,11 +1,13 @@
 """The filters of ManeuveringTarget that are steered: one alpha-beta filter, or a bank of them.
 
-Equations and their numbers stand in ``filters/alpha_beta.py`` and ``filters/imm.py``.
+Equations and their numbers stand in ``filters/alpha_beta.py`` and ``filters/imm.py``. A scan that missed the target is
+prediction only, whatever the action: means and covariances stay as predicted, the weights become the predicted mode
+probabilities (13), averages and gains hold.
 """
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import numpy
@@ -15,13 +17,17 @@ from ...filters.gaussian import log_density
 from ...filters.ordered_sums import weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Quantity
-from ..task import Bank, Initial, Task
+from ..task import Bank, Initial
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
+if TYPE_CHECKING:
+    from .task import ManeuveringTarget
+
 SCANS_SHOWN = 20
 """The clock in the observation saturates here: a filter has settled after about ten scans."""
-
+PERIODS_SHOWN = (0.01, 100.0)
+"""Likewise the time since the last measurement, scan periods."""
 
 LARGEST_SHARE = 1e8
 """Of what an acceleration leaves over the covariance that the gains give."""
@@ -50,6 +56,10 @@ class AlphaBeta(NamedTuple):
     """Its exponential average, ``(N,)``."""
     alpha: Array
     """Gain used last, ``(N,)``."""
+    grown: Array = None
+    """s for which the innovation of the last update had grown, ``(N,)``; None where that is the scan period."""
+    since: Array = None
+    """s since that update, ``(N,)``; None likewise, for zero."""
 
 
 class Filters(NamedTuple):
@@ -79,24 +89,48 @@ class Filters(NamedTuple):
     """Position gains used last, ``(M, N)``."""
 
 
-class _RadarBank(Bank[Task, Measurement, Any]):
+class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
     """What both banks share: the averages that are shown, and the end of the observation."""
 
     parameters: ManeuveringTargetParameters
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         self.T = self.parameters.sampling_interval
+        self.regular = task.regular
         self.forgetting = math.exp(-1.0 / self.parameters.averaging_measurements)
         self.average = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
-    def averaged(self, old: Array, new: Array) -> Array:
-        """Exponential average with a new value taken in."""
-        return self.forgetting * old + (1.0 - self.forgetting) * new
+    def averaged(self, measurement: Measurement, old: Array, new: Array) -> Array:
+        """Exponential average with a new value taken in, if there is one."""
+        return self.seen(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
-    def surroundings(self) -> tuple[Block, Block]:
+    def interval(self, measurement: Measurement) -> float | Array:
+        """Seconds since the scan before."""
+        return self.T if self.regular else measurement.interval
+
+    def elapsed(self, measurement: Measurement) -> float | Array:
+        """Seconds since the last measurement."""
+        return self.T if self.regular else measurement.elapsed
+
+    def seen(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
+        """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
+        if self.regular or then is otherwise:
+            return then
+        if isinstance(then, tuple):
+            parts = [self.seen(measurement, *pair) for pair in zip(then, otherwise, strict=True)]
+            return type(then)(*parts) if hasattr(then, "_fields") else tuple(parts)
+        return self.xp.where(measurement.available > 0.0, then, otherwise)
+
+    def surroundings(self) -> tuple[Block, ...]:
         """Blocks of the measurement itself."""
         xp, unit = self.xp, self.parameters.range_sigma**2
+
+        def log_elapsed(state: Any, measurement: Measurement) -> Array:
+            if self.regular:
+                return xp.zeros_like(measurement.elapsed)
+            return xp.log(xp.clip(measurement.elapsed * (1.0 / self.T), *PERIODS_SHOWN))
+
         return (
             Block(
                 "log_measurement_sigma",
@@ -109,6 +143,19 @@ class _RadarBank(Bank[Task, Measurement, Any]):
                 "scan",
                 lambda state, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
                 f"scans since the start over {SCANS_SHOWN}, saturating at 1",
+            ),
+            Block(
+                "available",
+                lambda state, measurement: measurement.available,
+                "1 if the scan saw the target, 0 if not: no action has an effect then",
+            ),
+            Block(
+                "elapsed",
+                log_elapsed,
+                "the time since the last measurement over sampling_interval, within {:g} and {:g}".format(
+                    *PERIODS_SHOWN
+                ),
+                shown=KEPT_AS_LOG,
             ),
         )
 
@@ -194,29 +241,29 @@ class GainBank(_RadarBank):
             log_squared=zero[0],
             average_log_squared=zero[0],
             alpha=alpha,
+            grown=None if self.regular else self.T + zero[0],
+            since=None if self.regular else zero[0],
         )
 
     def predict(self, state: AlphaBeta, measurement: Measurement) -> AlphaBeta:
-        """Predict by one scan."""
-        xp, f = self.xp, state
-        predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], self.T)
-        covariance = alpha_beta.predict_covariance(f.covariance, self.T)
-        innovation = measurement.position - predicted
+        """Predict to the scan."""
+        xp, f, interval = self.xp, state, self.interval(measurement)
+        predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], interval)
+        covariance = alpha_beta.predict_covariance(f.covariance, interval)
+        innovation = self.seen(measurement, measurement.position - predicted, 0.0)
         S = covariance.position + measurement.variance
         normalised = innovation / xp.sqrt(S)
         squares = normalised * normalised
         log_squared = xp.log1p(squares[0] + squares[1])
-        return AlphaBeta(
-            f.mean,
-            predicted,
-            covariance,
-            innovation,
-            S,
-            self.averaged(f.average_excess, innovation * innovation - S),
-            self.averaged(f.average_innovation, normalised),
-            log_squared,
-            self.averaged(f.average_log_squared, log_squared),
-            f.alpha,
+        return f._replace(
+            predicted=predicted,
+            covariance=covariance,
+            innovation=innovation,
+            innovation_variance=S,
+            average_excess=self.averaged(measurement, f.average_excess, innovation * innovation - S),
+            average_innovation=self.averaged(measurement, f.average_innovation, normalised),
+            log_squared=log_squared,
+            average_log_squared=self.averaged(measurement, f.average_log_squared, log_squared),
         )
 
     def alpha(self, action: Array) -> Array:
@@ -231,29 +278,34 @@ class GainBank(_RadarBank):
 
     def act(self, state: AlphaBeta, measurement: Measurement, action: Array) -> AlphaBeta:
         """Update with the gain of the action and the beta that belongs to it."""
-        f, alpha = state, self.alpha(action)
+        xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.elapsed(measurement)
         beta = alpha_beta.benedict_bordner_beta(alpha)
-        updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, self.T)
-        covariance = alpha_beta.update_covariance(f.covariance, measurement.variance, alpha, beta, self.T)
-        return f._replace(mean=self.xp.concat(updated), covariance=covariance, alpha=alpha)
+        updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, elapsed)
+        covariance = alpha_beta.update_covariance(f.covariance, measurement.variance, alpha, beta, elapsed)
+        after = f._replace(mean=xp.concat(updated), covariance=covariance, alpha=alpha)
+        if self.regular:
+            return after
+        after = after._replace(grown=measurement.elapsed, since=xp.zeros_like(measurement.elapsed))
+        missed = f._replace(mean=xp.concat([f.predicted, f.mean[2:]]), since=measurement.elapsed)
+        return self.seen(measurement, after, missed)
 
     def mean(self, state: AlphaBeta) -> Array:
         """Position and velocity, ``(4, N)``."""
         return state.mean
 
     def covariance(self, state: AlphaBeta) -> Array:
-        """Covariance that belongs to the gains used, and what an acceleration since the last scan would leave of which
-        these know nothing: one as large as usual, and as the last innovations say.
+        """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last
+        would leave of which these know nothing: one as large as usual, and as the last innovations say.
         """
-        xp, f, T = self.xp, state, self.T
+        xp, f = self.xp, state
+        T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
         usual = (0.5 * T**2 * self.parameters.unmodelled_acceleration) ** 2
         beta = alpha_beta.benedict_bordner_beta(f.alpha)
         told = usual + xp.clip(f.average_excess, 0.0, None)
         # Of one direction; beyond this the sum would be singular to rounding.
-        told = xp.minimum(
-            told, LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
-        )
-        P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T)
+        largest = LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
+        told = xp.minimum(told, largest / (1.0 + since / T) ** 4)
+        P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T, since)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(
@@ -264,10 +316,15 @@ class GainBank(_RadarBank):
         )
 
     def records(self, state: AlphaBeta, measurement: Measurement) -> dict[str, Array]:
-        """Normalised innovation squared, and the gain."""
+        """Normalised innovation squared and log-density of the measurement as predicted (NaN where there is none), and
+        the gain.
+        """
+        nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
+        density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
-            "nis": self.xp.expm1(state.log_squared),
-            "nis_degrees": 2.0 + 0.0 * state.alpha,
+            "nis": self.seen(measurement, nis, math.nan),
+            "nis_degrees": 2.0 * measurement.available,
+            "log_likelihood": self.seen(measurement, density, math.nan),
             "alpha": state.alpha,
         }
 
@@ -275,7 +332,7 @@ class GainBank(_RadarBank):
 class FilterBank(_RadarBank):
     """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         p = self.parameters
         self.count = len(p.gains)
@@ -366,13 +423,13 @@ class FilterBank(_RadarBank):
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Mix, predict by one scan, and ask how likely the measurement is."""
-        xp, bank = self.xp, state
+        """Mix, predict to the scan, and ask how likely the measurement is."""
+        xp, bank, interval = self.xp, state, self.interval(measurement)
         prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
         mean, covariance = imm.mix(bank.mean, bank.covariance, prediction.mixing)
-        mean = xp.concat([alpha_beta.predict(mean[:2], mean[2:], self.T), mean[2:]])
-        covariance = alpha_beta.predict_joint_covariance(covariance, self.T)
-        innovation = measurement.position[:, None] - mean[:2]
+        mean = xp.concat([alpha_beta.predict(mean[:2], mean[2:], interval), mean[2:]])
+        covariance = alpha_beta.predict_joint_covariance(covariance, interval)
+        innovation = self.seen(measurement, measurement.position[:, None] - mean[:2], 0.0)
         identity = xp.eye(2, dtype=mean.dtype, device=mean.device)[:, :, None, None]
         S = covariance[:2, :2] + identity * measurement.variance[:, None]
         log_likelihood, squared = log_density(innovation, S)
@@ -385,10 +442,10 @@ class FilterBank(_RadarBank):
             imm.log_probabilities(prediction.probabilities),
             innovation,
             S,
-            log_likelihood,
-            self.averaged(bank.average_innovation, normalised),
+            self.seen(measurement, log_likelihood, 0.0),
+            self.averaged(measurement, bank.average_innovation, normalised),
             log_squared,
-            self.averaged(bank.average_log_squared, log_squared),
+            self.averaged(measurement, bank.average_log_squared, log_squared),
             bank.alpha,
         )
 
@@ -402,17 +459,24 @@ class FilterBank(_RadarBank):
             self.parameters.evidence_scale,
             self.xp,
         )
-        return self._updated(state, measurement, self.gain_alpha, self.gain_beta)._replace(
-            probabilities=probabilities
-        )
+        after = self._updated(state, measurement, self.gain_alpha, self.gain_beta)
+        return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
     def _updated(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
         """Update every filter by its gains."""
-        updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, self.T)
+        elapsed = self.elapsed(measurement)
+        updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(
-            state.covariance, measurement.variance[:, None], alpha, beta, self.T
+            state.covariance, measurement.variance[:, None], alpha, beta, elapsed
         )
         return state._replace(mean=self.xp.concat(updated), covariance=covariance)
+
+    def _in_force(self, state: Filters, measurement: Measurement, after: Filters) -> Filters:
+        """Filters after an update, or where the scan missed the target as predicted, with the probabilities (13)."""
+        if self.regular:
+            return after
+        predicted = imm.normalised_exponential(state.log_predicted)
+        return self.seen(measurement, after, state._replace(probabilities=predicted))
 
     def mean(self, state: Filters) -> Array:
         """Combination of the filters (15), ``(4, N)``."""
@@ -423,17 +487,24 @@ class FilterBank(_RadarBank):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """NIS of the combined prediction, and the weights."""
+        """NIS of the combined prediction, log-density of the measurement as the filters predict it (NaN where there is
+        none), and the weights.
+        """
         predicted = self.xp.exp(state.log_predicted)
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
-        nis = log_density(innovation, S)[1]
-        return {"nis": nis, "nis_degrees": 2.0 + 0.0 * nis, "mode_probability": state.probabilities}
+        density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
+        return {
+            "nis": self.seen(measurement, log_density(innovation, S)[1], math.nan),
+            "nis_degrees": 2.0 * measurement.available,
+            "log_likelihood": self.seen(measurement, density, math.nan),
+            "mode_probability": state.probabilities,
+        }
 
 
 class SteeredFilterBank(FilterBank):
     """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
 
-    def __init__(self, task: Task) -> None:
+    def __init__(self, task: "ManeuveringTarget") -> None:
         super().__init__(task)
         self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 
@@ -455,6 +526,5 @@ class SteeredFilterBank(FilterBank):
         alpha = 1.0 / (1.0 + xp.exp(-moved))
         beta = alpha_beta.benedict_bordner_beta(alpha)
         probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
-        return self._updated(state, measurement, alpha, beta)._replace(
-            probabilities=probabilities, alpha=alpha
-        )
+        after = self._updated(state, measurement, alpha, beta)
+        return self._in_force(state, measurement, after._replace(probabilities=probabilities, alpha=alpha))

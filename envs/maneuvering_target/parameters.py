@@ -40,6 +40,12 @@ class ManeuveringTargetParameters(TaskParameters):
     """Nats that an evidence of one adds to a mode's log-posterior (ours)."""
     averaging_measurements: float = parameter(5.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
+    detection_probability: tuple[float, float] = parameter((1.0, 1.0), above=0.0, at_most=1.0, ascending=True)
+    """Limits of the probability that a scan sees the target; each episode draws its own (ours; the paper: always)."""
+    scan_jitter: tuple[float, float] = parameter((0.0, 0.0), at_least=0.0, below=1.0, ascending=True)
+    """Limits of the share j of the scan period by which scans come early at most; each episode draws its own. Scan k is
+    at T (k - j u), u uniform on [0, 1), drawn for every scan: later than scan k - 1, whose u differs (ours; the paper:
+    never)."""
     unmodelled_acceleration: float = parameter(0.87, at_least=0.0, at_most=100.0)
     """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
     the covariance that control ``gain`` reports (ours)."""
@@ -82,6 +88,11 @@ class ManeuveringTargetParameters(TaskParameters):
     maneuver_acceleration: tuple[float, float] = parameter((0.5, 6.0), at_least=0.0, ascending=True)
     """Limits of their acceleration, m/s^2 (ours)."""
 
+    @property
+    def regular(self) -> bool:
+        """Whether every scan sees the target and none comes early."""
+        return self.detection_probability == (1.0, 1.0) and self.scan_jitter == (0.0, 0.0)
+
     def check(self) -> None:
         """Check what concerns several fields together."""
         modes = len(self.gains)
@@ -103,6 +114,11 @@ class ManeuveringTargetParameters(TaskParameters):
                 f"track_scans must be multiples of decision_interval {self.decision_interval}, got {self.track_scans!r}"
             )
         if self.flight == "track":
+            if self.scan_jitter[1] > 0.0:
+                raise ValueError(
+                    f"a flight that is a table has no states between its scans, got scan_jitter {self.scan_jitter!r}: "
+                    "leave it at (0, 0)"
+                )
             if len(self.track) != 4:
                 raise ValueError(f"track must have the four rows x, y, vx, vy, got {len(self.track)} rows")
             for row, name in zip(self.track, ("x", "y", "vx", "vy"), strict=True):

@@ -73,6 +73,8 @@ class ManeuveringTargetPicture(Picture):
         """Positions in km, innovation, gain or weights, position error with its reported sigma."""
         task, estimator = self.task, state.bank
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
+        if not state.measurement.available[0]:
+            measured = measured + numpy.nan
         error = task.error(state)[:2, 0]
         P = task.covariance(state)[:2, :2, 0]
         values = {
@@ -105,7 +107,7 @@ class ManeuveringTargetPicture(Picture):
     def begin(self, state: Episode) -> None:
         """Fly the whole episode ahead, for limits that need not move; the truth does not depend on noise."""
         world, truth, measurement = self.task.world, state.truth, state.measurement
-        still = numpy.zeros((world.normals, truth.position.shape[-1]))
+        still = numpy.zeros((world.normals + world.row_uniforms, truth.position.shape[-1]))
         positions, velocities, sigmas = [], [], []
         for _ in range(self.task.horizon + 1):
             positions.append(truth.position[:, 0])
@@ -235,7 +237,8 @@ class ManeuveringTargetPicture(Picture):
 
     def draw(self, history: History, state: Episode) -> None:
         """Move everything to where it is now."""
-        self.arrived.set_data(*(state.measurement.position[:, :1] / 1e3))
+        seen = int(state.measurement.available[0])
+        self.arrived.set_data(*(state.measurement.position[:, :seen] / 1e3))
         pairs = {name: _pair(history, name) for name in ("true", "measured", "estimated")}
         true, measured, estimated = pairs["true"], pairs["measured"], pairs["estimated"]
         self.true.set_data(*true)

@@ -3,7 +3,8 @@
 Windows are scan numbers, first and last included. The flights of ``atc``, ``cruise`` and ``descent``
 are legs that no training episode contains: time straight or turning (s) and turn rate (deg/s, anticlockwise positive),
 flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
-learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart.
+learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart. In
+``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar is another.
 """
 
 from collections.abc import Mapping
@@ -75,6 +76,18 @@ SCENARIOS: Mapping[str, Scenario] = {
                 **_AROUND,
             },
             {"start": (1, 10), "settled": (11, 80)},
+        ),
+        Scenario(
+            "missed-detections",
+            "Flights as in random; a scan sees the target with probability 0.7 only.",
+            {"flight": "random", "detection_probability": (0.7, 0.7)},
+            {"start": (1, 10), "settled": (11, 100)},
+        ),
+        Scenario(
+            "irregular-scans",
+            "Flights as in random; scans come early by up to 0.8 of the scan period: intervals of 1.2 to 10.8 s.",
+            {"flight": "random", "scan_jitter": (0.8, 0.8)},
+            {"start": (1, 10), "settled": (11, 100)},
         ),
     )
 }

@@ -13,15 +13,16 @@ import numpy
 
 from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
+from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .parameters import ManeuveringTargetParameters
+from .recorded import COLUMNS, FARTHEST_RANGE, recorded, scanned_regularly, started
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
-FARTHEST_RANGE = 500e3
-"""Metres; a user's trajectory beyond this is taken for a mistake of units."""
 MOST_SCANS = 100_000
 """Of all flights of a set together: a week of flying at 6 s."""
 
@@ -48,7 +49,8 @@ class ManeuveringTarget(Task):
     A flat `Box` of float64; `env.unwrapped.observation_fields` lists name, unit and scale of every component.
     `gain`: innovations over their predicted sigma, log(1 + normalised innovation squared), exponential
     averages of both, the share 1 - R/S of the innovation variance that is the filter's own, the last alpha,
-    the measurement sigma, scans since the start. Bank: the same for each filter, log-likelihoods relative to
+    the measurement sigma, scans since the start, whether this scan saw the target and the time since the last one that did.
+    Bank: the same for each filter, log-likelihoods relative to
     the largest, log predicted mode probabilities, last weights, under `gains` the last gains. Large values are
     compressed by sign(x) log(1 + |x|).
 
@@ -62,6 +64,14 @@ class ManeuveringTarget(Task):
 
     The track starts at the true state plus errors of the measurement's size: sigma in position and
     sqrt(2) sigma / T in velocity, the same for all filters (24).
+
+    ## Scans that miss the target or come early
+
+    In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some do
+    not: `available` is 0 then, the measurement zero, the filters' state the predicted one and the weights the predicted
+    ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u uniform on [0, 1): the filters
+    predict over the time that has passed, and estimate and truth are those of that time. The velocity's gain is
+    beta over the time since the last measurement, for which the innovation has grown.
 
     ## Episode End
 
@@ -78,12 +88,16 @@ class ManeuveringTarget(Task):
     """
 
     id = "filtergym/ManeuveringTarget-v0"
+    # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain then.
+    interface = 2
     paper_source = (
         "P. A. Bakulev, M. I. Sychev, Nguyen Trong Luu, Tracking a manoeuvring target with an IMM algorithm "
         "over two alpha-beta filters (in Russian)"
     )
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
+    of_world_only = ("flight", "track", "track_scans")
+    recorded_columns = COLUMNS
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
@@ -120,8 +134,24 @@ class ManeuveringTarget(Task):
         """Name the hypotheses and the paper's action."""
         count = len(self.parameters.gains)
         self.flights = self.parameters.track_scans
+        self.regular = self.parameters.regular and (
+            self.recording is None or scanned_regularly(self.recording, self.parameters)
+        )
+        """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
+
+    @classmethod
+    def recorded(cls, columns: Columns) -> Recorded:
+        """Make measurements of plots."""
+        return recorded(columns)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start from the first two plots, equation (24)."""
+        return started(measurements, seconds)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -22,6 +22,8 @@ class Maneuvers(NamedTuple):
     effect: Array
     """``(6, manoeuvres, N)``: the four of a turn and the two of thrust, as the properties below name them; one
     array, because the truth picks from all of them in every scan."""
+    turn: Array = None
+    """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early: the effect is all then."""
 
     @property
     def velocity_along(self) -> Array:
@@ -71,29 +73,54 @@ class Tracks(NamedTuple):
     last: Array
 
 
+class Scans(NamedTuple):
+    """A radar that may miss the target and come early."""
+
+    detection_probability: Array
+    """``(N,)``."""
+    jitter: Array
+    """Share of the scan period by which scans come early at most, ``(N,)``."""
+    early: Array
+    """That of the current scan, ``(N,)``."""
+    unseen: Array
+    """s since the last scan that saw the target, zero if the current one does, ``(N,)``."""
+    position: Array
+    """When the current scan would have come on time, m, ``(2, N)``; likewise the velocity, m/s."""
+    velocity: Array
+
+
 class Truth(NamedTuple):
     """The aircraft."""
 
     scan: Array
     """Number of the current scan, ``(N,)``."""
     position: Array
-    """m, ``(2, N)``."""
+    """At its time, m, ``(2, N)``."""
     velocity: Array
     """m/s, ``(2, N)``."""
     maneuvers: Maneuvers | Legs | Tracks | None
     """None where the flight is a table of one."""
+    scans: Scans | None = None
+    """None where every scan sees the target and none comes early."""
 
 
 class Measurement(NamedTuple):
-    """What the radar says; every scan has a measurement."""
+    """What the radar says in a scan."""
 
     scan: Array
-    """Scans since the start of the track, ``(N,)``; one scan is ``sampling_interval`` seconds."""
+    """Scans since the start of the track, ``(N,)``."""
     position: Array
-    """x and y, m, ``(2, N)``."""
+    """x and y, m, ``(2, N)``; zero in a scan that missed the target."""
     variance: Array
-    """Variances of their errors, evaluated at the measured position, m^2, ``(2, N)``. Reading: those at the true
-    position would show it."""
+    """Variances of their errors, evaluated at the measured position, m^2, ``(2, N)``; ``range_sigma`` squared in a scan
+    that missed the target. Reading: those at the true position would show it."""
+    available: Array
+    """1 if the scan saw the target, 0 if not, ``(N,)``."""
+    interval: Array
+    """s since the scan before, ``(N,)``."""
+    elapsed: Array
+    """s since the last scan that saw the target, or the start of the track, ``(N,)``: the interval, unless that before
+    missed it."""
 
 
 class RadarWorld(World[Task, Truth, Measurement]):
@@ -106,6 +133,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         p = self.parameters
+        self.row_uniforms = 0 if p.regular else 2
+        """Of a scan that may miss the target or come early, what decides both."""
         self.bearing_sigma = math.radians(p.bearing_sigma)
         self.slots = {"maneuver": 1, "random": p.maneuver_count[1], "legs": 0, "track": 0}[p.flight]
         """Manoeuvres that a flight may have."""
@@ -142,7 +171,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
             once = ones[None]
             first, last = p.maneuver_steps
             effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
-            maneuvers = Maneuvers(first * once, last * once, effect)
+            maneuvers = Maneuvers(first * once, last * once, effect, None if p.regular else 0.0 * once)
         sigma = xp.sqrt(polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma))
         start = position + sigma * normals[:2]
         start_velocity = velocity + (math.sqrt(2.0) / p.sampling_interval) * sigma * normals[2:]
@@ -150,8 +179,22 @@ class RadarWorld(World[Task, Truth, Measurement]):
         variance = polar.cartesian_variances(start, p.range_sigma, self.bearing_sigma)
         diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
-        truth = Truth(0.0 * ones, position, velocity, maneuvers)
+        truth = Truth(0.0 * ones, position, velocity, maneuvers, self._drawn_scans(draws, position, velocity))
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
+
+    def _drawn_scans(self, draws: Draws, position: Array, velocity: Array) -> Scans | None:
+        """Draw how reliable the scans of an episode are, of a track that begins with a measurement on time."""
+        p, never = self.parameters, 0.0 * position[0]
+        if p.regular:
+            return None
+        return Scans(
+            draws.uniform("detection_probability", p.detection_probability),
+            draws.uniform("scan_jitter", p.scan_jitter),
+            never,
+            never,
+            position,
+            velocity,
+        )
 
     def _random_flight(self, draws: Draws) -> tuple[Array, Array, Maneuvers]:
         """Draw a start and manoeuvres that do not overlap, each drawn as thrust or coordinated turn."""
@@ -172,7 +215,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
         coordinated = draws.event("coordinated", 0.5, self.slots)
         if not self.slots:
             empty = 0.0 * duration
-            return position, velocity, Maneuvers(empty, empty, xp.stack([empty] * 6))
+            turn = None if p.regular else empty
+            return position, velocity, Maneuvers(empty, empty, xp.stack([empty] * 6), turn)
         free = xp.clip(p.horizon - ordered_sum(duration), 1.0, None)
         before = 0.0 * free
         columns: list[tuple[Array, ...]] = []
@@ -195,16 +239,13 @@ class RadarWorld(World[Task, Truth, Measurement]):
                 vector[0],
                 vector[1],
             ]
-            columns.append((first, first + duration[m] - 1.0, xp.stack(effect)))
+            columns.append((first, first + duration[m] - 1.0, xp.stack(effect), theta))
             total = theta * duration[m]
             cosine, sine = xp.cos(total), xp.sin(total)
             turned = xp.stack([cosine * now[0] - sine * now[1], sine * now[0] + cosine * now[1]])
             now = turned + (T * duration[m]) * vector
-        return (
-            position,
-            velocity,
-            Maneuvers(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True))),
-        )
+        maneuvers = Maneuvers(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True)))
+        return position, velocity, maneuvers._replace(turn=None) if p.regular else maneuvers
 
     def _drawn_legs(self, draws: Draws, ones: Array) -> Legs:
         """Draw start, course, side and times of a flight around the stated ones."""
@@ -242,7 +283,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         return state[:2], state[2:4]
 
     def on_legs(self, legs: Legs, scan: Array) -> tuple[Array, Array]:
-        """Position and velocity at a scan."""
+        """Position and velocity at a scan, or between two: any number."""
         xp, now = self.xp, self.parameters.sampling_interval * scan
         time, turn, position, velocity = (part[0] for part in legs)
         for i in range(1, int(legs.time.shape[0])):
@@ -257,8 +298,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
         row = self.xp.astype(column, self.xp.int64)
         return self.table[:2, row], self.table[2:, row]
 
-    def _flown(self, truth: Truth, scan: Array) -> tuple[Array, Array]:
-        """Position and velocity at the next scan."""
+    def _flown(self, truth: Truth, position: Array, velocity: Array, scan: Array) -> tuple[Array, Array]:
+        """Position and velocity at the next scan, on time, from those at the one before."""
         xp, T, m = self.xp, self.parameters.sampling_interval, truth.maneuvers
         if isinstance(m, Legs):
             return self.on_legs(m, scan)
@@ -266,54 +307,105 @@ class RadarWorld(World[Task, Truth, Measurement]):
             return self._states(xp.clip(scan, None, float(self.table.shape[1]) - 1.0))
         if isinstance(m, Tracks):
             return self._states(xp.minimum(m.first + scan, m.last))
-        position, velocity = truth.position + T * truth.velocity, truth.velocity
+        before, position = velocity, position + T * velocity
         if not self.slots:
             return position, velocity
-        active = xp.astype((scan >= m.first) & (scan <= m.last), position.dtype)
-        # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
-        effects = active * m.effect
-        effect = ordered_sum(effects[:, slot] for slot in range(self.slots))
+        effect = self._picked(m, m.effect, scan)
         acceleration = effect[4:]
         position = position + (0.5 * T**2) * acceleration
         velocity = velocity + T * acceleration
         if self.parameters.flight == "random":
-            across = xp.stack([-truth.velocity[1], truth.velocity[0]])
-            position = position + (effect[2] * truth.velocity + effect[3] * across)
-            velocity = velocity + (effect[0] * truth.velocity + effect[1] * across)
+            across = xp.stack([-before[1], before[0]])
+            position = position + (effect[2] * before + effect[3] * across)
+            velocity = velocity + (effect[0] * before + effect[1] * across)
         return position, velocity
+
+    def _picked(self, m: Maneuvers, values: Array, scan: Array) -> Array:
+        """Values ``(..., manoeuvres, N)`` of the manoeuvre that is flown in the scan period that ends with a scan."""
+        active = self.xp.astype((scan >= m.first) & (scan <= m.last), values.dtype)
+        # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
+        values = active * values
+        return ordered_sum(values[..., slot, :] for slot in range(self.slots))
+
+    def _between(
+        self, truth: Truth, scans: Scans, scan: Array, early: Array, on_time: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Position and velocity at a scan that comes early by a share of the scan period.
+
+        Thrust is constant within a period, and so is the turn rate.
+        """
+        T, m = self.parameters.sampling_interval, truth.maneuvers
+        if isinstance(m, Legs):
+            return self.on_legs(m, scan - early)
+        if not isinstance(m, Maneuvers):  # a table: its scans come on time
+            return on_time
+        time = T * (1.0 - early)
+        if not self.slots:
+            return scans.position + time * scans.velocity, scans.velocity
+        turn, acceleration = self._picked(m, m.turn, scan) / T, self._picked(m, m.acceleration, scan)
+        position, velocity = self._after(time, turn, scans.position, scans.velocity)
+        return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
         """Fly one scan and measure."""
-        xp, p = self.xp, self.parameters
-        scan = truth.scan + 1.0
-        position, velocity = self._flown(truth, scan)
+        xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
+        scan, scans = truth.scan + 1.0, truth.scans
+        always = xp.ones_like(scan)
+        available, interval, elapsed = always, T * always, T * always
+        if scans is None:
+            position, velocity = self._flown(truth, truth.position, truth.velocity, scan)
+        else:
+            on_time = self._flown(truth, scans.position, scans.velocity, scan)
+            early = scans.jitter * noise[3]
+            position, velocity = self._between(truth, scans, scan, early, on_time)
+            available = xp.astype(noise[2] < scans.detection_probability, scan.dtype)
+            interval = T * (1.0 + (scans.early - early))
+            elapsed = scans.unseen + interval
+            scans = scans._replace(
+                early=early, unseen=(1.0 - available) * elapsed, position=on_time[0], velocity=on_time[1]
+            )
         if p.polar_measurements:
             radius = xp.sqrt(position[0] ** 2 + position[1] ** 2) + p.range_sigma * noise[0]
             azimuth = xp.atan2(position[1], position[0]) + self.bearing_sigma * noise[1]
             measured = radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
         else:
             true_variance = polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma)
-            measured = position + xp.sqrt(true_variance) * noise
+            measured = position + xp.sqrt(true_variance) * noise[:2]
         variance = polar.cartesian_variances(measured, p.range_sigma, self.bearing_sigma)
-        return Truth(scan, position, velocity, truth.maneuvers), Measurement(scan, measured, variance)
+        if scans is not None:
+            seen = available > 0.0
+            measured, variance = xp.where(seen, measured, 0.0), xp.where(seen, variance, p.range_sigma**2)
+        return (
+            Truth(scan, position, velocity, truth.maneuvers, scans),
+            Measurement(scan, measured, variance, available, interval, elapsed),
+        )
 
     def state(self, truth: Truth) -> Array:
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
-    def cost(self, truth: Truth, mean: Array) -> Array:
+    def error_cost(self, error: Array) -> Array:
         """Squared position error over the squared range sigma."""
-        scaled = (mean[:2] - truth.position) * (1.0 / self.parameters.range_sigma)
+        scaled = error[:2] * (1.0 / self.parameters.range_sigma)
         return scaled[0] * scaled[0] + scaled[1] * scaled[1]
 
     def context(self, truth: Truth) -> dict[str, Array]:
         """Manoeuvres: first and last scan, thrust (m/s^2) and turn in a scan (rad) of each, or where legs begin (s) and
-        their turn rates (rad/s); whether one is flown now. Of flights that are a table the number; empty where there is
-        one.
+        their turn rates (rad/s); whether one is flown now. Of flights that are a table the number; nothing of one.
+        Where scans may miss the target or come early, the probability that they see it, and the share of the scan
+        period by which they come early at most.
         """
+        if truth.scans is None:
+            return self._flight_context(truth, truth.scan)
+        flight = self._flight_context(truth, truth.scan - truth.scans.early)
+        reliability = truth.scans.detection_probability, truth.scans.jitter
+        return {**flight, "detection_probability": reliability[0], "scan_jitter": reliability[1]}
+
+    def _flight_context(self, truth: Truth, time: Array) -> dict[str, Array]:
+        """What the context tells of the flight at a time, scans."""
         xp, m = self.xp, truth.maneuvers
         if isinstance(m, Legs):
-            now = self.parameters.sampling_interval * truth.scan
+            now = self.parameters.sampling_interval * time
             turn = m.turn[0]
             for i in range(1, int(m.time.shape[0])):
                 turn = xp.where(now >= m.time[i], m.turn[i], turn)

@@ -60,6 +60,8 @@ class Filters(NamedTuple):
     believed: Array
     """Probabilities of the classes that the next scan starts from, ``(M, N)``: Bayes' own under ``evidence``, otherwise
     the weights in force."""
+    expected: Array
+    """Those that this scan has started from, ``(M, N)``."""
 
 
 class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
@@ -186,6 +188,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             refused_counts=refused_counts,
             probabilities=probabilities,
             believed=probabilities,
+            expected=probabilities,
         )
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
@@ -224,6 +227,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             used_counts,
             refused_counts,
             f.probabilities,
+            f.believed,
             f.believed,
         )
 
@@ -265,14 +269,20 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         return imm.combine(state.mean, state.covariance, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Weights and NIS.
+        """Weights, NIS, and the log-density of the radar measurement as the filters predict it.
 
         The NIS of the bank is the mean over the classes by their probability given the radar; where these are
         calibrated its expectation is 2, that of the true class's filter.
         """
         squared = ordered_sum(state.innovation * state.innovation)
         nis = weighted_sum(imm.normalised_exponential(state.log_predicted), squared)
-        return {"mode_probability": state.probabilities, "nis": nis, "nis_degrees": 2.0 + 0.0 * nis}
+        expected = imm.log_probabilities(state.expected)
+        return {
+            "mode_probability": state.probabilities,
+            "nis": nis,
+            "nis_degrees": 2.0 + 0.0 * nis,
+            "log_likelihood": imm.log_mixture_density(expected, state.log_likelihood),
+        }
 
 
 def one_hot(index: Array, count: int, xp: ModuleType) -> Array:

@@ -5,6 +5,7 @@ support measures (ESM) station with recognition of the target's class (in Russia
 theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/singer.py``.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy
@@ -12,9 +13,12 @@ import numpy
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..observation import Array
+from ..recorded_tables import Columns, Recorded
+from ..recording import Started
 from ..task import Component, Episode, PaperPolicy, Task
 from .banks import ClassBank, one_hot
 from .parameters import RadarEsmTrackingParameters
+from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
 
@@ -106,6 +110,7 @@ class RadarEsmTracking(Task):
     )
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
+    recorded_columns = COLUMNS
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",
@@ -158,6 +163,18 @@ class RadarEsmTracking(Task):
         starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
         return models, numpy.stack(starts, axis=-1)
 
+    @classmethod
+    def recorded(cls, columns: Columns) -> Recorded:
+        """Make measurements of ranges, their rates, bearings and decisions."""
+        return recorded(columns, cls.Parameters)
+
+    @classmethod
+    def recorded_start(
+        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+    ) -> Started:
+        """Start on the first measurement, which is that of scan 0."""
+        return started(measurements, parameters)
+
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
@@ -169,7 +186,7 @@ class RadarEsmTracking(Task):
         kept, covariance = super().records(episode), self.covariance(episode)
         for i, component in enumerate(self.components):
             kept[f"variance_{component.name}"] = covariance[i, i]
-        if "mode_probability" in kept:
+        if "mode_probability" in kept and self.recording is None:
             is_true = one_hot(episode.truth.target_class, self.classes, self.xp)
             kept["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
         return kept

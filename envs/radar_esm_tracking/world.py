@@ -247,9 +247,9 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
-    def cost(self, truth: Truth, mean: Array) -> Array:
+    def error_cost(self, error: Array) -> Array:
         """Mean of the three squared errors over their scales."""
-        scaled = (mean - truth.motion) * self.cost_factors
+        scaled = error * self.cost_factors
         return ordered_sum(scaled * scaled) * (1.0 / 3.0)
 
     def records(self, truth: Truth) -> dict[str, Array]:

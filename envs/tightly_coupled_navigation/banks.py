@@ -53,6 +53,8 @@ class Filters(NamedTuple):
     """``(M, N)``."""
     nis: Array
     """Normalised innovation squared by group of sensors, each given those before it, ``(4, M, N)``."""
+    log_density: Array
+    """Of the measurement as the filters predict it with the nominal noise, ``(N,)``."""
     average_nis: Array
     """Short average of the same per reading, ``(4, M, N)``."""
     range_innovation: Array
@@ -177,6 +179,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             covariances=covariances,
             log_likelihood=nis[0],
             nis=nis,
+            log_density=zeros,
             average_nis=nis + 1.0,
             range_innovation=xp.stack([zeros] * task.tracked.stop),
             probabilities=probabilities,
@@ -211,6 +214,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             covariances=update.covariance,
             log_likelihood=update.log_likelihood,
             nis=nis,
+            log_density=imm.log_mixture_density(state.predicted.log_probabilities, update.log_likelihood),
             average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
             range_innovation=innovation,
         )
@@ -285,13 +289,16 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         return state.covariance
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
-        """Probabilities, NIS of the combination and its degrees, whether a rate is beyond its aperture."""
+        """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
+        rate is beyond its aperture.
+        """
         xp, rates = self.xp, self.task.sensors[1]
         beyond = xp.abs(state.range_innovation[rates.readings]) > self.parameters.rate_aperture
         return {
             "mode_probability": state.probabilities,
             "nis": weighted_sum(state.probabilities, ordered_sum(state.nis)),
             "nis_degrees": ordered_sum(measurement.available),
+            "log_likelihood": state.log_density,
             "rate_outside_aperture": xp.astype(xp.any(beyond, axis=0), state.mean.dtype),
         }
 

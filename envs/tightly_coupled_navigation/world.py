@@ -452,10 +452,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """``(17, N)``, in the order of filters.gnss_ins."""
         return truth.state
 
-    def cost(self, truth: Truth, mean: Array) -> Array:
+    def error_cost(self, error: Array) -> Array:
         """Squared position and velocity errors over those of a single-epoch fix."""
-        p, e = self.parameters, mean - truth.state
-        x, v = e[gnss_ins.POSITION], e[gnss_ins.VELOCITY]
+        p, x, v = self.parameters, error[gnss_ins.POSITION], error[gnss_ins.VELOCITY]
         return ordered_sum(x * x) / p.position_unit**2 + ordered_sum(v * v) / p.velocity_unit**2
 
     def records(self, truth: Truth) -> dict[str, Array]:

@@ -6,16 +6,21 @@ from typing import Annotated, Any
 import typer
 
 from ..baselines.catalogue import baselines_of
-from ..envs.catalogue import catalogue, check_names, make_task, short_name, task_class
+from ..envs.catalogue import catalogue, check_names, make_task, read_recording, short_name, task_class
 from ..envs.flights import names_flights, read_flights
+from ..envs.recording import Recording
+from ..envs.recording_files import is_recording
+from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import evaluation_figures, save
-from ..evaluation.files import whole_files, writable_file, writable_folder
+from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
 from ..evaluation.metrics import Record, flight_records
+from ..evaluation.recording import record
 from ..names import competitor, evaluate, tidy_records
 from ..reports.benchmark import Cell, run_benchmark
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
-from ..reports.tables import flights_table, results_table
+from ..reports.tables import flights_table, recorded_table, results_table
 from .terminal import (
     Backend,
     Environment,
@@ -30,6 +35,9 @@ from .terminal import (
     parsed_settings,
     progress_bar,
 )
+
+MOST_RECORDINGS = 40
+"""Of which a table tells one by one."""
 
 
 def list_environments(
@@ -50,7 +58,13 @@ def list_environments(
 
 
 def evaluate_policies(
-    environment: Environment,
+    environment: Annotated[
+        str | None,
+        typer.Argument(
+            help="Environment id; `filtergym list` shows them. module:id for one that a module registers. A recording "
+            "names its own."
+        ),
+    ] = None,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -68,6 +82,17 @@ def evaluate_policies(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
     json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+    recording: Annotated[
+        str | None,
+        typer.Option(
+            help="In place of a scenario: what sensors really said, NetCDF or tables (CSV): a file, a folder, or a "
+            "pattern in quotes."
+        ),
+    ] = None,
+    estimates: Annotated[
+        Path | None,
+        typer.Option(help="File (CSV or NetCDF) for every estimate with its sigma, NIS and log-likelihood."),
+    ] = None,
     trust: Trust = False,
     backend: Backend = "auto",
     threads: Threads = 1,
@@ -95,9 +120,18 @@ def evaluate_policies(
 
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
-    cls = task_class(environment)
+    keywords = parsed_settings(settings or [])
+    if recording is not None and scenario is not None:
+        raise ValueError("--recording takes the place of --scenario: leave one of them out")
+    named = task_class(environment).scenarios if environment else {}
     flown: Any = scenario
-    if scenario not in cls.scenarios and names_flights(scenario):
+    if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
+        flown = read_recording(recording or scenario, environment, **keywords)
+        environment = flown.environment
+    if environment is None:
+        raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
+    cls = task_class(environment)
+    if not isinstance(flown, Recording) and scenario not in named and names_flights(scenario):
         flown = read_flights(
             scenario,
             None if site is None else pair("--site", site),
@@ -107,14 +141,20 @@ def evaluate_policies(
             smoothing=smoothing,
         )
     elif site is not None:
-        raise ValueError(f"--site is for flights from files, and scenario {scenario!r} is none")
+        raise ValueError(f"--site is for flights from files, and {scenario or recording!r} is none")
     known = baselines_of(cls.id)
     if out is not None:
         writable_folder(out)
     if json is not None:
         writable_file(json)
+    if estimates is not None:
+        check_estimates(estimates)
+        writable_file(estimates)
     names = policy or list(known.benchmark or known.names)
-    keywords = parsed_settings(settings or [])
+    if isinstance(flown, Recording):
+        episodes = len(flown.names)
+        if not policy:  # references and bounds are told what a recording does not hold
+            names = [name for name in names if kind_of(competitor(cls.id, name)) in RANKED]
     check_names(cls, keywords)
     measurements = len(set(names)) * episodes * make_task(cls.id, control, flown, **keywords).horizon
     with progress_bar() as bar:
@@ -129,26 +169,76 @@ def evaluate_policies(
             control,
             progress=lambda done: bar.update(line, advance=done),
             trust=trust,
+            tracks=estimates is not None,
             backend=backend,
             threads=threads,
             **keywords,
         )
+    if estimates is not None:
+        write_estimates(estimates, dataset)
+    judged = dataset.attrs["truth"]
     records = tidy_records(dataset)
-    of_flights = flight_records(dataset) if "flight" in dataset.coords else []
+    each = "flight" in dataset.coords and judged
+    if each and dataset.attrs["recorded"]:
+        each = dataset.sizes["episode"] <= MOST_RECORDINGS
+    of_flights = flight_records(dataset) if each else []
     if json is not None:
         write_records(json, [*records, *of_flights])
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
-            for name, figure in evaluation_figures(dataset):
+            for name, figure in evaluation_figures(dataset) if judged else ():
                 save(figure, waiting / f"{name}.png")
     if of_flights:
         console.print(flights_table(dataset, of_flights, records))
-    console.print(results_table(records))
+    console.print(results_table(records) if judged else recorded_table(records))
     for note in dataset.attrs["notes"]:
         console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
-        console.print(f"figures and records in {out}")
+        console.print(f"figures and records in {out}" if judged else f"records in {out}")
+    if estimates is not None:
+        console.print(f"estimates in {estimates}", soft_wrap=True)
+
+
+def record_scenario(
+    environment: Environment,
+    out: Annotated[Path, typer.Option(help="NetCDF file for the recording.")],
+    scenario: ScenarioName = None,
+    episodes: Annotated[int, typer.Option(help="Episodes to record.")] = 10,
+    seed: Experiment = 0,
+    split: Split = "test",
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+    ] = None,
+    backend: Backend = "auto",
+) -> None:
+    """Record what the sensors say in episodes of the simulation, with the truth.
+
+    Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
+    """
+    cls = task_class(environment)
+    keywords = parsed_settings(settings or [])
+    check_names(cls, keywords)
+    if out.suffix != ".nc":
+        raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
+    writable_file(out)
+    with progress_bar() as bar:
+        line = bar.add_task(
+            "recording", total=episodes * make_task(cls.id, None, scenario, **keywords).horizon
+        )
+        recording = record(
+            cls.id,
+            scenario,
+            episodes,
+            seed,
+            split,
+            progress=lambda done: bar.update(line, advance=done),
+            backend=backend,
+            **keywords,
+        )
+    with whole_file(out) as waiting:
+        recording.write(waiting)
+    console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
 
 
 def benchmark(

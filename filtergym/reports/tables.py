@@ -140,6 +140,46 @@ def results_table(records: Sequence[Any]) -> Table:
     return table
 
 
+def recorded_table(records: Sequence[Any]) -> Table:
+    """Compare competitors on measurements whose truth nobody knows: what they expected of each.
+
+    Args:
+        records: tidy records of one recording.
+    """
+    first = records[0]
+    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
+    table = Table(
+        title=f"{first.environment}, recording {first.scenario} ({first.episodes} "
+        f"episode{'s' if first.episodes > 1 else ''}; 95 % intervals)",
+        title_justify="left",
+    )
+    table.add_column("policy", no_wrap=True)
+    table.add_column("control")
+    for title in ("log-likelihood per measurement", "mean NIS", "95 % band", "inside 95 %, %"):
+        table.add_column(title, justify="right")
+
+    def place(entry: tuple[str, str, str]) -> float:
+        record = found.get((entry[0], "log_likelihood"))
+        return math.inf if record is None or record.value is None else -record.value
+
+    for name, kind, control in sorted(
+        dict.fromkeys((r.policy, r.kind, r.control) for r in records), key=place
+    ):
+        band, inside = found.get((name, "anis_band")), found.get((name, "nis_inside"))
+        row = [name, control if kind == "policy" else f"({kind})"]
+        row += [with_interval(found.get((name, metric))) for metric in ("log_likelihood", "anis")]
+        row.append("-" if band is None or band.low is None else f"{band.low:.3g} to {band.high:.3g}")
+        row.append(with_interval(inside, 100.0))
+        table.add_row(*row)
+    table.caption = (
+        "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
+        "predicted, nats; the higher the better.\nmean NIS: normalised innovation squared over its dimension; in the "
+        "band if the innovations are as large as predicted; - : it reports none."
+    )
+    table.caption_justify = "left"
+    return table
+
+
 SHOWN_OF_FLIGHTS = 8
 """Competitors in a table flight by flight: what fits beside each other."""
 
@@ -160,8 +200,9 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
     units = {r.component: r.unit for r in over_all if r.metric == "rmse"}
     flights, lengths = dataset["flight"].values, dataset["length"].values
     several = len(set(flights.tolist())) > 1
-    table = Table(title=f"{len(set(flights.tolist()))} flight{'s' * several}", title_justify="left")
-    table.add_column("flight", no_wrap=True)
+    what = "recording" if dataset.attrs["recorded"] else "flight"
+    table = Table(title=f"{len(set(flights.tolist()))} {what}{'s' * several}", title_justify="left")
+    table.add_column(what, no_wrap=True)
     table.add_column("episodes", justify="right")
     table.add_column("measurements", justify="right")
     for component in shown:
@@ -173,14 +214,14 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
         flight = scenario.removeprefix(f"{dataset.attrs['scenario']}: ")
         mine = flights == flight
         row = [flight, f"{mine.sum()}", f"{lengths[mine].sum():,}"]
-        for name, what, component in [
+        for name, number, component in [
             *((base, "rmse", c) for c in shown),
             *((o, metric, "") for o in others),
         ]:
-            record = found.get((scenario, name, what, component))
+            record = found.get((scenario, name, number, component))
             if record is None or record.value is None:
                 row.append("-")
-            elif what == "relative_cost_difference":
+            elif number == "relative_cost_difference":
                 row.append(f"{100.0 * record.value:+.1f}")
             else:
                 row.append(f"{record.value:.3g}")
@@ -189,9 +230,9 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
     if len(others) == SHOWN_OF_FLIGHTS:
         notes.append(f"The {SHOWN_OF_FLIGHTS} best are shown; all stand in the records.")
     notes.append(
-        "Intervals of the table over all flights resample whole flights; of fewer than ten they are too narrow."
+        f"Intervals of the table over all {what}s resample whole {what}s; of fewer than ten they are too narrow."
         if several
-        else "Intervals below are over the episodes of this one flight."
+        else f"Intervals below are over the episodes of this one {what}."
     )
     table.caption = " ".join(notes)
     table.caption_justify = "left"

@@ -1,0 +1,71 @@
+"""Positions by an INS and by a receiver as measurements of LooselyCoupledNavigation.
+
+The first row is the start of the track: there the position of the INS is taken for the true one, as the environment has
+it. Every further row is a measurement.
+"""
+
+from collections.abc import Mapping
+
+import numpy
+
+from ..recorded_tables import Columns, Recorded
+from ..recording import Started
+from .parameters import AXES, LooselyCoupledNavigationParameters
+
+COLUMNS = {
+    "ins": "m, position by the INS alone; with several axes ins_x, ins_y, ins_z",
+    "fix": "m, position by the receiver, empty where there is none; with several axes fix_x, fix_y, fix_z",
+    "sigma": "m, standard deviation of each axis of the fix, as reported; optional, default: the parameters'",
+    **{f"{kind}_{axis}": "likewise" for kind in ("ins", "fix") for axis in AXES},
+}
+
+
+def started(measurements: Mapping[str, numpy.ndarray]) -> Started:
+    """Start every episode where its INS was before the first increment."""
+    mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
+    covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
+    return Started(measurements, {"mean": mean, "covariance": covariance}, 0)
+
+
+def recorded(columns: Columns) -> Recorded:
+    """Make measurements of one track.
+
+    Raises:
+        ValueError: for what lacks or cannot be.
+    """
+    ends = [f"_{axis}" for axis in AXES if columns.has(f"ins_{axis}") or columns.has(f"fix_{axis}")]
+    if columns.has("ins") or not ends:
+        ends = [""]
+    for name in (f"{kind}{end}" for kind in ("ins", "fix") for end in ends):
+        if not columns.has(name):
+            raise ValueError(f"it lacks the column {name}; it needs ins and fix, or ins_x, fix_x and so on")
+    if ends != [""] and ends != [f"_{axis}" for axis in AXES[: len(ends)]]:
+        raise ValueError(f"axes must be {', '.join(AXES[: len(ends)])}, got {', '.join(e[1:] for e in ends)}")
+    ins = columns.whole(*(f"ins{end}" for end in ends))
+    interval = columns.regular("the filters of this environment count measurements, not seconds")
+    parameters = {"axes": len(ends), "sampling_interval": interval}
+    fix = numpy.stack([columns[f"fix{end}"] for end in ends], axis=1)
+    # A fix of some axes is none: the receiver's measurement is one.
+    available = numpy.isfinite(fix).all(axis=1)
+    if not available[1:].any():
+        raise ValueError("no row has a fix on every axis")
+    given = {name: value for name, value in columns.given.items() if name not in ("axes", "horizon")}
+    nominal = LooselyCoupledNavigationParameters(**{**parameters, **given}).receiver_variance ** 0.5
+    sigma = columns.sigmas("sigma")[:, 0] if columns.has("sigma") else numpy.full(len(ins), nominal)
+    count = len(ins) - 1
+    measurements = {
+        "number": numpy.arange(1.0, count + 1.0),
+        "ins": ins[1:],
+        "increment": numpy.diff(ins, axis=0),
+        "fix": numpy.where(available[:, None], fix, 0.0)[1:],
+        "available": available[1:].astype(float),
+        "reported_deviation": sigma[1:],
+    }
+    return Recorded(
+        measurements,
+        {"mean": ins[0], "covariance": numpy.zeros((len(ends), len(ends)))},
+        numpy.arange(1, count + 1),
+        {n: v for n, v in parameters.items() if n not in columns.given},
+        float(columns.time[0]),
+        columns.time[1:],
+    )

@@ -1,0 +1,206 @@
+"""Radar plots of a user's own as measurements of ManeuveringTarget.
+
+x is east and y is north of the radar; an azimuth is counted clockwise from north. The track starts from the first two
+plots, equation (24): the position of the second, and the difference of both over the time between them, with the
+covariance that belongs to it.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy
+
+from ...filters import polar
+from ..recorded_tables import Columns, Recorded
+from ..recording import Recording, Started
+from .parameters import ManeuveringTargetParameters
+
+COLUMNS = {
+    "x": "m, east of the radar",
+    "y": "m, north of it",
+    "range": "m, in place of x and y",
+    "azimuth": "degrees clockwise from north, likewise",
+    "sigma_x": "m, standard deviation of x; optional",
+    "sigma_y": "m, likewise",
+    "range_sigma": "m, standard deviation of the range; optional, default: the parameter",
+    "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
+}
+PAIRS = (("x", "y"), ("range", "azimuth"), ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma"))
+FARTHEST_RANGE = 500e3
+"""m; what lies beyond this is taken for a mistake of units."""
+LARGEST_GAP = 1000
+"""Scans that may be missing between two rows; more is a mistake of units."""
+
+
+def recorded(columns: Columns) -> Recorded:
+    """Make measurements of the plots of one track.
+
+    Raises:
+        ValueError: for what lacks or cannot be. Scans without a plot are missing measurements.
+    """
+    for pair in PAIRS:
+        if sum(columns.has(name) for name in pair) == 1:
+            lacking = next(name for name in pair if not columns.has(name))
+            raise ValueError(f"it lacks the column {lacking}, which belongs to {' and '.join(pair)}")
+    position = _positions(columns)
+    there = numpy.isfinite(position).all(axis=1)
+    if numpy.isfinite(position[~there]).any():
+        row = int(numpy.flatnonzero(numpy.isfinite(position).any(axis=1) & ~there)[0])
+        raise ValueError(f"row {row} has one coordinate of two")
+    variance = _variances(columns, position, there)
+    farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
+    if farthest > FARTHEST_RANGE:
+        raise ValueError(
+            f"a plot lies {farthest / 1e3:,.0f} km from the radar, whose range ends at {FARTHEST_RANGE / 1e3:,.0f} km "
+            "(positions are metres)"
+        )
+    plots = numpy.flatnonzero(there)
+    if len(plots) < 3:
+        raise ValueError(
+            f"it has {len(plots)} plot{'s' * (len(plots) != 1)}: the track starts from the first two, and goes on"
+        )
+    first = plots[1]
+    initial = two_plot_start(position[plots[:2]], variance[plots[:2]], numpy.diff(columns.time[plots[:2]]))
+    parameters: dict[str, Any] = {}
+    interval = columns.interval()
+    rows, time = _scans(columns, int(first), interval)
+    if "sampling_interval" not in columns.given:
+        parameters["sampling_interval"] = interval
+    seen = (rows >= 0) & there[rows]
+    nominal = columns.given.get("range_sigma", ManeuveringTargetParameters.range_sigma) ** 2
+    said = {
+        "scan": numpy.arange(1.0, len(rows) + 1.0),
+        "position": numpy.where(seen[:, None], position[rows], 0.0),
+        "variance": numpy.where(seen[:, None], variance[rows], nominal),
+        "available": seen.astype(float),
+        **_clocks(numpy.append(columns.time[first], time), seen),
+    }
+    return Recorded(
+        said,
+        initial,
+        rows,
+        parameters,
+        float(columns.time[first]),
+        time,
+    )
+
+
+def scanned_regularly(recording: Recording, p: ManeuveringTargetParameters) -> bool:
+    """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    there = numpy.isfinite(recording.seconds)
+    said = recording.measurements
+    return all(
+        bool((said[name][there] == value).all())
+        for name, value in (
+            ("available", 1.0),
+            ("interval", p.sampling_interval),
+            ("elapsed", p.sampling_interval),
+        )
+    )
+
+
+def two_plot_start(
+    position: numpy.ndarray, variance: numpy.ndarray, lasted: numpy.ndarray
+) -> dict[str, numpy.ndarray]:
+    """Start of a track from two plots: the second, and their difference over the time between them.
+
+    Args:
+        position: of the two, ``(..., 2, 2)``, m.
+        variance: of their errors, likewise, m^2.
+        lasted: s, ``(..., 1)``.
+    """
+    before, first = position[..., 0, :], position[..., 1, :]
+    covariance = numpy.zeros((*first.shape[:-1], 4, 4))
+    shared = variance[..., 1, :] / lasted
+    for axis in range(2):
+        covariance[..., axis, axis] = variance[..., 1, axis]
+        covariance[..., axis, axis + 2] = covariance[..., axis + 2, axis] = shared[..., axis]
+        covariance[..., axis + 2, axis + 2] = variance[..., axis].sum(axis=-1) / lasted[..., 0] ** 2
+    mean = numpy.concatenate([first, (first - before) / lasted], axis=-1)
+    return {"mean": mean, "covariance": covariance}
+
+
+def started(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray) -> Started:
+    """Start every episode from its first two plots.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if seconds.shape[1] < 3 or not numpy.isfinite(seconds[:, :3]).all():
+        raise ValueError("an episode without initial_mean starts from its first two plots, and needs a third")
+    if not (measurements["available"][:, :2] > 0.0).all():
+        raise ValueError(
+            "an episode without initial_mean starts from its first two scans, and one has no plot"
+        )
+    initial = two_plot_start(
+        measurements["position"][:, :2], measurements["variance"][:, :2], numpy.diff(seconds[:, :2])
+    )
+    later = {name: values[:, 2:] for name, values in measurements.items()}
+    later["scan"] = later["scan"] - measurements["scan"][:, 1:2]
+    return Started(later, initial, 2)
+
+
+def _positions(columns: Columns) -> numpy.ndarray:
+    """X and y, ``(rows, 2)``, m; NaN where there is no plot."""
+    if columns.has("x", "y"):
+        return numpy.stack([columns["x"], columns["y"]], axis=1)
+    if not columns.has("range", "azimuth"):
+        raise ValueError("it needs x and y (m), or range (m) and azimuth (degrees clockwise from north)")
+    distance, azimuth = columns["range"], numpy.radians(columns["azimuth"])
+    if (distance < 0.0).any():
+        row = int(numpy.argmax(distance < 0.0))
+        raise ValueError(f"range is a distance, and row {row} has {distance[row]:g} m")
+    if (numpy.abs(columns["azimuth"]) > 360.0).any():
+        worst = float(numpy.nanmax(numpy.abs(columns["azimuth"])))
+        raise ValueError(f"azimuth reaches {worst:g}, and degrees from -360 to 360 are expected")
+    return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
+
+
+def _variances(columns: Columns, position: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
+    """Variances of x and y, ``(rows, 2)``, m^2; NaN where there is no plot."""
+    variance = numpy.full(position.shape, numpy.nan)
+    if columns.has("sigma_x", "sigma_y"):
+        variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
+        return variance
+    if columns.has("range_sigma", "azimuth_sigma"):
+        sigmas = columns.only(there).sigmas("range_sigma", "azimuth_sigma").T
+    else:
+        names = ("range_sigma", "bearing_sigma")
+        sigmas = numpy.array(
+            [float(columns.given.get(name, getattr(ManeuveringTargetParameters, name))) for name in names]
+        )
+    variance[there] = polar.cartesian_variances(position[there].T, sigmas[0], numpy.radians(sigmas[1])).T
+    return variance
+
+
+def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
+    rows: list[int] = []
+    times: list[float] = []
+    for row in range(first + 1, len(columns.time)):
+        last, now = float(columns.time[row - 1]), float(columns.time[row])
+        missed = round((now - last) / interval) - 1
+        if missed > LARGEST_GAP:
+            raise ValueError(
+                f"{now - last:g} s lie between rows {row - 1} and {row}, {missed:,} scans of {interval:g} s: cut it"
+            )
+        for i in range(1, missed + 1):
+            rows.append(-1)
+            times.append(last + (now - last) * i / (missed + 1))
+        rows.append(row)
+        times.append(now)
+    return numpy.array(rows), numpy.array(times)
+
+
+def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
+    """Seconds since the scan before, and since the last one that had a plot.
+
+    Args:
+        time: of the start, and of the scans, ``(1 + T,)``.
+        seen: whether a scan has a plot, ``(T,)``.
+    """
+    elapsed, last = [], time[0]
+    for now, has in zip(time[1:], seen, strict=True):
+        elapsed.append(now - last)
+        last = now if has else last
+    return {"interval": numpy.diff(time), "elapsed": numpy.array(elapsed)}

@@ -1,0 +1,114 @@
+"""Ranges, range rates, bearings and type decisions as measurements of RadarEsmTracking.
+
+The first row is scan 0, which starts the track. A decision is the number of an emitter type, empty where the ESM heard
+nothing; beside one stand both bearings, or their difference.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy
+
+from ...filters.class_fusion import bearing_difference
+from ..recorded_tables import Columns, Recorded
+from ..recording import Started
+
+COLUMNS = {
+    "range": "m",
+    "range_rate": "m/s, below zero where the target comes nearer",
+    "decision": "emitter type that the ESM decides for, counted from 0; empty where it heard nothing; optional",
+    "radar_bearing": "degrees, of the radar; with every decision",
+    "esm_bearing": "degrees, of the ESM, counted as the radar's; with every decision",
+    "bearing_difference": "degrees, radar minus ESM; in place of both bearings",
+    "looked": "1 where the ESM listened, else 0; optional, default: every esm_period scans, and wherever it decided",
+}
+
+
+def recorded(columns: Columns, parameters_of: Any) -> Recorded:
+    """Make measurements of one track.
+
+    Args:
+        columns: of the track.
+        parameters_of: makes the parameters of keywords.
+
+    Raises:
+        ValueError: for what lacks or cannot be.
+    """
+    for name in ("range", "range_rate"):
+        if not columns.has(name):
+            raise ValueError(f"it lacks the column {name}")
+    radar = columns.whole("range", "range_rate")
+    interval = columns.regular("the filters of this environment are tabulated by scans")
+    named = {n: v for n, v in columns.given.items() if n not in ("horizon", "decision_interval")}
+    p = parameters_of(**{"sampling_interval": interval, **named})
+    types, scans = len(p.recognition), numpy.arange(len(radar))
+    decision = columns["decision"] if columns.has("decision") else numpy.full(len(radar), numpy.nan)
+    decided = numpy.isfinite(decision)
+    wrong = decided & ((decision != numpy.round(decision)) | (decision < 0) | (decision >= types))
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ValueError(
+            f"decision is the number of an emitter type from 0 to {types - 1}, and row {row} has {decision[row]:g}"
+        )
+    difference = _differences(columns, decided)
+    looked = columns.whole("looked")[:, 0] > 0.5 if columns.has("looked") else scans % p.esm_period == 0
+    said = {
+        "scan": scans,
+        "radar": radar,
+        "looked": looked | decided,
+        "decision": numpy.where(decided, decision, types).astype(numpy.int64),
+        "bearing_difference": numpy.where(decided, difference, 0.0),
+    }
+    later, initial, _ = started({name: values[None] for name, values in said.items()}, p)
+    return Recorded(
+        {name: values[0] for name, values in later.items()},
+        {name: values[0] for name, values in initial.items()},
+        scans[1:],
+        {} if "sampling_interval" in columns.given else {"sampling_interval": interval},
+        float(columns.time[0]),
+        columns.time[1:],
+    )
+
+
+def started(measurements: Mapping[str, numpy.ndarray], p: Any) -> Started:
+    """Start every episode on its first measurement.
+
+    Args:
+        measurements: ``(E, T, ...)``.
+        p: parameters.
+
+    Raises:
+        ValueError: if there is no second one.
+    """
+    if measurements["radar"].shape[1] < 2:
+        raise ValueError("the first measurement starts the track, and a recording needs a second one")
+    first = {name: values[:, 0] for name, values in measurements.items()}
+    # What an acceleration of unknown class adds: as in equation (12) at the start.
+    acceleration = float(numpy.square(p.acceleration_sigma) @ numpy.array(p.prior))
+    covariance = numpy.diag([p.range_sigma**2, p.range_rate_sigma**2, acceleration])
+    initial = {
+        "mean": numpy.pad(first["radar"], ((0, 0), (0, 1))),
+        "covariance": numpy.tile(covariance, (len(first["radar"]), 1, 1)),
+        **{f"first_{name}": values for name, values in first.items()},
+    }
+    later = {name: values[:, 1:] for name, values in measurements.items()}
+    later["scan"], initial["first_scan"] = later["scan"] - first["scan"][:, None], 0 * first["scan"]
+    return Started(later, initial, 1)
+
+
+def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:
+    """Radar bearing minus ESM bearing of every row, degrees."""
+    if not decided.any():
+        return numpy.zeros(len(decided))
+    if columns.has("bearing_difference"):
+        found = bearing_difference(columns["bearing_difference"], numpy.zeros(len(decided)))
+    elif columns.has("radar_bearing", "esm_bearing"):
+        found = bearing_difference(columns["radar_bearing"], columns["esm_bearing"])
+    else:
+        raise ValueError(
+            "it has decisions, and the gate needs radar_bearing and esm_bearing (degrees), or bearing_difference"
+        )
+    if not numpy.isfinite(found[decided]).all():
+        row = int(numpy.argmax(decided & ~numpy.isfinite(found)))
+        raise ValueError(f"row {row} has a decision and lacks a bearing")
+    return numpy.where(decided, found, 0.0)

@@ -1,0 +1,266 @@
+"""Tables of what sensors said, one row a measurement, as they come out of a radar, a receiver or a logger.
+
+An environment says which columns it knows (:attr:`.Task.recorded_columns`) and makes measurements of them
+(:meth:`.Task.recorded`). What every table has in common is here: times, missing values, several recordings in one file,
+and true values, ``truth_NAME`` for every component of the environment.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
+from .recording import Recording, measured_once
+from .task import Task
+
+TIME = ("time", "timestamp", "seconds")
+RECORDING = "recording"
+TRUTH = "truth_"
+UNEVEN = 0.01
+"""Share of the sampling interval by which a time may be off where measurements must be regular."""
+
+
+class Columns:
+    """Columns of one recording, in the order of its times.
+
+    Args:
+        name: of the recording.
+        columns: numbers by the names of the columns, NaN where a cell is empty.
+        time: s, increasing.
+        given: parameters that the user has named.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        columns: Mapping[str, numpy.ndarray],
+        time: numpy.ndarray,
+        given: Mapping[str, Any],
+    ) -> None:
+        self.name, self.time, self.given = name, time, given
+        self._columns = columns
+
+    def has(self, *names: str) -> bool:
+        """Whether all of these columns are there."""
+        return all(name in self._columns for name in names)
+
+    @property
+    def true(self) -> list[str]:
+        """Names of the columns that say what is true."""
+        return [name for name in self._columns if name.startswith(TRUTH)]
+
+    def __getitem__(self, name: str) -> numpy.ndarray:
+        """Column, NaN where a cell is empty."""
+        return self._columns[name]
+
+    def only(self, rows: numpy.ndarray) -> "Columns":
+        """Some rows of the same."""
+        columns = {name: values[rows] for name, values in self._columns.items()}
+        return Columns(self.name, columns, self.time[rows], self.given)
+
+    def whole(self, *names: str) -> numpy.ndarray:
+        """Columns without an empty cell, ``(rows, columns)``.
+
+        Raises:
+            ValueError: if there is one.
+        """
+        for name in names:
+            missing = numpy.isnan(self[name])
+            if missing.any():
+                raise ValueError(
+                    f"{name} has no value in row {int(missing.argmax())}, and here nothing may be missing"
+                )
+        return numpy.stack([self[name] for name in names], axis=1)
+
+    def sigmas(self, *names: str) -> numpy.ndarray:
+        """Standard deviations without an empty cell, ``(rows, columns)``.
+
+        Raises:
+            ValueError: if one is not above zero.
+        """
+        found = self.whole(*names)
+        for name, values in zip(names, found.T, strict=True):
+            if (values <= 0.0).any():
+                row = int((values <= 0.0).argmax())
+                raise ValueError(
+                    f"{name} is a standard deviation, above zero, and row {row} has {values[row]:g}"
+                )
+        return found
+
+    def interval(self) -> float:
+        """Sampling interval, s: the one that the user has named, or the median of those in the table."""
+        if "sampling_interval" in self.given:
+            return float(self.given["sampling_interval"])
+        # Rounded as times are: files of one sensor have the same then.
+        return float(f"{numpy.median(numpy.diff(self.time)):.6g}")
+
+    def regular(self, why: str) -> float:
+        """Sampling interval of measurements that must be regular, s.
+
+        Args:
+            why: who needs that, at the end of the sentence.
+
+        Raises:
+            ValueError: if they are not.
+        """
+        interval = self.interval()
+        steps = numpy.diff(self.time)
+        off = numpy.abs(steps - interval) > UNEVEN * interval
+        if off.any():
+            row = int(off.argmax())
+            raise ValueError(
+                f"times are {steps[row]:g} s apart after row {row} and {interval:g} s elsewhere: {why}, so resample "
+                "it, or cut it at the gap"
+            )
+        return interval
+
+
+class Recorded(NamedTuple):
+    """What an environment makes of the columns of one recording; T measurements."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """``(T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """``(...)``."""
+    rows: numpy.ndarray
+    """Row of the table that each measurement is of, ``(T,)``; -1 where it is of none."""
+    parameters: Mapping[str, Any]
+    """That follow from the table."""
+    start: float
+    """Time of the start of the track, s, as in the table."""
+    time: numpy.ndarray
+    """Of the measurements, likewise, ``(T,)``."""
+
+
+def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Recording:
+    """Read a table of what sensors said.
+
+    Args:
+        path: of a file.
+        cls: the environment.
+        keywords: parameters of it.
+
+    Raises:
+        ValueError: if it cannot be read, or lacks what the environment needs.
+    """
+    if not cls.recorded_columns:
+        measured_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
+        raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
+    known = _Known({*TIME, RECORDING, *cls.recorded_columns})
+    if not path.name.endswith(FLIGHT_SUFFIXES):
+        raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
+    table = {name.lower(): values for name, values in read_table(path, known).items()}
+    time_name = next((name for name in TIME if name in table), None)
+    if time_name is None or not any(name in table for name in cls.recorded_columns):
+        raise ValueError(
+            f"it has the columns {', '.join(table) or 'none'}, and {cls.id} reads time and "
+            f"{', '.join(cls.recorded_columns)}"
+        )
+    time = seconds(table[time_name])
+    columns = {
+        name: numbers(name, values)
+        for name, values in table.items()
+        if name in known and name not in (*TIME, RECORDING)
+    }
+    for name, values in columns.items():
+        if numpy.isinf(values).any():
+            raise ValueError(f"{name} is not finite in row {int(numpy.isinf(values).argmax())}")
+    parts = []
+    for name, rows in _recordings(table.get(RECORDING), len(time)).items():
+        own = Columns(
+            name or path.name.partition(".")[0],
+            {n: v[rows] for n, v in columns.items()},
+            time[rows],
+            keywords,
+        )
+        try:
+            _check_times(own.time)
+            parts.append((own, cls.recorded(own)))
+        except ValueError as error:
+            if not name:
+                raise
+            raise ValueError(f"recording {name!r}: {error}") from error
+    return _joined(path, cls, keywords, parts)
+
+
+class _Known(set[str]):
+    """Names of columns; and all that begin with ``truth_``, because components follow from the parameters."""
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or str(name).startswith(TRUTH)
+
+
+def _recordings(names: Any, rows: int) -> dict[str, numpy.ndarray]:
+    """Rows of every recording of a table, in their order."""
+    if names is None:
+        return {"": numpy.arange(rows)}
+    values = numpy.array([str(value) for value in numpy.asarray(names).tolist()])
+    return {name: numpy.flatnonzero(values == name) for name in dict.fromkeys(values.tolist())}
+
+
+def _check_times(time: numpy.ndarray) -> None:
+    if len(time) < 2:
+        raise ValueError(f"it has {len(time)} row{'s' * (len(time) != 1)}, and a recording needs several")
+    if not numpy.isfinite(time).all():
+        raise ValueError(f"time has no value in row {int((~numpy.isfinite(time)).argmax())}")
+    steps = numpy.diff(time)
+    if (steps <= 0.0).any():
+        row = int((steps <= 0.0).argmax())
+        what = "is the same in rows" if steps[row] == 0.0 else "decreases between rows"
+        raise ValueError(f"time {what} {row} and {row + 1}: rows must be in the order of their times")
+
+
+def _joined(
+    path: Path,
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    parts: list[tuple[Columns, Recorded]],
+) -> Recording:
+    """Put the recordings of a file side by side."""
+    task = cls(cls.Parameters(**{**parts[0][1].parameters, **keywords}), cls.controls[0])
+    true = [TRUTH + component.name for component in task.components]
+    longest = max(len(found.rows) for _, found in parts)
+    for own, found in parts:
+        if found.parameters != parts[0][1].parameters:
+            raise ValueError(
+                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {parts[0][0].name!r} "
+                f"{dict(parts[0][1].parameters)}: put them into files of their own"
+            )
+
+    def padded(values: numpy.ndarray) -> numpy.ndarray:
+        fill = numpy.nan if values.dtype.kind == "f" else 0
+        widths = [(0, longest - len(values)), *[(0, 0)] * (values.ndim - 1)]
+        return numpy.pad(values, widths, constant_values=fill)
+
+    measurements = {
+        name: numpy.stack([padded(numpy.asarray(found.measurements[name])) for _, found in parts])
+        for name in parts[0][1].measurements
+    }
+    truth = None
+    if all(own.has(*true) for own, _ in parts):
+        for own, found in parts:
+            if (found.rows < 0).any():
+                raise ValueError(
+                    f"recording {own.name!r} has scans without a row, of which nobody knows the truth: add rows "
+                    "without plots, or leave out the truth"
+                )
+        truth = numpy.stack([padded(own.whole(*true)[found.rows]) for own, found in parts])
+    elif any(own.true for own, _ in parts):
+        raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")
+    return Recording(
+        environment=cls.id,
+        measurements=measurements,
+        initial={
+            name: numpy.stack([numpy.asarray(found.initial[name]) for _, found in parts])
+            for name in parts[0][1].initial
+        },
+        seconds=numpy.stack([padded(found.time - found.start) for _, found in parts]),
+        lengths=numpy.array([len(found.rows) for _, found in parts]),
+        truth=truth,
+        names=tuple(own.name for own, _ in parts),
+        parameters={**parts[0][1].parameters, **keywords},
+        name=path.name.partition(".")[0],
+        source=str(path),
+    )

@@ -1,0 +1,500 @@
+"""Recorded measurements in place of a simulated world: what sensors really said, replayed to any policy.
+
+A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, what everyone is told of the
+start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`RecordedWorld` in the
+place of the task's own: an episode replays one recording, which the first uniform number of its generator draws. Banks,
+estimators, backends and evaluations know nothing of it.
+
+What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names
+and shapes. So this module is the same for every task whose measurements do not depend on what is estimated. In a closed
+loop they do, and no recording can answer what the sensors would have said to another estimate.
+
+Where there is no truth there is no error and no cost, and rewards are zero.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy
+
+from .draws import Draws
+from .observation import Array
+from .parameters import check, declared, frozen
+from .task import Scenario, Task, World, named_arrays
+
+MOST_NUMBERS = 50_000_000
+"""Of a recording: 400 MB; to replay it takes twice as much again."""
+
+
+class Replayed(NamedTuple):
+    """Where an episode is in the tables of a recording."""
+
+    number: Array
+    """Of the recording, ``(N,)``, as a float; likewise all that follows."""
+    count: Array
+    """Measurements so far."""
+    first: Array
+    """Column of the first measurement."""
+    last: Array
+    """Column of the last one."""
+
+
+class Started(NamedTuple):
+    """A start of the track that was made of the first measurements of E episodes."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """Those after the start, ``(E, T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """``(E, ...)``."""
+    used: int
+    """Measurements that the start took."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Recorded episodes of one environment, E of them; the longest has T measurements.
+
+    Args:
+        environment: its id.
+        measurements: every array of the environment's ``Measurement`` by its name, ``(E, T, ...)``.
+        initial: every array of what everyone is told of the start of the track, ``(E, ...)``.
+        seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
+        lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
+            otherwise the last measurement again.
+        truth: true values of the task's components in their units, ``(E, T, C)``; None where they are not known.
+        names: of the episodes; default: their numbers.
+        parameters: of the environment, where they differ from the defaults; a horizon makes episodes shorter.
+        name: of the whole, in reports.
+        source: where the data come from, in words.
+        licence: of the data, in words.
+        notes: what is to be told of the reading, a line each.
+
+    Raises:
+        ValueError: for arrays that do not fit each other, or are not finite where they must be.
+    """
+
+    environment: str
+    measurements: Mapping[str, numpy.ndarray]
+    initial: Mapping[str, numpy.ndarray]
+    seconds: numpy.ndarray
+    lengths: numpy.ndarray
+    truth: numpy.ndarray | None = None
+    names: tuple[str, ...] = ()
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "recording"
+    source: str = ""
+    licence: str = ""
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        episodes, _ = self.seconds.shape
+        if not self.names:
+            object.__setattr__(self, "names", tuple(str(i) for i in range(episodes)))
+        arrays = {**self.measurements, "truth": self.truth}
+        for name, values in arrays.items():
+            if values is not None and values.shape[:2] != self.seconds.shape:
+                raise ValueError(
+                    f"{name} must have shape {self.seconds.shape} as seconds has, and further axes, got {values.shape}"
+                )
+        for name, values in {"length": self.lengths, **self.initial}.items():
+            if len(values) != episodes:
+                raise ValueError(f"{name} must be of {episodes} episodes, got {len(values)}")
+        if len(set(self.names)) != episodes:
+            raise ValueError(
+                f"the {episodes} episodes of a recording need as many different names, got {self.names!r:.80}"
+            )
+        rows = self.rows
+        for episode, name in enumerate(self.names):
+            self._check_episode(episode, int(rows[episode]), name)
+
+    def _check_episode(self, episode: int, rows: int, name: str) -> None:
+        """Raise ValueError for an episode that cannot be replayed."""
+        if not 1 <= self.lengths[episode] <= rows:
+            raise ValueError(
+                f"recording {name!r}: length must be from 1 to its {rows} measurements, got {self.lengths[episode]}"
+            )
+        times = self.seconds[episode]
+        if not numpy.isfinite(times[:rows]).all():
+            raise ValueError(f"recording {name!r}: seconds are not finite at measurement {_first(times) + 1}")
+        if rows > 1 and not (numpy.diff(times[:rows]) > 0.0).all():
+            wrong = int(numpy.argmax(numpy.diff(times[:rows]) <= 0.0))
+            raise ValueError(
+                f"recording {name!r}: seconds must increase, and measurement {wrong + 2} has {times[wrong + 1]:g} s "
+                f"after {times[wrong]:g} s"
+            )
+        checked = (
+            dict(self.measurements) if self.truth is None else {**self.measurements, "truth": self.truth}
+        )
+        for what, values in checked.items():
+            if not numpy.isfinite(values[episode, :rows]).all():
+                raise ValueError(
+                    f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; what is "
+                    "missing has the value zero, where the environment can say so"
+                )
+        for what, values in self.initial.items():
+            if not numpy.isfinite(values[episode]).all():
+                raise ValueError(f"recording {name!r}: initial_{what} is not finite")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
+        """Share it: nothing in it changes."""
+        return self
+
+    def __repr__(self) -> str:
+        true = "with truth" if self.truth is not None else "without truth"
+        return f"<Recording {self.name!r} of {self.environment}: {len(self.names)} episodes {true}>"
+
+    @functools.cached_property
+    def rows(self) -> numpy.ndarray:
+        """Measurements that there are of each episode, ``(E,)``."""
+        there = numpy.isfinite(self.seconds)
+        # From the last one backwards: what is missing before it is a mistake, and not the end.
+        return self.seconds.shape[1] - numpy.argmax(there[:, ::-1], axis=1) * there.any(axis=1)
+
+    # --- as a scenario
+
+    def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
+        """Measurements acted on in each episode, whole decisions, none beyond the horizon."""
+        lengths = numpy.minimum(self.lengths, horizon)
+        return tuple((lengths - lengths % decision_interval).tolist())
+
+    def scenario(self, cls: type[Task], keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario that replays this, one recording in every episode.
+
+        Args:
+            cls: the environment.
+            keywords: parameters that win over those of the recording.
+
+        Raises:
+            ValueError: if it is of another environment, or does not fit the parameters.
+        """
+        if self.environment != cls.id:
+            raise ValueError(f"recording {self.name!r} is of {self.environment}, not of {cls.id}")
+        known = [f.name for f in dataclasses.fields(cls.Parameters)]
+        unknown = [name for name in self.parameters if name not in known]
+        if unknown:
+            raise ValueError(
+                f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
+            )
+        named = {**self.parameters, **keywords}
+        interval = frozen(named.get("decision_interval", 1))
+        check("decision_interval", interval, *declared(cls.Parameters)["decision_interval"])
+        longest, shortest = int(self.lengths.max()), int(self.lengths.min())
+        if shortest < interval:
+            raise ValueError(
+                f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
+                f"{self.name!r}, got {interval}"
+            )
+        parameters = {"horizon": longest - longest % interval, **self.parameters}
+        made = cls.Parameters(**{**parameters, **keywords})
+        if made.horizon > longest:
+            raise ValueError(
+                f"horizon must be at most {longest}, the measurements of recording {self.name!r}, got {made.horizon}"
+            )
+        self.check_fits(cls(made, cls.controls[0]))
+        return Scenario(
+            self.name,
+            "Recorded measurements.",
+            parameters,
+            flights=self.names,
+            notes=self.notes,
+            recording=self,
+        )
+
+    def check_fits(self, task: Task) -> None:
+        """Raise ValueError if a task of NumPy measures other arrays than there are, or a closed loop."""
+        initial, measurement = measured_once(task)
+        for kind, prefix, example, found, leading in (
+            ("measures", "", measurement, self.measurements, 2),
+            ("is told at the start", "initial_", initial, self.initial, 1),
+        ):
+            expected = {name: tuple(values.shape[:-1]) for name, values in named_arrays(example)}
+            missing = [f"{prefix}{name}" for name in expected if name not in found]
+            if missing:
+                raise ValueError(
+                    f"recording {self.name!r} lacks {', '.join(missing)}; {task.id} {kind} "
+                    f"{', '.join(prefix + name for name in expected)}"
+                )
+            for name in found:
+                if name not in expected:
+                    raise ValueError(
+                        f"recording {self.name!r} has {prefix}{name}, which is nothing that {task.id} {kind}: "
+                        f"{', '.join(prefix + name for name in expected)}"
+                    )
+                shape = found[name].shape[leading:]
+                if shape != expected[name]:
+                    raise ValueError(
+                        f"recording {self.name!r}: {prefix}{name} has the shape {shape} and {task.id} with these "
+                        f"parameters {kind} {expected[name]}"
+                    )
+        if self.truth is not None and task.World.error_cost is World.error_cost:
+            raise ValueError(
+                f"recording {self.name!r} has truth, and {task.id} does not say what an error costs: give its World "
+                "the method error_cost, or leave the truth out"
+            )
+        if self.truth is not None and self.truth.shape[2] != len(task.components):
+            raise ValueError(
+                f"recording {self.name!r}: truth has {self.truth.shape[2]} components and {task.id} has "
+                f"{len(task.components)}: {', '.join(c.name for c in task.components)}"
+            )
+
+    # --- as a file
+
+    @property
+    def dataset(self) -> Any:
+        """As it stands in a file, an :class:`xarray.Dataset`."""
+        from .recording_files import dataset_of
+
+        return dataset_of(self)
+
+    def write(self, path: Any) -> None:
+        """Write a NetCDF file, which ``read_recording`` reads and ``scenario`` names."""
+        from .recording_files import write_recording
+
+        write_recording(self, path)
+
+    # --- as a world
+
+    def world(self, task: Task) -> "RecordedWorld":
+        """Return the world that replays this."""
+        return RecordedWorld(task, self)
+
+    @functools.cached_property
+    def tables(self) -> "Tables":
+        """All episodes one after another, as floats."""
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        ends = numpy.cumsum(self.rows)
+
+        def columns(values: numpy.ndarray) -> numpy.ndarray:
+            return numpy.ascontiguousarray(numpy.moveaxis(values[there].astype(float), 0, -1))
+
+        def starts(values: numpy.ndarray) -> numpy.ndarray:
+            return numpy.ascontiguousarray(numpy.moveaxis(values.astype(float), 0, -1))
+
+        return Tables(
+            {name: columns(values) for name, values in self.measurements.items()},
+            {name: starts(values) for name, values in self.initial.items()},
+            None if self.truth is None else columns(self.truth),
+            columns(self.seconds),
+            (ends - self.rows).astype(float),
+            (ends - 1).astype(float),
+        )
+
+
+def recording_from(fields: Mapping[str, Any]) -> Recording:
+    """Return the recording whose fields a dictionary holds, as they come out of JSON.
+
+    Raises:
+        ValueError: if a field is missing or unknown.
+    """
+    arrays: dict[str, Any] = {
+        "seconds": None,
+        "lengths": None,
+        "truth": None,
+        "measurements": {},
+        "initial": {},
+    }
+    known = {f.name for f in dataclasses.fields(Recording)}
+    if not {"environment", "measurements", "initial", "seconds", "lengths"} <= set(fields) <= known:
+        raise ValueError(
+            f"a recording as a dictionary has {', '.join(sorted(known))}, got {', '.join(map(repr, fields))}"
+        )
+    for name in arrays:
+        value = fields.get(name)
+        if isinstance(value, Mapping):
+            arrays[name] = {key: numpy.asarray(item) for key, item in value.items()}
+        else:
+            arrays[name] = None if value is None else numpy.asarray(value)
+    arrays["seconds"] = arrays["seconds"].astype(float)
+    others = {name: value for name, value in fields.items() if name not in arrays}
+    for name in ("names", "notes"):
+        others[name] = tuple(others.get(name, ()))
+    return Recording(**arrays, **others)
+
+
+def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
+    """Put recordings of one environment side by side; those with other parameters than the first are left out.
+
+    Args:
+        recordings: at least one.
+        name: of the whole.
+        notes: what is to be told of the reading, a line each; what is left out is added.
+    """
+    first, told = recordings[0], list(notes)
+    kept: list[Recording] = []
+    for one in recordings:
+        differing = sorted(
+            parameter
+            for parameter in {*one.parameters, *first.parameters}
+            if one.parameters.get(parameter) != first.parameters.get(parameter)
+        )
+        if differing:
+            told.append(
+                f"{one.name}: left out: {differing[0]} is {one.parameters.get(differing[0], 'the default')}, and of "
+                f"{first.name} {first.parameters.get(differing[0], 'the default')}"
+            )
+        else:
+            kept.append(one)
+    untrue = [one.name for one in kept if one.truth is None]
+    if untrue and len(untrue) < len(kept):
+        told.append(f"{untrue[0]}: has no truth, so nobody is judged")
+    longest = max(one.seconds.shape[1] for one in kept)
+
+    def side_by_side(arrays: Sequence[numpy.ndarray], padded: bool = True) -> numpy.ndarray:
+        if padded:
+            arrays = [
+                numpy.pad(
+                    values,
+                    [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)],
+                    constant_values=numpy.nan if values.dtype.kind == "f" else 0,
+                )
+                for values in arrays
+            ]
+        return numpy.concatenate(arrays)
+
+    names = []
+    for one in kept:
+        alone = len(one.names) == 1
+        names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
+    return dataclasses.replace(
+        first,
+        measurements={
+            key: side_by_side([one.measurements[key] for one in kept]) for key in first.measurements
+        },
+        initial={key: side_by_side([one.initial[key] for one in kept], False) for key in first.initial},
+        seconds=side_by_side([one.seconds for one in kept]),
+        lengths=numpy.concatenate([one.lengths for one in kept]),
+        truth=None if untrue else side_by_side([one.truth for one in kept if one.truth is not None]),
+        names=tuple(names),
+        name=name,
+        source=name,
+        notes=tuple(told),
+    )
+
+
+class Tables(NamedTuple):
+    """A recording as it is replayed: arrays of floats with measurements, or recordings, as their last axis."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    initial: Mapping[str, numpy.ndarray]
+    truth: numpy.ndarray | None
+    seconds: numpy.ndarray
+    first: numpy.ndarray
+    """Column of the first measurement of each recording, ``(E,)``; likewise of the last."""
+    last: numpy.ndarray
+
+
+def _first(values: numpy.ndarray) -> int:
+    """Place of the first row that is not finite."""
+    return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
+
+
+def measured_once(task: Task) -> tuple[Any, Any]:
+    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
+
+    Raises:
+        ValueError: if what is measured depends on what is estimated.
+    """
+    world = task.World(task)
+    draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
+    truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
+    bank = task.bank.start(initial)
+    if task.bank.feedback(bank) is not None:
+        raise ValueError(
+            f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
+            "what the sensors said to one estimate is not what they would have said to another, and can be neither "
+            "recorded nor replayed"
+        )
+    row = numpy.zeros((world.normals + world.row_uniforms, 8))
+    row[world.normals :] = 0.5
+    return initial, world.advance(truth, row, None)[1]
+
+
+class RecordedWorld(World[Task, Replayed, Any]):
+    """What the sensors said, in place of a task's own world."""
+
+    initial_normals = 1
+    normals = 1
+
+    def __init__(self, task: Task, recording: Recording) -> None:
+        super().__init__(task)
+        self.recording = recording
+        self.simulated = task.World(task)
+        """The task's own world, which knows what an error costs."""
+        plain = type(task)(task.parameters, task.control)
+        self._initial, self._measurement = measured_once(plain)
+        tables = recording.tables
+        # Tables of NumPy are read by compiled code as they are.
+        kept = task.constant if task.backend == "torch" else numpy.asarray
+        self.tables = Tables(
+            {name: kept(values) for name, values in tables.measurements.items()},
+            {name: kept(values) for name, values in tables.initial.items()},
+            None if tables.truth is None else kept(tables.truth),
+            kept(tables.seconds),
+            kept(tables.first),
+            kept(tables.last),
+        )
+
+    def begin(self, draws: Draws, normals: Array) -> tuple[Replayed, Any]:
+        """Draw a recording, and tell of its start."""
+        number = draws.integer("recording", (0, len(self.recording.names) - 1))
+        first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
+        initial = self._filled(self._initial, self.tables.initial, number)
+        return Replayed(number, 0.0 * number, first, last), initial
+
+    def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
+        """Go on to the next measurement; at the end the last one is said again."""
+        truth = truth._replace(count=truth.count + 1.0)
+        return truth, self._filled(self._measurement, self.tables.measurements, self._column(truth))
+
+    def _column(self, truth: Replayed) -> Array:
+        """Of the measurement at hand."""
+        xp = self.xp
+        return xp.minimum(truth.first + xp.clip(truth.count - 1.0, 0.0, None), truth.last)
+
+    def _at(self, table: Array, column: Array) -> Array:
+        """Entries of a table, ``(..., N)``."""
+        return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
+
+    def _filled(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
+        """A NamedTuple of arrays as one that was measured, from the tables."""
+        xp = self.xp
+        names = iter([name for name, _ in named_arrays(like)])
+
+        def filled(part: Any) -> Any:
+            if isinstance(part, tuple):
+                return type(part)(*map(filled, part))
+            if part is None:
+                return None
+            values = self._at(tables[next(names)], column)
+            if part.dtype.kind == "b":
+                return values > 0.5
+            return xp.astype(values, xp.int64) if part.dtype.kind in "iu" else values
+
+        return filled(like)
+
+    def state(self, truth: Replayed) -> Array:
+        """True values of the task's components, ``(C, N)``.
+
+        Raises:
+            ValueError: if the recording has none.
+        """
+        if self.tables.truth is None:
+            raise ValueError(
+                f"recording {self.recording.name!r} has no truth, so there is no error and no cost"
+            )
+        return self._at(self.tables.truth, self._column(truth))
+
+    def error_cost(self, error: Array) -> Array:
+        """What it costs in the task's own world."""
+        return self.simulated.error_cost(error)
+
+    def records(self, truth: Replayed) -> dict[str, Array]:
+        """Time since the start of the track, s."""
+        return {"seconds": self._at(self.tables.seconds, self._column(truth))}
+
+    def context(self, truth: Replayed) -> dict[str, Array]:
+        """Which recording it is."""
+        return {"recording": truth.number}

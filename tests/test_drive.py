@@ -1,0 +1,322 @@
+"""The drive of benchmarks/drive.py: reader, alignment, strapdown and levels against known answers; the shipped file."""
+
+import importlib.util
+import json
+import math
+import struct
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from filtergym.envs.catalogue import make_task
+from filtergym.envs.loosely_coupled_navigation.world import Measurement
+from filtergym.filters import geodesy
+from filtergym.filters import loosely_coupled as ins_gnss
+from scipy.spatial.transform import Rotation
+
+from filtergym import evaluate, read_recording
+
+ROOT = Path(__file__).parent.parent
+spec = importlib.util.spec_from_file_location("drive", ROOT / "benchmarks" / "drive.py")
+drive = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(drive)
+
+RATE = 40.0
+"""Of the synthetic IMU, Hz."""
+BEGIN = datetime(2025, 7, 8, 19, 34, 18, tzinfo=UTC).timestamp()
+LATITUDE, LONGITUDE, HEIGHT = math.radians(40.0), math.radians(-105.0), 1600.0
+
+
+def normal_gravity():
+    """At the synthetic drive, m/s^2: Somigliana's formula and the free-air gradient."""
+    sine = math.sin(LATITUDE) ** 2
+    e2 = geodesy.ECCENTRICITY_SQUARED
+    surface = 9.7803253359 * (1 + 0.00193185265241 * sine) / math.sqrt(1 - e2 * sine)
+    return surface * (1 - 2 * HEIGHT / geodesy.SEMI_MAJOR_AXIS)
+
+
+class Circle:
+    """A level drive: 10 s of standstill, 5 s of speeding up to the north, then a circle to the right."""
+
+    standstill, run, speed, turn = 10.0, 5.0, 10.0, 0.2
+
+    def __init__(self, seconds):
+        self.time = np.arange(0.0, seconds, 1.0 / RATE)
+        t = self.time
+        self.forward = np.where((t > self.standstill) & (t <= self.standstill + self.run), 2.0, 0.0)
+        v = 2.0 * np.clip(t - self.standstill, 0.0, self.run)
+        self.yaw_rate = np.where(t > self.standstill + self.run, self.turn, 0.0)
+        yaw = self.turn * np.clip(t - self.standstill - self.run, 0.0, None)
+        self.yaw = yaw
+        self.velocity = np.stack([v * np.cos(yaw), v * np.sin(yaw), 0.0 * v], axis=1)
+        straight = np.clip(t - self.standstill, 0.0, self.run)
+        radius = self.speed / self.turn
+        self.north = straight**2 + radius * np.sin(yaw)
+        self.east = radius * (1.0 - np.cos(yaw))
+        self.right = v * self.yaw_rate
+
+    def inertial(self):
+        """Rates, rad/s, and specific forces, m/s^2, of an ideal IMU on a rotating Earth, forward, right, down."""
+        north, east, _ = self.velocity.T
+        radius = geodesy.SEMI_MAJOR_AXIS
+        spin = geodesy.EARTH_RATE * np.array([math.cos(LATITUDE), 0.0, -math.sin(LATITUDE)])
+        carried = np.stack([east / radius, -north / radius, -east * math.tan(LATITUDE) / radius], axis=1)
+        level = Rotation.from_euler("z", self.yaw[:, None]).inv()
+        rates = level.apply(spin + carried) + np.outer(self.yaw_rate, [0.0, 0.0, 1.0])
+        body = np.stack([self.forward, self.right, np.full(len(self.time), -normal_gravity())], axis=1)
+        return rates, body + level.apply(np.cross(2.0 * spin + carried, self.velocity))
+
+    def position(self):
+        """Latitude, longitude in degrees, height in m."""
+        e2, sine = geodesy.ECCENTRICITY_SQUARED, math.sin(LATITUDE)
+        across = geodesy.SEMI_MAJOR_AXIS / math.sqrt(1 - e2 * sine**2)
+        along = across * (1 - e2) / (1 - e2 * sine**2)
+        latitude = LATITUDE + self.north / (along + HEIGHT)
+        longitude = LONGITUDE + self.east / ((across + HEIGHT) * np.cos(LATITUDE))
+        return np.degrees(latitude), np.degrees(longitude), np.full(len(self.time), HEIGHT)
+
+    def write(self, folder, rate_bias=(0.0, 0.0, 0.0), force_bias=(0.0, 0.0, 0.0), drop=None):
+        """Write the log as the repository has it; biases of the vehicle's axes, rad/s and m/s^2."""
+        rates, forces = self.inertial()
+        mounting = Rotation.from_euler("xyz", drive.MOUNTING, degrees=True)
+        measured = mounting.apply(np.concatenate([forces + force_bias, rates + rate_bias]))
+        half = len(self.time)
+        # The logger's clock runs fast by a thousandth, and writes 0.125 s late.
+        rows = np.column_stack(
+            [measured[:half] / 9.80665, np.degrees(measured[half:]), 1000.0 + 1001.0 * self.time]
+        )
+        file = folder / drive.INERTIAL
+        file.parent.mkdir(parents=True)
+        lines = [",".join(f"{value:.9f}" for value in row) for row in rows]
+        # The first line belongs to what was before, the last one is cut.
+        file.write_text("\n".join(["0,0", *lines, lines[-1][:20]]))
+        last = round(1000.0 * self.time[-1])
+        header = b"TIMETAG RTKLIB demo5".ljust(60, b"\0") + struct.pack("<IId", 7, int(BEGIN), drive.DELAY)
+        file.with_name(f"{file.name}.tag").write_bytes(header + struct.pack("<IIII", 5, 60, last, 999))
+        lines = ["%  GPST latitude(deg) ..."]
+        velocity = self.velocity + 0.0
+        every = round(0.25 * RATE)
+        for i in range(0, half, every):
+            if drop is not None and i == drop * every:
+                continue
+            at = datetime.fromtimestamp(BEGIN + self.time[i], UTC).strftime("%Y/%m/%d %H:%M:%S.%f")
+            B, L, h = (values[i] for values in self.position())
+            north, east, down = velocity[i]
+            lines.append(
+                f"{at} {B:.10f} {L:.10f} {h:.4f} 1 20 "
+                + "0.01 " * 8
+                + f"{north:.6f} {east:.6f} {-down:.6f} "
+                + "0 " * 6
+            )
+        (folder / drive.FIXES).write_text("\n".join(lines) + "\n")
+        return folder
+
+
+@pytest.fixture(autouse=True)
+def antenna_at_the_imu(monkeypatch):
+    """The circle is driven by a point."""
+    monkeypatch.setattr(drive, "LEVER", (0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def pyins():
+    return pytest.importorskip("pyins", reason="python-ins is in filtergym[dev]")
+
+
+def test_log_is_read(tmp_path, pyins):
+    path = Circle(30.0)
+    path.write(tmp_path)
+    inertial = drive.read_inertial(tmp_path / drive.INERTIAL)
+    np.testing.assert_allclose(inertial.index - BEGIN, path.time, atol=1e-6)
+    rates, forces = path.inertial()
+    np.testing.assert_allclose(inertial.to_numpy(), np.hstack([rates, forces]), atol=1e-7)
+    fixes = drive.read_fixes(tmp_path / drive.FIXES)
+    np.testing.assert_allclose(fixes.index - BEGIN, 0.25 * np.arange(120), atol=1e-5)
+    np.testing.assert_allclose(
+        drive.metres(fixes, (LATITUDE, LONGITUDE)), np.stack([path.east, path.north])[:, ::10], atol=0.02
+    )
+
+
+def test_ins_aligned_by_the_log_follows_the_circle(tmp_path, pyins, monkeypatch):
+    """Biases that the standstill and the turns tell apart do not drive it away: left alone, those make 50 m of 20 s."""
+    monkeypatch.setattr(drive, "ALIGNMENT", 20.0)
+    path = Circle(52.0)
+    path.write(tmp_path, rate_bias=(0.004, -0.003, 0.002), force_bias=(0.05, -0.03, 0.04))
+    fixes = drive.read_fixes(tmp_path / drive.FIXES)
+    recorded = drive.recordings(drive.read_inertial(tmp_path / drive.INERTIAL), fixes, seed=3)
+    assert recorded["recording"].values.tolist() == ["29 s"]
+    assert drive.errors(recorded).shape == (2, 81)
+    assert abs(drive.errors(recorded)).max() < 1.0
+    truth = np.stack([path.east, path.north], axis=1)[10 * 118 : 10 * 199 : 10]
+    origin = recorded["truth"].values[0, 0] - truth[0]
+    np.testing.assert_allclose(recorded["truth"].values[0] - origin, truth, atol=0.05)
+    again = drive.recordings(drive.read_inertial(tmp_path / drive.INERTIAL), fixes, seed=3)
+    np.testing.assert_array_equal(again["fix"], recorded["fix"])
+
+
+@pytest.mark.parametrize("error", [0.0, 0.2])
+def test_free_ins_of_a_constant_acceleration_error(pyins, error):
+    """Without one it follows the circle; with one along the vehicle's down axis the height goes off by b t^2 / 2."""
+    import pandas
+    from pyins import strapdown, util
+
+    path = Circle(36.0)
+    rates, forces = path.inertial()
+    inertial = pandas.DataFrame(np.hstack([rates, forces]), path.time, [*util.GYRO_COLS, *util.ACCEL_COLS])
+    begin = round(15.5 * RATE)  # in the circle
+    position = np.stack(path.position(), axis=1)
+    attitude = np.stack([0.0 * path.yaw, 0.0 * path.yaw, np.degrees(path.yaw)], axis=1)
+    columns = np.hstack([position, path.velocity, attitude])
+    increments = strapdown.compute_increments_from_imu(inertial, "rate")
+    # What the filter takes for a bias is subtracted.
+    biases = pandas.DataFrame(np.zeros((1, 6)), [0.0], [*util.THETA_COLS, *util.DV_COLS])
+    biases["dv_z"] = -error
+    known = drive.Aligned(
+        pandas.DataFrame(columns, path.time, util.TRAJECTORY_COLS), biases, increments, innovations={}
+    )
+    times = path.time[begin : begin + 801 : 10]
+    found = drive.free_inertial(known, times)
+    east, north = drive.metres(found, (LATITUDE, LONGITUDE))
+    expected = drive.metres(
+        pandas.DataFrame(position[begin : begin + 801 : 10], times, util.LLA_COLS), (LATITUDE, LONGITUDE)
+    )
+    np.testing.assert_allclose([east, north], expected, atol=0.1)
+    down = 0.5 * error * (times - times[0]) ** 2
+    np.testing.assert_allclose(found["alt"], HEIGHT - down, atol=0.1)
+
+
+def test_logs_that_are_none_are_refused(tmp_path, pyins):
+    path = Circle(20.0)
+    path.write(tmp_path)
+    inertial, fixes = tmp_path / drive.INERTIAL, tmp_path / drive.FIXES
+    tags = inertial.with_name(f"{inertial.name}.tag")
+    right = tags.read_bytes()
+    for wrong in (b"", right[:70], right[:-3], b"x" + right[1:]):
+        tags.write_bytes(wrong)
+        with pytest.raises(ValueError, match=r"imu_1934.csv.tag holds no time tags of RTKLIB"):
+            drive.read_inertial(inertial)
+    tags.write_bytes(right)
+    rows = inertial.read_text().splitlines()
+    for wrong in (
+        rows[:1],
+        [row.rsplit(",", 1)[0] for row in rows],
+        [row.replace("0.", "x") for row in rows],
+    ):
+        inertial.write_text("\n".join(wrong))
+        with pytest.raises(ValueError, match="no table of three accelerations, three rates and milliseconds"):
+            drive.read_inertial(inertial)
+    inertial.write_text("\n".join([rows[0], *rows[-2:0:-1], rows[-1]]))
+    with pytest.raises(ValueError, match="milliseconds in the last column do not increase"):
+        drive.read_inertial(inertial)
+    rows = fixes.read_text().splitlines()
+    for wrong in ([row[:60] for row in rows], ["2025/07/08 noon 1 2 3"], [*rows[:3], "x"]):
+        fixes.write_text("\n".join(wrong))
+        with pytest.raises(ValueError, match="no solution of RTKLIB with velocities"):
+            drive.read_fixes(fixes)
+    for wrong in (rows[:1], rows[:2], [*rows, rows[-1]], []):
+        fixes.write_text("\n".join(wrong))
+        with pytest.raises(ValueError, match="at least two positions, with times that increase"):
+            drive.read_fixes(fixes)
+
+
+def test_what_cannot_be_aligned_is_refused(tmp_path, pyins):
+    path = Circle(40.0)
+    path.write(tmp_path, drop=100)
+    inertial = drive.read_inertial(tmp_path / drive.INERTIAL)
+    fixes = drive.read_fixes(tmp_path / drive.FIXES)
+    with pytest.raises(ValueError, match=r"positions come every 0.25 s, but two are 0.50 s apart"):
+        drive.recordings(inertial, fixes)
+    with pytest.raises(ValueError, match="needs a standstill of 5 s at the beginning"):
+        drive.aligned(inertial[inertial.index > BEGIN + 6.0], fixes)
+    with pytest.raises(ValueError, match="no speed is above 2"):
+        drive.aligned(inertial, fixes[fixes.index < BEGIN + 9.0])
+
+
+LEVELS = {"drift": 0.3, "coloured": 0.5, "correlation_time": 4.0, "white_intensity": 0.02}
+
+
+def test_modelled_error_is_the_filters_own():
+    p = make_task(
+        "filtergym/LooselyCoupledNavigation-v0", scenario="paper", **{**drive.PARAMETERS, **LEVELS}
+    ).parameters
+    covariance, expected = p.modelled_prior(np.zeros(())), []
+    for _ in range(81):
+        covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.modelled_growth)
+        expected.append(covariance.position)
+    found = drive.modelled(0.25 * np.arange(1, 82), LEVELS)
+    np.testing.assert_allclose(np.diag(found), expected, rtol=1e-9)
+    assert np.linalg.eigvalsh(found).min() > 0.0
+
+
+def test_likeliest_levels_are_those_of_the_model():
+    """Of 400 windows drawn from it: what a filter sees, the growth of the error, is met."""
+    time = 0.25 * np.arange(1, 82)
+    factor = np.linalg.cholesky(drive.modelled(time, LEVELS))
+    generator = np.random.default_rng(5)
+    error = (factor @ generator.standard_normal((81, 800))).T.reshape(400, 2, 81).transpose(0, 2, 1)
+    truth = np.zeros((400, 82, 2))
+    ins = np.concatenate([np.zeros((400, 1, 2)), error], axis=1)
+    fix = 1.414 * generator.standard_normal((400, 81, 2))
+    recorded = drive.dataset(truth, ins, fix, 1.414, np.arange(400.0))
+    levels, likelihood = drive.likeliest(recorded)
+    ratio = (
+        np.diag(drive.modelled(time, levels))[[3, 19, 80]]
+        / np.diag(drive.modelled(time, LEVELS))[[3, 19, 80]]
+    )
+    assert abs(np.log(ratio)).max() < 0.2
+    worse = drive.likeliest(recorded, 0.2)
+    assert worse[0]["correlation_time"] == pytest.approx(0.2)
+    assert worse[1] < likelihood
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return xarray.load_dataset(ROOT / "docs" / "data" / "drive.nc", engine="scipy")
+
+
+def test_shipped_file_is_a_recording(shipped):
+    assert (ROOT / "docs" / "data" / "drive.nc").stat().st_size < 300_000
+    licence = (ROOT / "docs" / "data" / "drive_licence.txt").read_text(encoding="utf-8")
+    assert "BSD 3-Clause License" in licence
+    assert shipped.attrs["source"].split("commit ")[1].split(",")[0] in licence
+    task = make_task(shipped.attrs["environment"], **json.loads(shipped.attrs["parameters"]))
+    assert json.loads(shipped.attrs["parameters"]) == drive.PARAMETERS
+    assert [c.name for c in task.components] == shipped["component"].values.tolist()
+    for name in (*Measurement._fields, "seconds", "truth", "initial_mean", "initial_covariance", "length"):
+        assert np.isfinite(shipped[name]).all(), name
+    assert shipped["ins"].shape == (24, 81, 2)
+    assert (shipped["length"] == 80).all()
+
+
+def test_shipped_file_is_a_drive(shipped):
+    """Arrays agree with each other, fixes have the noise they report, and the car keeps to the speeds of a town."""
+    start = shipped["initial_mean"].values[:, None]
+    ins = np.concatenate([start, shipped["ins"].values], axis=1)
+    np.testing.assert_array_equal(np.diff(ins, axis=1), shipped["increment"])
+    noise = (shipped["fix"].values - shipped["truth"].values) / shipped["reported_deviation"].values[
+        ..., None
+    ]
+    assert noise.std() == pytest.approx(1.0, abs=0.04)  # four deviations of 3888 numbers
+    assert abs(noise.mean()) < 0.07
+    truth = np.concatenate([start, shipped["truth"].values], axis=1)
+    speed = np.hypot(*np.moveaxis(np.diff(truth, axis=1), 2, 0)) / 0.25
+    assert 12.0 < speed.max() < 17.0
+    assert shipped["seconds"].values[0, [0, -1]].tolist() == [0.25, 20.25]
+    rms = np.sqrt((drive.errors(shipped) ** 2).mean(axis=0))
+    assert rms[3] < 0.1  # 1 s
+    assert 2.0 < rms[39] < 5.0
+    assert 10.0 < rms[79] < 20.0
+
+
+def test_shipped_file_is_replayed_to_every_kind_of_filter():
+    read = read_recording(ROOT / "docs" / "data" / "drive.nc")
+    found = evaluate(read.environment, ["plain-reduced", "augmented", "gnss-only"], scenario=read)
+    assert found.sizes["episode"] == 24
+    assert np.isfinite(found["error"].values).all()
+    error = found["error"] ** 2
+    root = np.sqrt(error.sum("component").mean(["episode", "time"]))
+    # Two axes of white noise of 1.41 m, and what the page says of the filter that estimates the rate errors.
+    assert float(root.sel(policy="gnss-only")) == pytest.approx(2.0, abs=0.1)
+    assert float(root.sel(policy="augmented")) == pytest.approx(0.859, abs=1e-3)

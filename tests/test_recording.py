@@ -1,0 +1,881 @@
+"""Recorded measurements: replay is the simulation bit for bit, files come back, tables are read or refused."""
+
+import copy
+import dataclasses
+import json
+import pickle
+import runpy
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import xarray
+from filtergym.envs.catalogue import make_task, task_class
+from filtergym.envs.compiled import AVAILABLE
+from filtergym.envs.flight_tables import MOST_ROWS
+from filtergym.envs.lanes import Lanes
+from filtergym.envs.maneuvering_target.recorded import recorded as plot_measurements
+from filtergym.envs.recorded_tables import Columns
+from filtergym.envs.recording import measured_once
+from filtergym.envs.task import named_arrays
+from filtergym.evaluation.estimates import write_estimates
+from filtergym.evaluation.metrics import chi_square_band
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.filters.gaussian import log_density
+from filtergym.filters.imm import log_mixture_density
+
+from filtergym import evaluate, read_recording, record, tidy_records
+from filtergym.__main__ import main
+from filtergym.reports.tables import with_interval
+
+TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
+ESM, TIGHT = "filtergym/RadarEsmTracking-v0", "filtergym/TightlyCoupledNavigation-v0"
+UAV = "filtergym/UavAutopilot-v0"
+OPEN = {
+    TARGET: {"horizon": 24},
+    LOOSE: {"horizon": 40, "axes": 2},
+    ESM: {"horizon": 24},
+    TIGHT: {"horizon": 12, "decision_interval": 3},
+}
+DOCS = Path(__file__).parent.parent / "docs"
+BACKENDS = ["numpy", *(["compiled"] if AVAILABLE else [])]
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    """One short recording of every environment with an open loop."""
+    return {env: record(env, episodes=3, backend="numpy", **keywords) for env, keywords in OPEN.items()}
+
+
+def blind(recording):
+    """The same recording without truth."""
+    return dataclasses.replace(recording, truth=None)
+
+
+# --- replay
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("env", OPEN)
+def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
+    keywords = OPEN[env]
+    control = make_task(env).controls[-1]
+    made = record(env, episodes=3, backend=backend, **keywords)
+    made.write(tmp_path / "recording.nc")
+    read = read_recording(tmp_path / "recording.nc")
+    original = gym.make_vec(env, num_envs=3, control=control, backend=backend, **keywords, reward="cost")
+    replay = gym.make_vec(env, num_envs=3, control=control, backend=backend, scenario=read, reward="cost")
+    seeds = {}
+    for seed in range(100):
+        uniforms = np.random.default_rng(seed).random((replay.unwrapped.task.noise.uniforms, 1))
+        seeds[int(replay.unwrapped.task.flight_of(uniforms)[0])] = seed
+    shown = [
+        original.reset(seed=[int(s) for s in episode_seeds("test", 0, 3)])[0],
+        replay.reset(seed=[seeds[i] for i in range(3)])[0],
+    ]
+    np.testing.assert_array_equal(*shown)
+    original.action_space.seed(1)
+    decisions = keywords["horizon"] // original.unwrapped.task.decision_interval
+    for i in range(decisions):
+        action = original.action_space.sample()
+        (seen, paid, _, over, _), (seen2, paid2, _, over2, _) = original.step(action), replay.step(action)
+        np.testing.assert_array_equal(seen, seen2)  # the last one too, on which nobody acts
+        np.testing.assert_array_equal(paid, paid2)
+        np.testing.assert_array_equal(over, over2)
+        assert over.all() == (i == decisions - 1)
+
+
+@pytest.mark.parametrize("env", OPEN)
+def test_evaluation_of_a_replay_is_that_of_the_simulation(env, recordings):
+    policy = {TARGET: "imm", LOOSE: "paper", ESM: "paper", TIGHT: "paper"}[env]
+    names = [policy] if policy in _names(env) else _names(env)[:1]
+    simulated = evaluate(env, names, episodes=3, backend="numpy", tracks=True, **OPEN[env])
+    replayed = evaluate(env, names, scenario=recordings[env], backend="numpy", tracks=True)
+    assert replayed["flight"].values.tolist() == ["0", "1", "2"]
+    for name in ("estimate", "covariance", "error", "cost", "charge", "nees", "nis", "log_likelihood"):
+        np.testing.assert_array_equal(simulated[name].values, replayed[name].values, name)
+
+
+def _names(env):
+    from filtergym.baselines.catalogue import baselines_of
+
+    return list(baselines_of(env).policies)
+
+
+def test_types_of_measurements_come_back(recordings):
+    for env, recording in recordings.items():
+        task = make_task(env, scenario=recording)
+        expected = dict(named_arrays(measured_once(make_task(env, **OPEN[env]))[1]))
+        lanes = Lanes(task, 2)
+        for lane in range(2):
+            lanes.seed(lane, np.random.default_rng(lane))
+        lanes.restart()
+        found = dict(named_arrays(lanes.state.measurement))
+        assert {n: (v.dtype, v.shape) for n, v in found.items()} == {
+            n: (v.dtype, v.shape) for n, v in expected.items()
+        }
+
+
+def test_torch_replays_too(recordings):
+    pytest.importorskip("torch")
+    env = gym.make_vec(TARGET, num_envs=2, backend="torch", scenario=recordings[TARGET])
+    other = gym.make_vec(TARGET, num_envs=2, backend="numpy", scenario=recordings[TARGET])
+    shown, expected = env.reset(seed=3)[0], other.reset(seed=3)[0]
+    np.testing.assert_allclose(shown.numpy(), expected, rtol=1e-12, atol=1e-12)
+    action = np.zeros(env.action_space.shape)
+    np.testing.assert_allclose(env.step(action)[1].numpy(), other.step(action)[1], rtol=1e-9, atol=1e-9)
+
+
+def test_episodes_of_different_lengths_end_where_they_do(tmp_path):
+    made = record(TARGET, episodes=3, backend="numpy", horizon=12)
+    lengths = np.array([12, 7, 4])
+    there = np.arange(13) < lengths[:, None]  # without the measurement after the last one
+    cut = dataclasses.replace(made, lengths=lengths, seconds=np.where(there, made.seconds, np.nan))
+    cut.write(tmp_path / "cut.nc")
+    read = read_recording(tmp_path / "cut.nc", TARGET)
+    assert read.rows.tolist() == lengths.tolist()
+    task = make_task(TARGET, scenario=read)
+    assert task.flights == (12, 7, 4)
+    assert task.horizon == 12
+    dataset = evaluate(TARGET, ["imm"], scenario=read, backend="numpy")
+    assert dataset["length"].values.tolist() == lengths.tolist()
+    assert np.isfinite(dataset["cost"].values[0]).sum(axis=1).tolist() == lengths.tolist()
+    assert make_task(TARGET, scenario=read, horizon=5).flights == (5, 5, 4)
+    assert make_task(TARGET, scenario=read, decision_interval=3).flights == (12, 6, 3)
+    env = gym.make(TARGET, scenario=read, context=True)
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        steps, over = 0, False
+        while not over:
+            shown, _, _, over, _ = env.step(env.action_space.sample())
+            steps += 1
+        assert steps == lengths[int(info["context"]["recording"])]
+        assert np.isfinite(shown).all()
+
+
+def test_flights_and_user_keywords_go_with_a_recording():
+    time = np.arange(0.0, 300.0, 6.0)
+    flights = [
+        {
+            "time": time[:n],
+            "position": np.column_stack([1e4 + 150.0 * time[:n], 5e3 + 0.0 * time[:n]]),
+            "name": name,
+        }
+        for n, name in ((40, "a"), (25, "b"))
+    ]
+    scenario = {"trajectories": flights, "fewest_scans": 2}
+    made = record(TARGET, scenario, episodes=4, backend="numpy", range_sigma=50.0)
+    assert made.parameters == {"range_sigma": 50.0}  # and no table of the flights
+    assert sorted(set(made.lengths.tolist())) == [24, 39]
+    assert make_task(TARGET, scenario=made).parameters.range_sigma == 50.0
+    assert make_task(TARGET, scenario=made, range_sigma=70.0).parameters.range_sigma == 70.0
+    timed = record(LOOSE, episodes=1, backend="numpy", duration=0.3)
+    assert make_task(LOOSE, scenario=timed).horizon == 30
+    assert "duration" not in timed.parameters
+
+
+def test_a_recording_travels(recordings, tmp_path):
+    recording = recordings[ESM]
+    env = gym.make(ESM, scenario=recording)
+    shown, _ = env.reset(seed=5)
+    action = env.action_space.sample()
+    following = env.step(action)[0]
+    again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+    np.testing.assert_array_equal(again.reset(seed=5)[0], shown)
+    for other in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        other.reset(seed=5)
+        np.testing.assert_array_equal(other.step(action)[0], following)
+    recording.write(tmp_path / "esm.nc")
+    named = gym.make(ESM, scenario=str(tmp_path / "esm.nc"))
+    np.testing.assert_array_equal(named.reset(seed=5)[0], shown)
+    assert make_task(ESM, scenario=recording).under("mode").recording is recording
+
+
+# --- without truth
+
+
+def test_without_truth_rewards_are_zero_and_nothing_is_judged(recordings):
+    recording = blind(recordings[TARGET])
+    env = gym.make(TARGET, scenario=recording, detailed_info=True, render_mode="rgb_array")
+    env.reset(seed=0)
+    _, paid, _, _, info = env.step(env.action_space.sample())
+    assert paid == 0.0
+    assert not {"error", "cost", "truth"} & info.keys()
+    assert "estimate" in info
+    assert env.render().shape[2] == 3
+    vector = gym.make_vec(TARGET, num_envs=3, scenario=recording)
+    vector.reset(seed=0)
+    assert vector.step(vector.action_space.sample())[1].tolist() == [0.0] * 3
+    for keywords in ({"reward": "cost"}, {"observation": "asymmetric"}):
+        with pytest.raises(ValueError, match="has no truth, so nobody knows what an estimate costs"):
+            gym.make(TARGET, scenario=recording, **keywords)
+    paying = gym.make(TARGET, horizon=24).unwrapped
+    with pytest.raises(ValueError, match="and this environment pays: make another one"):
+        paying.reset(options={"scenario": recording})
+    paying.reset(options={"scenario": recordings[TARGET]}, seed=0)
+    assert paying.step(paying.action_space.sample())[1] != 0.0
+
+
+def test_without_truth_evaluation_tells_of_innovations(recordings):
+    dataset = evaluate(TARGET, ["imm", "kalman-imm"], scenario=blind(recordings[TARGET]), backend="numpy")
+    assert not {"error", "cost", "charge", "nees"} & set(dataset)
+    found = {(r.policy, r.metric): r for r in tidy_records(dataset) if r.window == "all"}
+    nis, likelihood = (
+        dataset["nis"].sel(policy="imm").values,
+        dataset["log_likelihood"].sel(policy="imm").values,
+    )
+    assert found["imm", "anis"].value == pytest.approx(nis.mean() / 2.0)
+    low, high = chi_square_band(np.array([2.0]))
+    assert found["imm", "nis_inside"].value == pytest.approx(((nis >= low) & (nis <= high)).mean())
+    assert found["imm", "log_likelihood"].value == pytest.approx(likelihood.mean())
+    band = found["imm", "anis_band"]
+    total = 2.0 * nis.size
+    assert (band.low, band.high) == pytest.approx(
+        [float(b[0]) / total for b in chi_square_band(np.array([total]))]
+    )
+    assert found["kalman-imm", "log_likelihood"].value is None  # of one's own estimator nobody knows
+
+
+@pytest.mark.parametrize("env", [LOOSE, ESM, TIGHT])
+def test_every_environment_has_a_likelihood_without_truth(env, recordings):
+    controls = {name: name for name in _names(env)[:3]}
+    dataset = evaluate(env, controls, scenario=blind(recordings[env]), backend="numpy")
+    records = [r for r in tidy_records(dataset) if r.metric == "log_likelihood" and r.window == "all"]
+    assert len(records) == 3
+    assert all(r.value is not None for r in records)
+
+
+@pytest.mark.parametrize("control", ["evidence", "gain"])
+def test_log_likelihood_is_the_density_of_what_was_predicted(control):
+    task = make_task(TARGET, control, horizon=10)
+    lanes = Lanes(task, 3)
+    for lane in range(3):
+        lanes.seed(lane, np.random.default_rng(lane))
+    lanes.restart()
+    action = lanes.widened(np.full((3, *task.action_space.shape), 0.3))
+    for _ in range(3):
+        lanes.step(lambda state: task.act(state, action))
+    bank, said = lanes.state.bank, task.records(task.act(lanes.state, action))
+    if control == "gain":
+        S = np.stack([np.diag(v) for v in bank.innovation_variance.T], axis=-1)
+        expected = log_density(bank.innovation, S)[0]
+    else:
+        each = np.exp(log_density(bank.innovation, bank.innovation_covariance)[0])
+        expected = np.log((np.exp(bank.log_predicted) * each).sum(axis=0))
+    np.testing.assert_allclose(said["log_likelihood"], expected, rtol=1e-9)
+
+
+def test_mixture_density_of_what_underflows():
+    weights = np.log(np.array([[0.25], [0.75]]))
+    density = log_mixture_density(weights, np.array([[-5000.0], [-5001.0]]))
+    np.testing.assert_allclose(density, -5000.0 + np.log(0.25 + 0.75 * np.exp(-1.0)))
+
+
+def test_likelihood_where_a_fix_is_missing_is_none():
+    made = record(LOOSE, "outage", episodes=1, backend="numpy", horizon=300)
+    dataset = evaluate(LOOSE, _names(LOOSE)[:1], scenario=blind(made), backend="numpy")
+    missing = made.measurements["available"][0, :300] == 0.0
+    assert missing.any()
+    np.testing.assert_array_equal(np.isnan(dataset["log_likelihood"].values[0, 0]), missing)
+
+
+def test_references_are_refused_on_recordings(recordings):
+    with pytest.raises(
+        ValueError, match="reference 'known-turn' is told what recording 'random recorded' does not"
+    ):
+        evaluate(TARGET, ["known-turn"], scenario=recordings[TARGET])
+
+
+def test_training_and_tuning_refuse_recordings(recordings):
+    from filtergym.agents.training_run import training_scenarios
+    from filtergym.baselines.tuning import tune
+
+    with pytest.raises(ValueError, match="held out"):
+        training_scenarios(task_class(TARGET), recordings[TARGET])
+    with pytest.raises(ValueError, match="held out"):
+        tune(TARGET, "imm", None, 1000, recordings[TARGET])
+
+
+# --- estimates
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_estimates_are_written(known, recordings, tmp_path):
+    recording = recordings[TARGET] if known else blind(recordings[TARGET])
+    dataset = evaluate(TARGET, ["imm", "kalman-imm"], scenario=recording, backend="numpy", tracks=True)
+    write_estimates(tmp_path / "estimates.nc", dataset)
+    with xarray.open_dataset(tmp_path / "estimates.nc", engine="scipy") as found:
+        np.testing.assert_array_equal(found["estimate"].values, dataset["estimate"].values)
+        variance = np.diagonal(dataset["covariance"].values, axis1=-2, axis2=-1)
+        np.testing.assert_allclose(found["sigma"].values, np.sqrt(variance))
+        assert ("truth" in found) == known
+    write_estimates(tmp_path / "estimates.csv", dataset)
+    lines = (tmp_path / "estimates.csv").read_text().splitlines()
+    header = lines[0].split(",")
+    assert len(lines) == 1 + 2 * 3 * 24
+    row = dict(zip(header, lines[1 + 24 * 3 + 24 + 1].split(","), strict=True))
+    assert (row["policy"], row["recording"], row["measurement"], row["nis"]) == ("kalman-imm", "1", "2", "")
+    assert float(row["estimate_position_y"]) == dataset["estimate"].values[1, 1, 1, 1]
+    assert float(row["seconds"]) == 12.0
+    with pytest.raises(ValueError, match=r"estimates are written as \.csv or \.nc"):
+        write_estimates(tmp_path / "estimates.txt", dataset)
+
+
+# --- closed loops
+
+
+@pytest.mark.parametrize(("env", "keywords"), [(UAV, {}), (TIGHT, {"scenario": "paper"})])
+def test_a_closed_loop_says_why_it_cannot_be_recorded(env, keywords):
+    with pytest.raises(
+        ValueError, match="is a closed loop, in which the estimate decides what is measured next"
+    ):
+        record(env, episodes=1, **keywords)
+
+
+# --- tables
+
+
+def table(path, **columns):
+    """Write a CSV file."""
+    names = list(columns)
+    rows = zip(*(np.asarray(columns[name], dtype=object).tolist() for name in names), strict=True)
+    cells = ["" if v is None or (isinstance(v, float) and v != v) else repr(v) if isinstance(v, float) else str(v)
+             for row in rows for v in row]  # fmt: skip
+    lines = [",".join(cells[i : i + len(names)]) for i in range(0, len(cells), len(names))]
+    path.write_text("\n".join([",".join(names), *lines]) + "\n")
+    return path
+
+
+PLOTS = {
+    "time": [0.0, 5.0, 10.0, 15.0, 20.0],
+    "x": [1000.0, 2000.0, 3100.0, 3900.0, 5000.0],
+    "y": [9000.0, 8900.0, 8800.0, 8500.0, 8400.0],
+}
+
+
+def test_plots_start_from_the_first_two(tmp_path):
+    sigmas = {"sigma_x": [50.0, 60.0, 70.0, 80.0, 90.0], "sigma_y": [40.0] * 5}
+    read = read_recording(table(tmp_path / "plots.csv", **PLOTS, **sigmas), TARGET)
+    assert read.parameters == {"sampling_interval": 5.0}
+    assert read.truth is None
+    assert read.lengths.tolist() == [3]
+    assert read.seconds.tolist() == [[5.0, 10.0, 15.0]]
+    assert read.measurements["position"][0].tolist() == [[3100.0, 8800.0], [3900.0, 8500.0], [5000.0, 8400.0]]
+    assert read.measurements["variance"][0, :, 0].tolist() == [4900.0, 6400.0, 8100.0]
+    np.testing.assert_allclose(read.initial["mean"][0], [2000.0, 8900.0, 200.0, -20.0])
+    # By what is subtracted: x1, and (x1 - x0) / T.
+    J = np.array([[0.0, 1.0], [-0.2, 0.2]])
+    expected = J @ np.diag([2500.0, 3600.0]) @ J.T
+    np.testing.assert_allclose(read.initial["covariance"][0][np.ix_([0, 2], [0, 2])], expected)
+    dataset = evaluate(TARGET, ["imm"], scenario=read, tracks=True)
+    assert np.isfinite(dataset["estimate"].values).all()
+
+
+def test_range_and_azimuth_are_east_and_north(tmp_path):
+    polar = {
+        "time": PLOTS["time"],
+        "range": np.hypot(PLOTS["x"], PLOTS["y"]).tolist(),
+        "azimuth": np.degrees(np.arctan2(PLOTS["x"], PLOTS["y"])).tolist(),
+    }
+    one = read_recording(table(tmp_path / "polar.csv", **polar), TARGET)
+    other = read_recording(table(tmp_path / "plots.csv", **PLOTS), TARGET)
+    np.testing.assert_allclose(one.measurements["position"], other.measurements["position"], rtol=1e-12)
+    np.testing.assert_allclose(one.measurements["variance"], other.measurements["variance"], rtol=1e-12)
+    sigmas = {"range_sigma": [30.0] * 5, "azimuth_sigma": [0.5] * 5}
+    named = read_recording(table(tmp_path / "own.csv", **polar, **sigmas), TARGET)
+    as_parameters = read_recording(tmp_path / "polar.csv", TARGET, range_sigma=30.0, bearing_sigma=0.5)
+    np.testing.assert_allclose(named.measurements["variance"], as_parameters.measurements["variance"])
+    assert as_parameters.parameters["bearing_sigma"] == 0.5
+
+
+def test_several_tracks_with_truth_in_one_table(tmp_path):
+    rows = {name: values * 2 for name, values in PLOTS.items()}
+    truth = {
+        f"truth_{c}": np.arange(10.0).tolist()
+        for c in ("position_x", "position_y", "velocity_x", "velocity_y")
+    }
+    path = table(tmp_path / "two.csv", **rows, recording=["a"] * 5 + ["b"] * 5, **truth)
+    read = read_recording(path, TARGET)
+    assert read.names == ("a", "b")
+    assert read.truth[:, :, 0].tolist() == [[2.0, 3.0, 4.0], [7.0, 8.0, 9.0]]
+    assert np.isfinite(evaluate(TARGET, ["imm"], scenario=read)["cost"].values).all()
+
+
+def test_positions_of_ins_and_receiver(tmp_path):
+    ins = {"ins_x": [0.0, 1.0, 3.0, 6.0], "ins_y": [5.0, 5.0, 4.0, 4.0]}
+    fix = {"fix_x": [0.5, 1.5, None, 5.0], "fix_y": [5.0, 5.5, 4.0, 4.5]}
+    path = table(
+        tmp_path / "log.csv", time=[10.0, 10.1, 10.2, 10.3], **ins, **fix, sigma=[1.0, 2.0, 3.0, 4.0]
+    )
+    read = read_recording(path, LOOSE)
+    assert read.parameters["axes"] == 2
+    assert read.parameters["sampling_interval"] == pytest.approx(0.1)
+    said = read.measurements
+    assert said["increment"][0].tolist() == [[1.0, 0.0], [2.0, -1.0], [3.0, 0.0]]
+    assert said["available"][0].tolist() == [1.0, 0.0, 1.0]
+    assert said["fix"][0].tolist() == [[1.5, 5.5], [0.0, 0.0], [5.0, 4.5]]
+    assert said["reported_deviation"][0].tolist() == [2.0, 3.0, 4.0]
+    assert read.initial["mean"][0].tolist() == [0.0, 5.0]
+    found = evaluate(LOOSE, _names(LOOSE)[:1], scenario=read, tracks=True)
+    assert np.isfinite(found["estimate"].values).all()
+
+
+def test_ranges_and_decisions(tmp_path):
+    path = table(
+        tmp_path / "esm.csv",
+        time=[0.0, 0.5, 1.0, 1.5],
+        range=[9e4, 8.99e4, 8.98e4, 8.97e4],
+        range_rate=[-200.0, -190.0, -210.0, -205.0],
+        decision=[1, None, None, 2],
+        radar_bearing=[359.0, None, None, 10.0],
+        esm_bearing=[2.0, None, None, 11.5],
+    )
+    read = read_recording(path, ESM)
+    said = read.measurements
+    assert said["decision"][0].tolist() == [4, 4, 2]
+    assert said["looked"][0].tolist() == [False, False, True]
+    assert said["bearing_difference"][0].tolist() == [0.0, 0.0, -1.5]
+    assert read.initial["first_decision"][0] == 1
+    assert read.initial["first_bearing_difference"][0] == -3.0
+    # Everyone is told what the simulation tells.
+    initial, _ = measured_once(make_task(ESM))
+    np.testing.assert_allclose(read.initial["covariance"][0], initial.covariance[..., 0])
+    assert np.isfinite(evaluate(ESM, _names(ESM)[:1], scenario=read, tracks=True)["estimate"].values).all()
+
+
+def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, tmp_path):
+    for env, used in ((TARGET, 2), (LOOSE, 0), (ESM, 1)):
+        data = recordings[env].dataset
+        data = data.drop_vars([name for name in data.variables if str(name).startswith("initial_")])
+        data.to_netcdf(tmp_path / "raw.nc", engine="scipy")
+        read = read_recording(tmp_path / "raw.nc")
+        assert read.lengths.tolist() == [n - used for n in recordings[env].lengths]
+        counted = "number" if env == LOOSE else "scan"
+        assert read.measurements[counted][:, 0].tolist() == [1] * 3
+        assert np.isfinite(evaluate(env, _names(env)[:1], scenario=read)["cost"].values).all()
+        if env == TARGET:
+            said = recordings[env].measurements
+            velocity = (said["position"][:, 1] - said["position"][:, 0]) / 6.0
+            np.testing.assert_allclose(read.initial["mean"], np.hstack([said["position"][:, 1], velocity]))
+            np.testing.assert_array_equal(read.truth, recordings[env].truth[:, 2:])
+            np.testing.assert_allclose(read.seconds[:, 0], 6.0)
+        if env == LOOSE:
+            np.testing.assert_allclose(read.initial["mean"], recordings[env].initial["mean"], atol=1e-12)
+    data = recordings[TIGHT].dataset.drop_vars(["initial_mean", "initial_covariance"])
+    data.to_netcdf(tmp_path / "raw.nc", engine="scipy")
+    with pytest.raises(ValueError, match="lacks initial_mean and initial_covariance"):
+        read_recording(tmp_path / "raw.nc")
+
+
+def test_scans_without_a_plot_are_missing_measurements(tmp_path):
+    fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
+    time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
+    x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
+    found = plot_measurements(Columns("track", {"x": x, "y": x + 1.0}, time, {}))
+    said = found.measurements
+    assert set(said) == set(fields)
+    assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]
+    assert said["available"].tolist() == [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]
+    np.testing.assert_allclose(said["interval"], [5.2, 4.8, 5.0, 5.0, 5.0, 5.0])
+    np.testing.assert_allclose(said["elapsed"], [5.2, 4.8, 9.8, 14.8, 19.8, 5.0])
+    assert said["position"][1].tolist() == [0.0, 0.0]
+    assert said["variance"][2].tolist() == [1e4, 1e4]  # range_sigma squared
+    assert said["position"][4].tolist() == [6e3, 6001.0]
+
+
+def test_a_table_with_gaps_is_filtered_over_the_times_it_has(tmp_path):
+    """No plot is prediction only, over the time that has passed; nothing becomes NaN but what is of no measurement."""
+    time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0, 40.0])
+    x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3, 8e3])
+    path = table(tmp_path / "gaps.csv", time=time, x=x, y=x + 1.0)
+    read = read_recording(path, TARGET)
+    names = ["imm", "kalman-imm-turn", "adaptive-rearm", "constant"]
+    names = [name for name in names if name in _names(TARGET)]
+    for backend in ("numpy", "auto"):
+        found = evaluate(TARGET, names, scenario=read, tracks=True, backend=backend)
+        assert np.isfinite(found["estimate"].values).all()
+        nis = found["nis"].sel(policy="imm").values[0]
+        assert np.isnan(nis).tolist() == [False, True, True, True, False, False, False]
+    estimate = found["estimate"].sel(policy="imm").values[0]
+    lasted = np.array([4.8, 5.0, 5.0])
+    # Of a mixture of two filters the mean moves on as its own velocity says.
+    moved = estimate[0, :2] + np.cumsum(lasted)[:, None] * estimate[0, 2:]
+    assert abs(estimate[1:4, :2] - moved).max() < 1e-9 * 1e4
+    # The same with cells of the scans that nobody wrote down.
+    full = np.insert(time, 4, [20.0, 25.0])
+    told = np.insert(x, 4, [np.nan, np.nan])
+    again = read_recording(table(tmp_path / "told.csv", time=full, x=told, y=told + 1.0), TARGET)
+    for name, values in read.measurements.items():
+        np.testing.assert_array_equal(values, again.measurements[name])
+
+
+@pytest.mark.parametrize("scenario", ["missed-detections", "irregular-scans"])
+def test_missed_and_irregular_scans_are_replayed_bit_for_bit(scenario, tmp_path):
+    for backend in ("numpy", "auto"):
+        made = record(TARGET, scenario, episodes=3, horizon=30, backend=backend)
+        made.write(tmp_path / "made.nc")
+        simulated = evaluate(TARGET, ["imm"], scenario, 3, horizon=30, backend=backend)
+        replayed = evaluate(TARGET, ["imm"], read_recording(tmp_path / "made.nc"), backend=backend)
+        np.testing.assert_array_equal(simulated["error"].values, replayed["error"].values)
+    interval = made.measurements["interval"]
+    np.testing.assert_allclose(made.seconds, np.cumsum(interval, axis=1))
+    assert (np.ptp(interval) > 1.0) == (scenario == "irregular-scans")
+    assert (made.measurements["available"] == 0.0).any() == (scenario == "missed-detections")
+
+
+def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
+    table(tmp_path / "a.csv", **PLOTS)
+    table(tmp_path / "b.csv", **{name: values[:4] for name, values in PLOTS.items()})
+    table(tmp_path / "c.csv", **changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]))
+    table(tmp_path / "d.csv", **changed(time=[0.0, 6.0, 12.0, 18.0, 24.0]))
+    for source in (tmp_path, str(tmp_path / "*.csv"), [tmp_path / f"{name}.csv" for name in "abcd"]):
+        read = read_recording(source, TARGET)
+        assert read.names == ("a", "b")
+        assert read.lengths.tolist() == [3, 2]
+        assert read.notes == (
+            "c.csv: left out: time is the same in rows 1 and 2: rows must be in the order of their times",
+            "d: left out: sampling_interval is 6.0, and of a 5.0",
+        )
+    dataset = evaluate(TARGET, ["imm"], scenario=read)
+    assert dataset.attrs["notes"] == list(read.notes)
+    assert np.isfinite(dataset["nis"].values[0]).sum(axis=1).tolist() == [3, 2]
+    with pytest.raises(
+        ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time is the same"
+    ):
+        read_recording([tmp_path / "c.csv"] * 2, TARGET)
+
+
+def test_files_with_and_without_truth_are_not_judged(recordings, tmp_path):
+    recordings[TARGET].write(tmp_path / "known.nc")
+    blind(recordings[TARGET]).write(tmp_path / "untold.nc")
+    read = read_recording(tmp_path)
+    assert read.names[2:4] == ("known: 2", "untold: 0")
+    assert read.truth is None
+    assert read.notes == ("untold: has no truth, so nobody is judged",)
+
+
+def test_a_horizon_makes_episodes_shorter(recordings, tmp_path):
+    recordings[TARGET].write(tmp_path / "plots.nc")
+    read = read_recording(tmp_path / "plots.nc", horizon=10)
+    assert make_task(TARGET, scenario=read).flights == (10, 10, 10)
+    assert make_task(TARGET, scenario=read, horizon=7).horizon == 7
+
+
+def changed(**columns):
+    """Plots with other columns; None leaves one out."""
+    return {name: values for name, values in {**PLOTS, **columns}.items() if values is not None}
+
+
+LOG = {"time": [0.0, 1.0, 2.0, 3.0], "ins": [0.0, 1.0, 2.0, 3.0], "fix": [0.0, 1.0, 2.0, 3.0]}
+ECHO = {"time": [0.0, 1.0, 2.0], "range": [9e4, 9e4, 9e4], "range_rate": [0.0, 1.0, 2.0]}
+WRONG = {
+    "sigma zero": (TARGET, changed(sigma_x=[1.0, 1.0, 0.0, 1.0, 1.0], sigma_y=[1.0] * 5), "row 2 has 0"),
+    "sigma negative": (
+        TARGET,
+        changed(sigma_x=[1.0] * 5, sigma_y=[1.0, -2.0, 1.0, 1.0, 1.0]),
+        "row 1 has -2",
+    ),
+    "one sigma": (TARGET, changed(sigma_x=[1.0] * 5), "lacks the column sigma_y"),
+    "one coordinate": (TARGET, changed(y=[1.0, 2.0, None, 4.0, 5.0]), "row 2 has one coordinate of two"),
+    "no coordinate": (
+        TARGET,
+        {"time": PLOTS["time"], "sigma_x": [1.0] * 5, "sigma_y": [1.0] * 5},
+        "needs x and y",
+    ),
+    "words": (TARGET, changed(x=["a", 1.0, 2.0, 3.0, 4.0]), "x has 'a' in row 0, which is no number"),
+    "decreasing": (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases between rows 1 and 2"),
+    "twice": (TARGET, changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]), "time is the same in rows 1 and 2"),
+    "no time": (TARGET, changed(time=None), "reads time and x, y"),
+    "two rows": (TARGET, {name: values[:2] for name, values in PLOTS.items()}, "it has 2 plots"),
+    "one row": (
+        TARGET,
+        {name: values[:1] for name, values in PLOTS.items()},
+        "1 row, and a recording needs several",
+    ),
+    "radians": (
+        TARGET,
+        {"time": PLOTS["time"], "range": [9e3] * 5, "azimuth": [400.0] * 5},
+        "azimuth reaches 400, and degrees",
+    ),
+    "range below zero": (
+        TARGET,
+        {"time": PLOTS["time"], "range": [9e3, -1.0, 1.0, 1.0, 1.0], "azimuth": [1.0] * 5},
+        "range is a distance, and row 1 has -1 m",
+    ),
+    "half the truth": (TARGET, changed(truth_position_x=[1.0] * 5), "truth needs every component"),
+    "irregular": (
+        LOOSE,
+        {**LOG, "time": [0.0, 1.0, 2.0, 4.0]},
+        "times are 2 s apart after row 2 and 1 s elsewhere",
+    ),
+    "no fix": (LOOSE, {**LOG, "fix": [None] * 4}, "no row has a fix"),
+    "INS missing": (LOOSE, {**LOG, "ins": [0.0, None, 2.0, 3.0]}, "ins has no value in row 1"),
+    "no INS": (LOOSE, {"time": LOG["time"], "fix": LOG["fix"]}, "lacks the column ins"),
+    "unknown type": (ESM, {**ECHO, "decision": [0, 7, None]}, "from 0 to 3, and row 1 has 7"),
+    "no bearings": (
+        ESM,
+        {**ECHO, "decision": [0, None, None]},
+        "the gate needs radar_bearing and esm_bearing",
+    ),
+    "one bearing": (
+        ESM,
+        {**ECHO, "decision": [0, 1, None], "radar_bearing": [1.0, 2.0, 3.0], "esm_bearing": [1.0, None, 3.0]},
+        "row 1 has a decision and lacks a bearing",
+    ),
+    "no tables": (TIGHT, LOG, "reads recordings from NetCDF only"),
+    "a closed loop": (UAV, LOG, "is a closed loop, in which the estimate decides"),
+    "kilometres away": (TARGET, changed(x=[1e6] * 5), "a plot lies 1,000 km from the radar"),
+    "another environment": (ESM, PLOTS, "reads time and range, range_rate"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_tables_are_one_sentence(case, tmp_path):
+    env, columns, sentence = WRONG[case]
+    with pytest.raises(ValueError, match=r"recording .*wrong\.csv: ") as refusal:
+        read_recording(table(tmp_path / "wrong.csv", **columns), env)
+    assert sentence in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "sentence"),
+    [
+        ("empty.csv", b"", "it has the columns none"),
+        ("binary.csv", b"\xff\xfe\x00\x01" * 9, "it is no text in UTF-8"),
+        ("empty.nc", b"", "it is empty"),
+        ("binary.nc", b"\x00\x01" * 99, "it is no NetCDF"),
+        ("words.txt", b"time,x,y\n", "a recording ends in .csv, .nc"),
+    ],
+)
+def test_files_that_are_no_recordings(name, content, sentence, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=f"recording .*{name}: ") as refusal:
+        read_recording(tmp_path / name, TARGET)
+    assert sentence in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
+    with pytest.raises(ValueError, match="does not say of which environment"):
+        read_recording(table(tmp_path / "plots.csv", **PLOTS))
+    with pytest.raises(ValueError, match="there is no such file"):
+        read_recording(tmp_path / "nothing.nc")
+
+
+def test_ten_million_rows_are_refused_early(tmp_path):
+    row = b"1,2,3\n"
+    (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + row * (MOST_ROWS + 2))
+    with pytest.raises(ValueError, match="more than 1,000,000 rows"):
+        read_recording(tmp_path / "long.csv", TARGET)
+    with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may hold"):
+        record(TARGET, episodes=10, horizon=10_000_000)
+
+
+# --- NetCDF
+
+
+NOT_FINITE = "position is not finite at measurement 3; what is missing has the value zero"
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (
+            lambda d: d.assign_attrs(environment=LOOSE),
+            "it is of filtergym/LooselyCoupledNavigation-v0, not of",
+        ),
+        (lambda d: d.assign_attrs(parameters="{"), "must be a JSON object"),
+        (
+            lambda d: d.assign_attrs(parameters='{"rang_sigma": 1}'),
+            "sets 'rang_sigma', which is no parameter",
+        ),
+        (lambda d: d.drop_vars("variance"), "lacks variance; filtergym/ManeuveringTarget-v0 measures scan"),
+        (lambda d: d.drop_vars("initial_mean"), "lacks initial_mean"),
+        (lambda d: d.assign(height=d["scan"]), "has height, which is nothing that"),
+        (lambda d: d.isel(position_axis0=[0]), "position has the shape (1,)"),
+        (lambda d: d.drop_vars("seconds"), "lacks the variable seconds"),
+        (lambda d: d.assign(seconds=-d["seconds"]), "seconds must increase, and measurement 2 has -12 s"),
+        (lambda d: d.assign(seconds=0.0 * d["seconds"] + np.nan), "it holds no measurements"),
+        (lambda d: d.assign(position=d["position"].where(d["scan"] != 3.0)), NOT_FINITE),
+        (lambda d: d.assign(length=d["length"] + 5), "length must be from 1 to its 25 measurements, got 29"),
+        (
+            lambda d: d.assign(truth=d["truth"].isel(component=slice(2)).rename(component="two")),
+            "truth has 2",
+        ),
+    ],
+)
+def test_wrong_netcdf_is_one_sentence(change, sentence, recordings, tmp_path):
+    change(recordings[TARGET].dataset).to_netcdf(tmp_path / "wrong.nc", engine="scipy")
+    with pytest.raises(ValueError, match=r"wrong") as refusal:
+        read_recording(tmp_path / "wrong.nc", TARGET)
+    assert sentence in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_satellites_without_velocity(recordings, tmp_path):
+    data = recordings[TIGHT].dataset.drop_vars("satellite_velocity")
+    data.to_netcdf(tmp_path / "gnss.nc", engine="scipy")
+    with pytest.raises(ValueError, match=r"lacks satellite_velocity; .* measures number, readings"):
+        gym.make(TIGHT, scenario=tmp_path / "gnss.nc")
+
+
+def test_files_say_what_they_hold(recordings):
+    data = recordings[LOOSE].dataset
+    assert data["ins"].dims[:2] == data["seconds"].dims == ("episode", "time")
+    assert data["truth"].dims == ("episode", "time", "component")
+    assert data["initial_covariance"].dims == ("episode", "component", "other_component")
+    assert data.attrs["environment"] == LOOSE
+    assert json.loads(data.attrs["parameters"])["axes"] == 2
+    assert data["recording"].values.tolist() == ["0", "1", "2"]
+
+
+def test_recordings_of_another_environment_are_refused(recordings):
+    with pytest.raises(
+        ValueError, match="is of filtergym/ManeuveringTarget-v0, not of filtergym/RadarEsmTracking-v0"
+    ):
+        gym.make(ESM, scenario=recordings[TARGET])
+    with pytest.raises(
+        ValueError, match=r"ins has the shape \(2,\) and .* with these parameters measures \(1,\)"
+    ):
+        gym.make(LOOSE, scenario=recordings[LOOSE], axes=1)
+
+
+def test_a_single_mistake_of_arrays_is_told(recordings):
+    made = recordings[TARGET]
+    with pytest.raises(ValueError, match="position must have shape"):
+        dataclasses.replace(made, measurements={**made.measurements, "position": np.zeros((3, 4, 2))})
+    with pytest.raises(ValueError, match="as many different names"):
+        dataclasses.replace(made, names=("a", "a", "b"))
+    with pytest.raises(ValueError, match="horizon must be at most 24"):
+        make_task(TARGET, scenario=made, horizon=30)
+
+
+def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
+    from filtergym.envs.maneuvering_target.world import RadarWorld
+    from filtergym.envs.task import World
+
+    monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
+    with pytest.raises(ValueError, match="does not say what an error costs"):
+        make_task(TARGET, scenario=recordings[TARGET])
+    make_task(TARGET, scenario=blind(recordings[TARGET]))
+
+
+# --- the page
+
+PAGE = DOCS / "own_data.md"
+
+
+def test_the_example_of_the_page_prints_what_it_says(capsys):
+    section = PAGE.read_text(encoding="utf-8").partition("## What the sensors really said")[2]
+    code = section.partition("```python\n")[2].partition("```")[0]
+    exec(code, {})
+    said = [line.rpartition("  # ")[2] for line in code.splitlines() if "  # " in line]
+    assert capsys.readouterr().out.splitlines() == said
+
+
+def test_the_table_of_the_page_is_that_of_its_command(tmp_path):
+    runpy.run_path(str(DOCS / "examples" / "plots.py"))["write_plots"](tmp_path / "plots.csv")
+    read = read_recording(tmp_path / "plots.csv", TARGET)
+    assert read.names == ("straight", "turning")
+    records = tidy_records(evaluate(TARGET, ["imm", "imm-tuned"], scenario=read))
+    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
+    text = PAGE.read_text(encoding="utf-8")
+    for policy, shown in (("imm", "`imm` (paper)"), ("imm-tuned", "`imm-tuned`")):
+        cells = [with_interval(found[policy, metric]) for metric in ("log_likelihood", "anis")]
+        assert f"| {shown} | {' | '.join(cells)} | 0.849 to 1.16 |" in text
+
+
+def test_every_column_is_on_the_page():
+    text = PAGE.read_text(encoding="utf-8")
+    axes = ("ins_y", "ins_z", "fix_y", "fix_z")
+    for env in (TARGET, LOOSE, ESM):
+        columns = [name for name in task_class(env).recorded_columns if name not in axes]
+        assert [name for name in columns if f"`{name}`" not in text] == []
+
+
+# --- the command line
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run a command in an empty folder: exit code, and what it has printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["filtergym", *map(str, words)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        printed = capsys.readouterr()
+        return end.value.code, printed.out + printed.err
+
+    return run
+
+
+def test_record_and_evaluate_on_the_command_line(command, tmp_path):
+    code, out = command("record", TARGET, "--episodes", 2, "--set", "horizon=12", "--out", "plots.nc")
+    assert (code, out.strip()) == (0, "2 episodes in plots.nc")
+    code, out = command(
+        "evaluate",
+        "--recording",
+        "plots.nc",
+        "--policy",
+        "imm",
+        "--estimates",
+        "estimates.csv",
+        "--out",
+        "figures",
+    )
+    assert code == 0
+    assert "2 recordings" in out
+    assert len((tmp_path / "estimates.csv").read_text().splitlines()) == 25
+    assert (tmp_path / "figures" / "records.json").exists()
+    # The file names its environment as a scenario, too.
+    code, again = command("evaluate", "--scenario", "plots.nc", "--policy", "imm")
+    assert code == 0
+    assert again.splitlines()[:9] == out.splitlines()[:9]
+
+
+def test_tables_on_the_command_line(command, tmp_path):
+    table(tmp_path / "plots.csv", **PLOTS)
+    code, out = command(
+        "evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", "--json", "records.json"
+    )
+    assert code == 0
+    assert "log-likelihood per measurement" in out
+    metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
+    assert {"log_likelihood", "anis", "anis_band", "nis_inside"} <= metrics
+    assert not {"rmse", "cost", "anees"} & metrics
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["evaluate", "--recording", "plots.csv"], "does not say of which environment it is"),
+        (["evaluate"], "name an environment, or a recording, which names its own"),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--scenario", "paper"],
+            "takes the place of --scenario",
+        ),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--policy", "known-turn"],
+            "'known-turn' is told what",
+        ),
+        (
+            ["evaluate", TARGET, "--recording", "plots.csv", "--site", "1,2"],
+            "--site is for flights from files",
+        ),
+        (["evaluate", TARGET, "--recording", "nothing/*.csv"], "no file matches 'nothing/*.csv'"),
+        (["record", TARGET, "--out", "plots.csv"], "a recording is a NetCDF file, whose name ends in .nc"),
+        (["record", UAV, "--out", "loop.nc"], "is a closed loop"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_one_sentence(words, sentence, command, tmp_path):
+    table(tmp_path / "plots.csv", **PLOTS)
+    code, out = command(*words)
+    assert code == 2
+    assert sentence in out
+    assert out.startswith("Error: ")
+    assert len(out.strip().splitlines()) == 1
