@@ -46,6 +46,12 @@ class ManeuveringTargetParameters(TaskParameters):
     """Limits of the share j of the scan period by which scans come early at most; each episode draws its own. Scan k is
     at T (k - j u), u uniform on [0, 1), drawn for every scan: later than scan k - 1, whose u differs (ours; the paper:
     never)."""
+    glint_probability: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """That both errors of a scan are those of glint, each scan on its own; nobody says so (ours)."""
+    glint_factor: float = parameter(5.0, above=0.0)
+    """Their standard deviation over that of the others (ours)."""
+    undisturbed: float = parameter(0.0, at_least=0.0, at_most=1.0)
+    """Probability of an episode in which every scan sees the target and none comes early, where others may (ours)."""
     unmodelled_acceleration: float = parameter(0.87, at_least=0.0, at_most=100.0)
     """Usual acceleration of one axis, root of its mean square over the flights of ``random``, m/s^2; enters nothing but
     the covariance that control ``gain`` reports (ours)."""

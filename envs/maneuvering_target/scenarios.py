@@ -4,7 +4,8 @@ Windows are scan numbers, first and last included. The flights of ``atc``, ``cru
 are legs that no training episode contains: time straight or turning (s) and turn rate (deg/s, anticlockwise positive),
 flown exactly. Start, course, side and times are drawn for each episode around the stated ones, so that no flight can be
 learned by heart. ``paper`` is as printed, the same flight always: a policy could learn it by heart. In
-``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar is another.
+``missed-detections`` and ``irregular-scans`` the flights are those of training, and the radar has one fault at a stated
+strength.
 """
 
 from collections.abc import Mapping
@@ -30,8 +31,14 @@ SCENARIOS: Mapping[str, Scenario] = {
         ),
         Scenario(
             "random",
-            "Training distribution: any start, speed and course; up to three manoeuvres of any kind.",
-            {"flight": "random"},
+            "Training distribution: any start, speed and course; up to three manoeuvres of any kind; in half of the "
+            "episodes scans miss the target and come early, from hardly ever to four of ten.",
+            {
+                "flight": "random",
+                "detection_probability": (0.6, 1.0),
+                "scan_jitter": (0.0, 0.95),
+                "undisturbed": 0.5,
+            },
             {"start": (1, 10), "settled": (11, 100)},
             training=True,
         ),
@@ -87,6 +94,13 @@ SCENARIOS: Mapping[str, Scenario] = {
             "irregular-scans",
             "Flights as in random; scans come early by up to 0.8 of the scan period: intervals of 1.2 to 10.8 s.",
             {"flight": "random", "scan_jitter": (0.8, 0.8)},
+            {"start": (1, 10), "settled": (11, 100)},
+        ),
+        Scenario(
+            "glint",
+            "Flights as in random, every scan on time; one scan in ten has errors five times as large. No training "
+            "episode holds any.",
+            {"flight": "random", "glint_probability": 0.1},
             {"start": (1, 10), "settled": (11, 100)},
         ),
     )

@@ -133,8 +133,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         p = self.parameters
-        self.row_uniforms = 0 if p.regular else 2
-        """Of a scan that may miss the target or come early, what decides both."""
+        self.row_uniforms = (0 if p.regular else 2) + (1 if p.glint_probability else 0)
+        """Of a scan that may miss the target or come early, what decides both; then what decides on glint."""
         self.bearing_sigma = math.radians(p.bearing_sigma)
         self.slots = {"maneuver": 1, "random": p.maneuver_count[1], "legs": 0, "track": 0}[p.flight]
         """Manoeuvres that a flight may have."""
@@ -187,9 +187,14 @@ class RadarWorld(World[Task, Truth, Measurement]):
         p, never = self.parameters, 0.0 * position[0]
         if p.regular:
             return None
+        seen = draws.uniform("detection_probability", p.detection_probability)
+        early = draws.uniform("scan_jitter", p.scan_jitter)
+        if p.undisturbed:
+            calm = draws.event("undisturbed", p.undisturbed)
+            seen, early = self.xp.where(calm, 1.0, seen), self.xp.where(calm, 0.0, early)
         return Scans(
-            draws.uniform("detection_probability", p.detection_probability),
-            draws.uniform("scan_jitter", p.scan_jitter),
+            seen,
+            early,
             never,
             never,
             position,
@@ -364,13 +369,16 @@ class RadarWorld(World[Task, Truth, Measurement]):
             scans = scans._replace(
                 early=early, unseen=(1.0 - available) * elapsed, position=on_time[0], velocity=on_time[1]
             )
+        errors = noise[:2]
+        if p.glint_probability:
+            errors = xp.where(noise[-1] < p.glint_probability, p.glint_factor * errors, errors)
         if p.polar_measurements:
-            radius = xp.sqrt(position[0] ** 2 + position[1] ** 2) + p.range_sigma * noise[0]
-            azimuth = xp.atan2(position[1], position[0]) + self.bearing_sigma * noise[1]
+            radius = xp.sqrt(position[0] ** 2 + position[1] ** 2) + p.range_sigma * errors[0]
+            azimuth = xp.atan2(position[1], position[0]) + self.bearing_sigma * errors[1]
             measured = radius * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
         else:
             true_variance = polar.cartesian_variances(position, p.range_sigma, self.bearing_sigma)
-            measured = position + xp.sqrt(true_variance) * noise[:2]
+            measured = position + xp.sqrt(true_variance) * errors
         variance = polar.cartesian_variances(measured, p.range_sigma, self.bearing_sigma)
         if scans is not None:
             seen = available > 0.0
