@@ -57,7 +57,7 @@ class ManeuveringTarget(Task):
     ## Rewards
 
     By default ("relative") what the paper's IMM is charged on the same flight and noise less what the agent is
-    charged: `30 log(1 + x / 30)` each, x the squared position error over `range_sigma` squared in units of 5.2,
+    charged: `30 log(1 + x / 30)` each, x the squared position error over `range_sigma` squared in units of 8.0,
     what the IMM is charged on average. "cost" is the agent's own part, below zero.
 
     ## Starting State
@@ -123,7 +123,7 @@ class ManeuveringTarget(Task):
     )
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
     cost_description = "squared position error over the squared range sigma"
-    reward_unit = 5.2
+    reward_unit = 8.0
     # What a turn costs rules the noise of the reward, and the paper pays for it too.
     reward = "relative"
     paper_policy = PaperPolicy("evidence", (0.0, 0.0))

@@ -63,8 +63,9 @@ class RadarEsmTrackingParameters(TaskParameters):
     )
     """Class transition probabilities q that the *bank* assumes, row = from, column = to (paper (2): a
     constant class). Anything but the identity makes the filters mix on the weights."""
-    evidence_scale: float = parameter(4.0, above=0.0)
-    """Nats that an evidence of one adds to a class's log-posterior (ours)."""
+    evidence_scale: float = parameter(12.0, above=0.0)
+    """Nats that an evidence of one adds to a class's log-posterior (ours: enough against a posterior that is sure of a
+    class which has changed)."""
     averaging_measurements: float = parameter(10.0, at_least=1.0)
     """Time constant of the exponential averages in the observation, scans (ours)."""
     range_scale: float = parameter(3000.0, above=0.0)

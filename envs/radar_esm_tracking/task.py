@@ -103,7 +103,7 @@ class RadarEsmTracking(Task):
     """
 
     id = "filtergym/RadarEsmTracking-v0"
-    interface = 2
+    interface = 3
     paper_source = (
         "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "
         "recognition of the target's class (in Russian)"
