@@ -66,10 +66,8 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
                 one = run.isel(episode=episode)
                 columns: list[Any] = [one[name].values[:, None] for name in series]
                 rows = numpy.concatenate([*columns, *(one[name].values for name in vectors)], axis=1)
-                for measurement, row in enumerate(rows.tolist(), 1):
-                    if (
-                        one["estimate"].values[measurement - 1, 0]
-                        == one["estimate"].values[measurement - 1, 0]
-                    ):
-                        cells = ["" if value != value else repr(value) for value in row]
-                        writer.writerow([policy, recording, measurement, *cells])
+                # Beyond the end of a shorter episode there is none.
+                there = numpy.isfinite(one["estimate"].values[:, 0])
+                for row in numpy.flatnonzero(there).tolist():
+                    cells = ["" if value != value else repr(value) for value in rows[row].tolist()]
+                    writer.writerow([policy, recording, row + 1, *cells])

@@ -176,6 +176,7 @@ def test_every_example_is_tried():
         "mine",
         "inverted_pendulum",
         "flights",
+        "plots",
     }
 
 
