@@ -1,11 +1,11 @@
 """Do no harm: a policy that acts only while something is wrong.
 
-Where filters and sensors are as modelled the paper's algorithm is hard to beat and easy to harm. So the gate answers the
-paper's action, or another policy's, unless an :mod:`alarm <..baselines.alarm>` has spoken within the last decisions.
-The policy inside is asked at every decision, so that it remembers the whole episode when its time comes.
+Where filters and sensors are as modelled the paper's algorithm is hard to beat and easy to harm. So the gate answers
+the paper's action, or another policy's, unless an alarm (:mod:`..baselines.alarm`) has spoken within the last
+decisions. The policy inside is asked at every decision, so that it remembers the whole episode when its time comes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -14,7 +14,8 @@ import numpy
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.catalogue import baselines_of
 from ..envs.task import Task
-from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, kind_of, made
+from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, kind_of, made, shown_as
+from .residual import ResidualPolicy, policy_to_correct
 
 NEVER = numpy.iinfo(numpy.int64).max // 2
 """Decisions since an alarm that has not spoken."""
@@ -137,7 +138,7 @@ class Gated(Policy):
         if own != task.control:
             raise ValueError(f"the policy is made for control {own!r}, but the task has {task.control!r}")
         self.gate = Gate(task, fallback, alarm, window)
-        _tell(self, self.policy)
+        shown_as(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory]:
         """Memories of policy and gate."""
@@ -151,8 +152,30 @@ class Gated(Policy):
         return action, (memory, gate_memory)
 
 
-class GatedMaker:
-    """Makes a gated policy for a task: what a name ``gated:POLICY`` stands for.
+class PolicyMaker:
+    """Makes for a task a policy with others around it.
+
+    Args:
+        maker: of the policy inside, or that policy.
+        wrap: from the task and the policy inside to the whole.
+        control: of both; default: the maker's own.
+    """
+
+    kind = "policy"
+
+    def __init__(self, maker: Any, wrap: Callable[[Task, Any], Any], control: str | None = None) -> None:
+        self.maker, self.wrap = maker, wrap
+        shown_as(self, maker, "control", "task_keywords")
+        if control is not None:
+            self.control = control
+
+    def __call__(self, task: Task) -> Any:
+        """Make it."""
+        return self.wrap(task, made(self.maker, task))
+
+
+def gated(name: str, maker: Any) -> PolicyMaker:
+    """Return what makes a policy behind a gate: what a name ``gated:POLICY`` stands for.
 
     Args:
         name: of the policy, in errors.
@@ -161,31 +184,25 @@ class GatedMaker:
     Raises:
         ValueError: if it does not act.
     """
-
-    kind = "policy"
-
-    def __init__(self, name: str, maker: Any) -> None:
-        kind = kind_of(maker)
-        if kind != "policy":
-            raise ValueError(
-                f"'gated:{name}' cannot be: {name!r} is of kind {kind} and has no actions to gate"
-            )
-        self.maker = maker
-        _tell(self, maker, "control", "task_keywords")
-
-    def __call__(self, task: Task) -> Gated:
-        """Make it."""
-        return Gated(task, self.maker)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, GatedMaker) and self.maker == other.maker
-
-    def __hash__(self) -> int:
-        return hash(self.maker)
+    kind = kind_of(maker)
+    if kind != "policy":
+        raise ValueError(f"{name!r} is of kind {kind} and has no actions that a gate could hold back")
+    return PolicyMaker(maker, Gated)
 
 
-def _tell(outer: Any, inner: Any, *further: str) -> None:
-    """Let a policy be treated as the model inside it: its spaces say how it is asked."""
-    for name in ("observation_space", "action_space", *further):
-        if hasattr(inner, name):
-            setattr(outer, name, getattr(inner, name))
+def as_trained(task: Task, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
+    """Return an agent as it acts in its training run.
+
+    Args:
+        task: of the run.
+        agent: the network alone.
+        residual_to: name of the policy that it corrects, if there is one; a gate then holds back the correction.
+        gated: whether it acts behind a gate.
+
+    Raises:
+        ValueError: if that cannot be.
+    """
+    corrected = policy_to_correct(task, residual_to) if residual_to else None
+    if corrected is not None:
+        agent = ResidualPolicy(task, corrected, agent)
+    return Gated(task, agent, fallback=corrected) if gated else agent

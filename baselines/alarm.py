@@ -6,8 +6,9 @@ positive (Page's cumulative sum, 1954); the alarm speaks where a sum reaches its
 with limit h reaches it once in exp(h) decisions or less (Lorden, 1971), so the limit follows from how many false alarms
 one may cost.
 
-What is wrong may be a surplus of innovations, over what the filter expects, or a lack of them; a measurement that is
-missing; a reading that repeats itself. An environment says in ``Baselines.alarm`` what it looks at; for others there is
+What is wrong may be innovations that are larger than a filter expects, smaller, or to one side; a reading that repeats
+itself. A measurement that is missing is wrong where the filter is not made for it, as one of fixed gains; a Kalman filter
+is told of it and knows what to do. An environment says in ``Baselines.alarm`` what it looks at; for others there is
 :class:`InnovationAlarm`.
 """
 
@@ -119,8 +120,8 @@ class Alarm:
 
 class InnovationAlarm(Alarm):
     """For any task that shows a block or quantity ``innovation``, each component over its predicted deviation: one that
-    is too large, or for a while too large, too small, or to one side; and ``available`` if it is shown: a measurement
-    that is missing.
+    is too large, or for a while too large, too small, or to one side. Where ``available`` is shown as zero there is
+    none, which is not held against the filter.
 
     Raises:
         ValueError: if the task shows no ``innovation``.

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium
 import xarray
 
-from .agents.gate import GatedMaker
+from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
@@ -41,7 +41,7 @@ def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     id = task_class(env).id
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return GatedMaker(inner, competitor(env, inner, trust=trust))
+        return gated(inner, competitor(env, inner, trust=trust))
     if name in baselines.own_names(id):
         return baselines.own_competitor(id, name)
     learned = learned_policy(id, name, trust)

@@ -1,18 +1,19 @@
-"""When something is wrong in LooselyCoupledNavigation: INS or receiver are not as modelled, or a fix is missing."""
+"""When something is wrong in LooselyCoupledNavigation: INS or receiver are not as modelled."""
 
 from typing import Any
 
 import numpy
 
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ..alarm import Alarm, certain, innovation_evidence
+from ..alarm import Alarm, innovation_evidence
 
 
 class FusionAlarm(Alarm):
-    """Innovations of the augmented filter that are larger, smaller or to one side, or a fix that is missing.
+    """Innovations of the augmented filter that are larger, smaller or to one side. An outage is none of these: every
+    filter is told of it.
 
-    Under ``noise`` the steered filter's are taken over the deviation that goes with the noise as the receiver reports it,
-    whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the bank, which
+    Under ``noise`` the steered filter's are taken over the deviation that goes with the noise as the receiver reports
+    it, whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the bank, which
     nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
     """
 

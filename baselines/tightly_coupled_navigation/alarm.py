@@ -1,4 +1,4 @@
-"""When something is wrong in TightlyCoupledNavigation: a sensor is noisy, stuck or missing."""
+"""When something is wrong in TightlyCoupledNavigation: a sensor is noisy or stuck."""
 
 import numpy
 
@@ -8,8 +8,8 @@ from ..alarm import LARGER, Alarm, certain, scale_ratio
 
 
 class SensorAlarm(Alarm):
-    """Innovations of a group of sensors too large under every hypothesis, pseudoranges or rates that are missing, or
-    accelerometers that repeat their last reading exactly: noise never does.
+    """Innovations of a group of sensors too large under every hypothesis, or accelerometers that repeat their last
+    reading exactly: noise never does. Satellites that are hidden are none of these: the filters are told of them.
     """
 
     window = 20
@@ -18,17 +18,15 @@ class SensorAlarm(Alarm):
         super().__init__(task)
         self.nis, self.accelerometer = task.reader("nis"), task.reader("accelerometer")
         self.available = task.reader("pseudorange_available"), task.reader("rate_available")
-        self.readings = [sensor.readings.stop - sensor.readings.start for sensor in task.sensors[2:]]
+        self.others = [sensor.readings.stop - sensor.readings.start for sensor in task.sensors[2:]]
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh every group of sensors."""
-        count, interval = len(observation), self.task.decision_interval
-        tracked = [read(observation) for read in self.available]
-        here = [available.sum(axis=1) for available in tracked]
-        here += [numpy.full(count, float(readings)) for readings in self.readings]
-        degrees = interval * numpy.stack(here, axis=1)
-        # A mean over the readings and measurements of a decision.
+        count = len(observation)
+        here = [read(observation).sum(axis=1) for read in self.available]
+        here += [numpy.full(count, float(readings)) for readings in self.others]
+        degrees = self.task.decision_interval * numpy.stack(here, axis=1)
+        # Shown is the mean over the readings and measurements of a decision.
         mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
-        larger = scale_ratio(degrees * mean, degrees, LARGER)
         stuck = (self.accelerometer(observation) == self.accelerometer(before)).all(axis=1)
-        return numpy.concatenate([larger, certain(stuck)], axis=1)
+        return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)

@@ -11,8 +11,8 @@ import numpy
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ..alarm import InnovationAlarm
 from ..table import Baselines, Tunable
+from .alarm import AutopilotAlarm
 from .estimators import (
     GustInteractingMultipleModel,
     MehraKalman,
@@ -199,7 +199,7 @@ BASELINES = Baselines(
     score_paper="kalman",
     score_bound="matched",
     tunable=TUNABLE,
-    alarm=InnovationAlarm,
+    alarm=AutopilotAlarm,
     best_constant="fixed-best",
     physical=("tracking_rmse", ""),
     benchmark=(
