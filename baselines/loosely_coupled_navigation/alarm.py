@@ -13,8 +13,8 @@ class FusionAlarm(Alarm):
     filter is told of it.
 
     Under ``noise`` the steered filter's are taken over the deviation that goes with the noise as the receiver reports
-    it, whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the bank, which
-    nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
+    it, whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the bank,
+    which nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
     """
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:

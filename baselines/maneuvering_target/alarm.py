@@ -10,11 +10,8 @@ ROUNDING = 1e-6
 
 
 class RadarAlarm(Alarm):
-    """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain that
-    explains the scans better; or a scan that missed the target or came early, of which fixed gains know nothing.
-
-    The paper's filters are none for what they are told: innovations of fixed gains are correlated even on straight
-    flights, and one in thirty of these raises a false alarm.
+    """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
+    that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
     """
 
     window = 50
