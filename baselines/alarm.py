@@ -8,8 +8,9 @@ one may cost.
 
 What is wrong may be innovations that are larger than a filter expects, smaller, or to one side; a reading that repeats
 itself. A measurement that is missing is wrong where the filter is not made for it, as one of fixed gains; a Kalman
-filter is told of it and knows what to do. An environment says in ``Baselines.alarm`` what it looks at; for others there is
-:class:`InnovationAlarm`.
+filter is told of it and knows what to do.
+
+An environment says in ``Baselines.alarm`` what it looks at; for others there is :class:`InnovationAlarm`.
 """
 
 import math
