@@ -25,8 +25,9 @@ class SensorAlarm(Alarm):
         count = len(observation)
         here = [read(observation).sum(axis=1) for read in self.available]
         here += [numpy.full(count, float(readings)) for readings in self.others]
-        degrees = self.task.decision_interval * numpy.stack(here, axis=1)
-        # Shown is the mean over the readings and measurements of a decision.
+        # Shown is the mean over the readings and measurements of a decision; before the first there is one measurement.
+        measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+        degrees = measurements * numpy.stack(here, axis=1)
         mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
         stuck = (self.accelerometer(observation) == self.accelerometer(before)).all(axis=1)
         return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)
