@@ -16,7 +16,15 @@ _HOMES = {
     "Sb3Policy": "sb3_policy",
     "load_sb3_policy": "sb3_policy",
 }
-__all__ = ["Gated", "LearnedPolicy", "ResidualActions", "ResidualPolicy", "Sb3Policy", "load_sb3_policy", "to_sb3"]
+__all__ = [
+    "Gated",
+    "LearnedPolicy",
+    "ResidualActions",
+    "ResidualPolicy",
+    "Sb3Policy",
+    "load_sb3_policy",
+    "to_sb3",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,9 +9,9 @@ import numpy
 from filtergym.agents.gate import Gated, PaperAction, PolicyMaker
 from filtergym.envs.catalogue import task_class
 from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.names import competitor
 
 import filtergym
+from filtergym.names import competitor
 
 
 def row(id: str, agent: str, scenario: str, episodes: int) -> str:
