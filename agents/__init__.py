@@ -9,13 +9,22 @@ from typing import Any
 
 _HOMES = {
     "to_sb3": "adapter",
+    "Gated": "gate",
     "LearnedPolicy": "learned_policy",
     "ResidualActions": "residual",
     "ResidualPolicy": "residual",
     "Sb3Policy": "sb3_policy",
     "load_sb3_policy": "sb3_policy",
 }
-__all__ = ["LearnedPolicy", "ResidualActions", "ResidualPolicy", "Sb3Policy", "load_sb3_policy", "to_sb3"]
+__all__ = [
+    "Gated",
+    "LearnedPolicy",
+    "ResidualActions",
+    "ResidualPolicy",
+    "Sb3Policy",
+    "load_sb3_policy",
+    "to_sb3",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -17,10 +17,13 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from ..envs.environment import TaskEnv, TaskVectorEnv
+from .gate import Gate
 from .residual import check_residual
 
 
-def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) -> "TaskVecEnv":
+def to_sb3(
+    vector_env: Any, staggered: bool = False, residual_to: Any = None, gate: Gate | None = None
+) -> "TaskVecEnv":
     """Return a native vector environment as a Stable-Baselines3 ``VecEnv``.
 
     It gives what ``DummyVecEnv`` gives over as many single environments, each in a ``Monitor``, to the last
@@ -33,6 +36,7 @@ def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) ->
             environments finish one after another instead of all in one step; later episodes are whole. For
             training only: a score over the shortened ones is not a score of whole episodes.
         residual_to: a policy to whose actions the agent's are added; see :mod:`.residual`.
+        gate: that decides whether the agent acts; see :mod:`.gate`.
 
     Raises:
         ValueError: for a vector environment that cannot be adapted, with the reason.
@@ -62,16 +66,17 @@ def to_sb3(vector_env: Any, staggered: bool = False, residual_to: Any = None) ->
         )
     if residual_to is not None:
         check_residual(vector_env.task, residual_to)
-    return TaskVecEnv(vector_env, staggered, residual_to)
+    return TaskVecEnv(vector_env, staggered, residual_to, gate)
 
 
 class TaskVecEnv(VecEnv):
     """See :func:`to_sb3`."""
 
-    def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any) -> None:
+    def __init__(self, env: TaskVectorEnv, staggered: bool, residual_to: Any, gate: Gate | None) -> None:
         self.env = env
-        self.residual_to = residual_to
+        self.residual_to, self.gate = residual_to, gate
         self._policy_memory: Any = None
+        self._gate_memory: Any = None
         self._shown: Any = None
         self._start = numpy.ones(env.num_envs, dtype=bool)
         self.staggered = staggered
@@ -114,12 +119,15 @@ class TaskVecEnv(VecEnv):
 
     def step_async(self, actions: numpy.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
-        if self.residual_to is not None:
+        if self.residual_to is not None or self.gate is not None:
             shown = self._shown["observation"] if self.env.privileged else self._shown
+        if self.residual_to is not None:
             own, self._policy_memory = self.residual_to.predict(
                 shown, self._policy_memory, self._start, deterministic=True
             )
             actions = own + actions
+        if self.gate is not None:
+            actions, _, self._gate_memory = self.gate.choose(shown, actions, self._gate_memory, self._start)
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, numpy.ndarray, numpy.ndarray, list[dict[str, Any]]]:
@@ -158,7 +166,7 @@ class TaskVecEnv(VecEnv):
 
         The latter are shared with this object, so pickle it before the next step.
         """
-        policy = self._policy_memory, self._shown, self._start
+        policy = self._policy_memory, self._gate_memory, self._shown, self._start
         lanes = self.env.lanes.snapshot()
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
@@ -170,7 +178,7 @@ class TaskVecEnv(VecEnv):
         """
         self.env.lanes.restore(snapshot["lanes"])
         self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
-        self._policy_memory, self._shown, self._start = snapshot["policy"]
+        self._policy_memory, self._gate_memory, self._shown, self._start = snapshot["policy"]
 
     # --- the rest of Stable-Baselines3's interface
 

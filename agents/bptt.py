@@ -19,9 +19,11 @@ import gymnasium
 import numpy
 import torch
 
+from ..envs.backend import host_array
 from ..envs.catalogue import find_mixture, make_task, task_class
 from ..envs.environment import TaskVectorEnv
 from ..evaluation.seeds import episode_seeds
+from .gate import Gate, as_trained
 from .learned_policy import LearnedPolicy, write_arrays
 from .training_run import (
     Bookkeeping,
@@ -78,7 +80,11 @@ class RecurrentPolicy(torch.nn.Module):
 
 
 def descend_episodes(
-    env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int, descend: Callable[[], None]
+    env: TaskVectorEnv,
+    policy: RecurrentPolicy,
+    truncation: int,
+    descend: Callable[[], None],
+    gate: Gate | None = None,
 ) -> float:
     """Fly one episode in every environment and descend the gradient of the mean cost.
 
@@ -88,6 +94,7 @@ def descend_episodes(
         truncation: decisions through which the gradient flows back.
         descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
             the mean cost of a decision since the last time; uses and clears them.
+        gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
 
     Returns:
         Mean cost of a measurement, in the unit of the reward and compressed as there.
@@ -95,10 +102,17 @@ def descend_episodes(
     observation, _ = env.reset()
     hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)
     total, pending = 0.0, torch.zeros(())
+    memory, start = None, numpy.ones(env.num_envs, dtype=bool)
     for decision in range(1, env.last_decision + 1):
         action, hidden = policy(observation, hidden)
         # In double, so that the filter's state is not rounded to the network's precision.
-        observation, reward, _, _, _ = env.step(action.double())
+        action = action.double()
+        if gate is not None:
+            shown, answer = (host_array(tensor.detach()) for tensor in (observation, action))
+            chosen, opened, memory = gate.choose(shown, answer, memory, start)
+            start = numpy.zeros(env.num_envs, dtype=bool)
+            action = torch.where(torch.as_tensor(opened)[:, None], action, torch.as_tensor(chosen))
+        observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
         window = (decision - 1) % truncation + 1
         if window == truncation or decision == env.last_decision:
@@ -217,10 +231,11 @@ def train_bptt(
     else:
         measure_normalisation(env, policy)
 
+    gate = Gate(env.task) if run.gated else None
     if env.backend == "compiled":
-        fly = Unrolled(env, policy, values["truncation"], _descended(run)).descend_episodes
+        fly = Unrolled(env, policy, values["truncation"], _descended(run), gate).descend_episodes
     else:
-        fly = functools.partial(descend_episodes, env, policy, values["truncation"])
+        fly = functools.partial(descend_episodes, env, policy, values["truncation"], gate=gate)
 
     def descend() -> None:
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
@@ -252,7 +267,7 @@ def train_bptt(
             interval or max(1, run.steps // 20),
             save_checkpoint,
             save_agent,
-            lambda task: LearnedPolicy(task, policy.arrays(), "tanh"),
+            lambda task: as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated),
             stop,
             report,
             curves_beside(logger),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ..evaluation.files import whole_files, writable_file
 from .learned_policy import stored_policy, write_arrays
-from .named_policies import learned_policy
+from .named_policies import zipped_model
 from .training_run import TrainingRun, best_agent, load_run, save_run, training_costs
 
 CHECK_EPISODES = 32
@@ -29,7 +29,6 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
         raise ValueError(f"{out} must end in .safetensors, by which an evaluation knows what it is")
     writable_file(out)
     source = best_agent(folder)
-    agent = learned_policy(run.environment, str(source), trust)
     with whole_files(out.parent) as waiting:
         file = waiting / out.name
         if source.suffix == ".safetensors":
@@ -37,6 +36,7 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
         else:
             from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
 
+            agent = zipped_model(run.environment, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
         costs = training_costs(run, stored_policy(run.environment, file), CHECK_EPISODES)

@@ -20,6 +20,7 @@ from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
+from .gate import as_trained
 from .training_run import task_keywords
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -218,8 +219,10 @@ class _Stored:
         self.arrays, self.header = _read(path)
         self.path = path
         self.control = self.header["control"]
+        self.around = self.header["run"].get("residual_to", ""), self.header["run"].get("gated", False)
 
-    def __call__(self, task: Task) -> LearnedPolicy:
+    def __call__(self, task: Task) -> Policy:
+        """Make it, with what was around it in training."""
         if self.header["interface"] != str(task.interface):
             raise ValueError(
                 f"{self.path} was trained when fields or actions of {task.id} meant something else (its interface "
@@ -237,7 +240,8 @@ class _Stored:
                 f"{self.path} answers with {self.header['output']} of {self.header['answers']} numbers, which is no "
                 f"action of control {task.control!r}: {space}"
             )
-        return LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
+        network = LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
+        return as_trained(task, network, *self.around)
 
 
 def stored_policy(id: str, path: Path) -> _Stored:

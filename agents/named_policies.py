@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from ..envs.catalogue import task_class
+from .gate import PolicyMaker, as_trained
 from .learned_policy import pretrained_path, stored_policy
-from .training_run import best_agent, load_run
+from .training_run import TrainingRun, best_agent, load_run
 
 
 def shipped_agents(id: str) -> list[str]:
@@ -33,10 +34,21 @@ def learned_policy(id: str, name: str, trust: bool = False) -> Any:
         return _agent_of_run(id, path, trust)
     if name.endswith(".safetensors"):
         return stored_policy(id, path)
-    return _model(id, path, None, trust) if name.endswith(".zip") else None
+    if not name.endswith(".zip"):
+        return None
+    model = zipped_model(id, path, None, trust)
+    # Beside the model of a run that is more than its network lies what it is.
+    return (
+        _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
+    )
 
 
-def _model(id: str, path: Path, control: str | None, trust: bool) -> Any:
+def zipped_model(id: str, path: Path, control: str | None, trust: bool) -> Any:
+    """Load a model of Stable-Baselines3, the network alone.
+
+    Raises:
+        ValueError: if the file is none, or is not trusted.
+    """
     try:
         from .sb3_policy import load_sb3_policy
     except ImportError as error:
@@ -50,7 +62,7 @@ def _agent_of_run(id: str, folder: Path, trust: bool) -> Any:
         # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
         for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
             if (folder / f"{name}.zip").is_file():
-                return _model(id, folder / f"{name}.zip", None, trust)
+                return zipped_model(id, folder / f"{name}.zip", None, trust)
     run = load_run(folder, trust)
     agent = best_agent(folder)
     if agent.suffix == ".safetensors":
@@ -58,7 +70,16 @@ def _agent_of_run(id: str, folder: Path, trust: bool) -> Any:
     own = run.environment.rpartition(":")[2]
     if own != task_class(id).id:
         raise ValueError(f"{folder} holds a run of {own}, not of {task_class(id).id}")
-    return _model(id, agent, run.control, trust)
+    return _as_recorded(zipped_model(id, agent, run.control, trust), run)
+
+
+def _as_recorded(model: Any, run: TrainingRun) -> Any:
+    """Return a model with what was around it in training."""
+    if not (run.residual_to or run.gated):
+        return model
+    return PolicyMaker(
+        model, lambda task, agent: as_trained(task, agent, run.residual_to, run.gated), run.control
+    )
 
 
 def with_normalisation(found: Any) -> Any:

@@ -10,9 +10,10 @@ from typing import Any
 import gymnasium
 import numpy
 
+from ..baselines.names import own_competitor
 from ..envs.environment import TaskEnv
 from ..envs.task import Task
-from ..evaluation.competitors import Policy
+from ..evaluation.competitors import Policy, kind_of, made, shown_as
 
 
 def check_residual(task: Task, policy: Any) -> None:
@@ -24,6 +25,28 @@ def check_residual(task: Task, policy: Any) -> None:
     own = getattr(policy, "control", task.control)
     if own != task.control:
         raise ValueError(f"the policy is made for control {own!r}, but the environment has {task.control!r}")
+
+
+def policy_to_correct(task: Task, name: str) -> Any:
+    """Make the policy that an agent corrects in a training run.
+
+    Args:
+        task: of both.
+        name: one of the environment's own policies, tuned or not.
+
+    Raises:
+        ValueError: for an unknown name, what does not act, acts under parameters of its own, or cannot be corrected.
+    """
+    maker = own_competitor(task.id, name)
+    if kind_of(maker) != "policy":
+        raise ValueError(f"{name!r} is of kind {kind_of(maker)} and has no actions that could be corrected")
+    if getattr(maker, "task_keywords", {}):
+        raise ValueError(
+            f"policy {name!r} acts under parameters of its own, and an agent trains under the environment's: choose "
+            "another policy to correct"
+        )
+    check_residual(task, maker)
+    return made(maker, task)
 
 
 class ResidualActions(gymnasium.Wrapper):
@@ -85,6 +108,7 @@ class ResidualPolicy(Policy):
         check_residual(task, policy)
         self.control = task.control  # type: ignore[misc]
         self.policy, self.agent = policy, agent
+        shown_as(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any]:
         """Memories of both."""

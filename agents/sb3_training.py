@@ -28,8 +28,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from ..envs.catalogue import make_task
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
+from .gate import Gate, PolicyMaker, as_trained
 from .learned_policy import write_arrays
 from .network_arrays import network_arrays
+from .residual import policy_to_correct
 from .sb3_policy import Sb3Policy
 from .training_run import (
     Bookkeeping,
@@ -38,6 +40,7 @@ from .training_run import (
     curves_beside,
     interruption,
     logger_in,
+    save_run,
     schedule,
     task_keywords,
 )
@@ -80,7 +83,9 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
         **run.hyperparameters.get("env_kwargs", {}),
     )
     run.backend = env.unwrapped.backend
-    adapted = to_sb3(env)
+    task = env.unwrapped.task
+    corrected = policy_to_correct(task, run.residual_to) if run.residual_to else None
+    adapted = to_sb3(env, residual_to=corrected, gate=Gate(task, corrected) if run.gated else None)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
     return adapted
 
@@ -98,6 +103,8 @@ def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder:
 def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
     """Write a model, and beside it ``agent.safetensors``, its plain arrays, if a learned policy can hold it."""
     save_model(agent.model, agent.normalisation, folder)
+    if run.residual_to or run.gated:
+        save_run(run, folder / "run.json")  # without it nobody who finds the model knows how it acts
     with contextlib.suppress(ValueError):
         arrays, output, activation = network_arrays(agent, run.algorithm)
         write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
@@ -224,7 +231,7 @@ def train_sb3(
             interval or max(1, run.steps // 20),
             lambda place: save_checkpoint(model, adapted, normalisation, place),
             lambda place: save_agent(policy, run, place),
-            policy,
+            PolicyMaker(policy, lambda task, agent: as_trained(task, agent, run.residual_to, run.gated)),
             stop,
             report,
             curves_beside(logger),

@@ -22,7 +22,7 @@ from typing import Any, NotRequired, TypedDict
 import numpy
 
 from ..baselines.catalogue import baselines_of
-from ..baselines.names import evaluate
+from ..baselines.names import evaluate, own_competitor
 from ..envs.catalogue import (
     find_mixture,
     find_scenario,
@@ -38,6 +38,8 @@ from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.stored import read_json, restored
+from .gate import Gate
+from .residual import policy_to_correct
 from .settings import OPTIONS, check_hyperparameters, check_keywords, merged, read_config
 
 FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
@@ -84,6 +86,10 @@ class TrainingRun:
     """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
     interface: int = 1
     """Of the environment when the run began, see :class:`~..envs.task.Task`."""
+    residual_to: str = ""
+    """Name of the policy that the agent corrects; none if empty."""
+    gated: bool = False
+    """Whether the agent acts only where something is wrong, see :mod:`.gate`."""
 
     @property
     def finished(self) -> bool:
@@ -108,6 +114,8 @@ def new_run(
     backend: str = "auto",
     keywords: Mapping[str, Any] | None = None,
     config: Path | None = None,
+    residual_to: str = "",
+    gated: bool = False,
 ) -> TrainingRun:
     """Describe a run; what is not given comes from the algorithm's hyperparameters.
 
@@ -123,9 +131,13 @@ def new_run(
         backend: what computes the steps.
         keywords: of the environment, parameters, ``reward`` or ``dtype``, likewise.
         config: file of settings, see :func:`.settings.read_config`; it goes before the file that is shipped.
+        residual_to: name of a policy of the environment's own to whose actions the agent's are added; the default
+            control is then that policy's.
+        gated: let the agent act only where something is wrong, see :mod:`.gate`.
 
     Raises:
-        ValueError: for an unknown name, a value out of its limits, or a scenario that is held out.
+        ValueError: for an unknown name, a value out of its limits, a scenario that is held out, or an agent that cannot
+            be around that policy or inside the gate.
     """
     cls = task_class(environment)
     if algorithm not in FILES:
@@ -140,13 +152,17 @@ def new_run(
     of_environment = merged(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     control = control or named["control"]
+    if residual_to and control is None:
+        control = getattr(own_competitor(cls.id, residual_to), "control", None)
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
     backend = backend if backend != "auto" or named["backend"] is None else named["backend"]
     flown = training_scenarios(cls, named["scenario"] if scenario is None else scenario)
     parameters = {name: value for name, value in of_environment.items() if name in parameter_names(cls)}
     for name in flown:
-        make_task(cls.id, control, name, **parameters)  # says what is wrong with a value
+        task = make_task(cls.id, control, name, **parameters)  # says what is wrong with a value
+    if residual_to or gated:
+        _check_around(algorithm, task, len(flown), residual_to, gated)
     for name, known in (("reward", REWARDS), ("dtype", DTYPES)):
         if name in of_environment and of_environment[name] not in known:
             raise nearest(name, of_environment[name], known)
@@ -169,7 +185,24 @@ def new_run(
         values,
         backend,
         interface=cls.interface,
+        residual_to=residual_to,
+        gated=gated,
     )
+
+
+def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, gated: bool) -> None:
+    """Raise ValueError if an agent cannot correct that policy, or act inside the gate."""
+    if scenarios > 1:
+        raise ValueError(
+            "a policy to correct and a gate are made for the parameters of one scenario: train on one, not on a mixture"
+        )
+    if residual_to and algorithm == "bptt":
+        raise ValueError(
+            "algorithm 'bptt' has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or sac"
+        )
+    corrected = policy_to_correct(task, residual_to) if residual_to else None
+    if gated:
+        Gate(task, corrected)
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
@@ -330,6 +363,8 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
         "seed",
         "envs",
         "hyperparameters",
+        "residual_to",
+        "gated",
     )
     for name in compared:
         has, wanted = getattr(run, name), getattr(run if same and name == "hyperparameters" else asked, name)
@@ -370,6 +405,8 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = Fals
         [
             f"filtergym train {run.environment} --algo {run.algorithm} --control {run.control} "
             f"--scenario {run.scenario} --steps {run.steps} --envs {run.envs} --seed {run.seed}",
+            *([f"--residual-to {run.residual_to}"] if run.residual_to else []),
+            *(["--gated"] if run.gated else []),
             *_settings_in_words(run),
         ]
     )

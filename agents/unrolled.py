@@ -13,6 +13,7 @@ import torch
 
 from ..envs.environment import TaskVectorEnv
 from ..envs.rollout import Rollout
+from .gate import Gate
 
 LIMIT = 10.0
 """Largest normalised observation that the policy sees."""
@@ -159,14 +160,25 @@ class Unrolled:
         policy: a :class:`~.bptt.RecurrentPolicy`.
         truncation: most decisions of a window.
         reward: that is ascended, "cost" or "log-likelihood".
+        gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
     """
 
-    def __init__(self, env: TaskVectorEnv, policy: Any, truncation: int, reward: str = "cost") -> None:
+    def __init__(
+        self,
+        env: TaskVectorEnv,
+        policy: Any,
+        truncation: int,
+        reward: str = "cost",
+        gate: Gate | None = None,
+    ) -> None:
         lanes: Any = env.lanes  # of one task
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation = min(truncation, env.last_decision)
         self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
+        self._gate: Any = gate
+        self._gate_memory: Any = None
+        self._opened = numpy.ones((self._truncation, env.num_envs))
         fields = env.task.fields
         self._mean = [i for i, field in enumerate(fields) if field.over_interval == "mean"]
         self._last = [i for i, field in enumerate(fields) if field.over_interval != "mean"]
@@ -185,6 +197,7 @@ class Unrolled:
         self._observation = self._env.reset()[0].T
         self._rollout.load(self._lanes.state)
         self._policy.begin()
+        self._gate_memory, self._start = None, numpy.ones(self._env.num_envs, dtype=bool)
 
     def _add_gradients(self, decisions: int) -> float:
         """Add the gradients of the mean cost of the coming decisions; return it.
@@ -197,6 +210,8 @@ class Unrolled:
         policy.read()
         for decision in range(decisions):
             action = policy.forward(decision, self._observation)
+            if self._gate is not None:
+                action = self._through_gate(decision, action)
             mean: Any = 0.0
             for measurement in range(decision * interval, (decision + 1) * interval):
                 rollout.action[measurement, :, :count] = action
@@ -222,9 +237,20 @@ class Unrolled:
                 if interval > 1:
                     rollout.shown_adjoint[self._last] = 0.0
                 of_action = of_action + rollout.action_adjoint[:, :count]
+            if self._gate is not None:
+                of_action = of_action * self._opened[decision]
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
             if interval > 1:
                 rollout.shown_adjoint[self._mean] /= interval
         policy.add_gradients(decisions)
         rollout.go_on()
         return -paid * share
+
+    def _through_gate(self, decision: int, action: numpy.ndarray) -> numpy.ndarray:
+        """Hold back actions ``(A, N)`` where nothing is wrong, and remember where they are not."""
+        chosen, opened, self._gate_memory = self._gate.choose(
+            self._observation.T, action.T, self._gate_memory, self._start
+        )
+        self._start = numpy.zeros_like(self._start)
+        self._opened[decision] = opened
+        return chosen.T

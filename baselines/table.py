@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..evaluation.competitors import Policy
+from .alarm import Alarm
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,9 @@ class Baselines:
     """The tunable policy that stands for the best constant action in the room table."""
     metrics: Callable[[Any, Any], list[Any]] | None = None
     """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
+
+    alarm: Callable[[Any], Alarm] | None = None
+    """Class that says from observations that something is wrong, for any control; None: the general one."""
 
     @property
     def names(self) -> tuple[str, ...]:

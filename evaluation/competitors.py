@@ -67,6 +67,19 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
     return found
 
 
+def shown_as(outer: Any, inner: Any, *further: str) -> None:
+    """Let a policy be asked like the model inside it, whose spaces say how.
+
+    Args:
+        outer: the policy.
+        inner: what may be a model of Stable-Baselines3.
+        further: attributes that go over, too, where there are any.
+    """
+    for name in ("observation_space", "action_space", *further):
+        if hasattr(inner, name):
+            setattr(outer, name, getattr(inner, name))
+
+
 class Policy:
     """Base of the classical policies: made for a task, deterministic unless it says otherwise.
 

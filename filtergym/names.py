@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium
 import xarray
 
+from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
@@ -20,6 +21,9 @@ from .evaluation.recording import record as record
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
 
+GATED = "gated:"
+"""Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
+
 
 def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     """Return what makes a policy, estimator, reference or bound for a task.
@@ -27,13 +31,17 @@ def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
-            ``.zip`` of a Stable-Baselines3 model), the folder of a training run, or ``module:Class`` of a user's.
+            ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
+            ``gated:NAME`` of a policy: that one where something is wrong, elsewhere the paper's algorithm.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
         ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
     id = task_class(env).id
+    if name.startswith(GATED):
+        inner = name.removeprefix(GATED)
+        return gated(inner, competitor(env, inner, trust=trust))
     if name in baselines.own_names(id):
         return baselines.own_competitor(id, name)
     learned = learned_policy(id, name, trust)

@@ -20,6 +20,7 @@ from ...evaluation.metrics import Measure, mean_of_present
 from ...filters import loosely_coupled as ins_gnss
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
 from ..table import Baselines, Tunable
+from .alarm import FusionAlarm
 from .augmented import WINDOW, AugmentedFilter, AugmentedMemory
 from .estimators import AugmentedMehra, AugmentedSageHusa, AugmentedVariationalBayes
 from .references import Matched, MatchedCovariance
@@ -414,6 +415,7 @@ BASELINES = Baselines(
     score_paper="plain-reduced",
     score_bound="matched",
     tunable=TUNABLE,
+    alarm=FusionAlarm,
     best_constant="best-constant",
     compared=("augmented",),
     benchmark=(

@@ -15,6 +15,7 @@ from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, Tunable
+from .alarm import RadarAlarm
 from .references import KnownInputBound, KnownTurn
 from .tunable_estimators import ESTIMATORS
 from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
@@ -211,6 +212,7 @@ BASELINES = Baselines(
     score_paper="imm",
     score_bound="known-turn",
     tunable=TUNABLE,
+    alarm=RadarAlarm,
     best_constant="fixed-best",
     benchmark=(
         "imm",

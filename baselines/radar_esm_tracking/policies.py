@@ -16,6 +16,7 @@ from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, Tunable
+from .alarm import ClassAlarm
 from .metrics import metrics
 from .references import Ideal, KnownClassBound
 
@@ -266,6 +267,7 @@ BASELINES = Baselines(
     score_paper="quasi-optimal",
     score_bound="ideal",
     tunable=TUNABLE,
+    alarm=ClassAlarm,
     best_constant="fixed-weights",
     physical=("rmse", "acceleration"),
     benchmark=(

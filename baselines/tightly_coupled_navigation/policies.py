@@ -15,6 +15,7 @@ from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, Tunable
+from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
 from .metrics import metrics
 from .references import KnownMode, KnownModeBound
@@ -248,6 +249,7 @@ BASELINES = Baselines(
     score_paper="multi-hypothesis",
     score_bound="known-mode",
     tunable=TUNABLE,
+    alarm=SensorAlarm,
     best_constant="fixed-gain",
     # Those that tell most: a policy takes seconds here, and the quick benchmark has two minutes for everything.
     benchmark=("multi-hypothesis", "nis-adaptive", "singer", "known-mode", "known-mode-bound"),

@@ -12,6 +12,7 @@ from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, Tunable
+from .alarm import AutopilotAlarm
 from .estimators import (
     GustInteractingMultipleModel,
     MehraKalman,
@@ -198,6 +199,7 @@ BASELINES = Baselines(
     score_paper="kalman",
     score_bound="matched",
     tunable=TUNABLE,
+    alarm=AutopilotAlarm,
     best_constant="fixed-best",
     physical=("tracking_rmse", ""),
     benchmark=(

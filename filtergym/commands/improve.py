@@ -81,6 +81,12 @@ def train(
         Path | None, typer.Option(help="YAML file of settings, in rl-zoo3's form or with keys env and algo.")
     ] = None,
     reward: Annotated[str | None, typer.Option(help="cost, log-likelihood or relative.")] = None,
+    residual_to: Annotated[
+        str, typer.Option(metavar="POLICY", help="Policy of the environment that the agent corrects.")
+    ] = "",
+    gated: Annotated[
+        bool, typer.Option("--gated", help="The agent acts only where an alarm says that something is wrong.")
+    ] = False,
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
@@ -117,7 +123,19 @@ def train(
     if reward is not None:
         keywords["reward"] = reward
     run = training_run.new_run(
-        environment, algo, control, steps, envs, seed, scenario, hyperparameters, backend, keywords, config
+        environment,
+        algo,
+        control,
+        steps,
+        envs,
+        seed,
+        scenario,
+        hyperparameters,
+        backend,
+        keywords,
+        config,
+        residual_to,
+        gated,
     )
     run = training_run.opened_run(out, run, resume, same=not (keywords or hyperparameters or config))
     with progress_bar() as bar:

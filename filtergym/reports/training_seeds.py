@@ -135,8 +135,8 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
                 f"runs of one environment are compared: {folder} is of {run.environment}, "
                 f"others are of {first.environment}"
             )
-        controls = {other.control for other in runs.values() if other.algorithm == run.algorithm}
-        label = run.algorithm if len(controls) == 1 else f"{run.algorithm} {run.control}"
+        controls = {other.control for other in runs.values() if _algorithm(other) == _algorithm(run)}
+        label = _algorithm(run) if len(controls) == 1 else f"{_algorithm(run)} {run.control}"
         other = seen.setdefault(label, run)
         for field in ("scenario", "envs", "hyperparameters"):
             if getattr(run, field) != getattr(other, field):
@@ -149,6 +149,12 @@ def load_runs(folders: Sequence[Path], trust: bool = False) -> list[SeedRun]:
             raise ValueError(f"{folder} is a second run of {member.name}")
         found[member.name] = member
     return sorted(found.values(), key=lambda member: (member.algorithm, member.run.seed))
+
+
+def _algorithm(run: TrainingRun) -> str:
+    """Name of a run's algorithm, with what is around the agent."""
+    around = f" on {run.residual_to}" if run.residual_to else ""
+    return run.algorithm + around + (" gated" if run.gated else "")
 
 
 def learning_curves(runs: Sequence[SeedRun]) -> Any:

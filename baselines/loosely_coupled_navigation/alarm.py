@@ -1,0 +1,35 @@
+"""When something is wrong in LooselyCoupledNavigation: INS or receiver are not as modelled."""
+
+import numpy
+
+from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.observation import signed_logarithm
+from ..alarm import Alarm, innovation_evidence
+
+COMPRESSED = 0.38684360137
+"""Variance of the signed logarithm of a standard normal number."""
+
+
+class FusionAlarm(Alarm):
+    """Innovations of the augmented filter that are larger, smaller or to one side. An outage is none of these: every
+    filter is told of it.
+
+    Under ``noise`` they are the steered filter's, shown over the deviation that goes with the receiver's noise as it
+    reports it, whatever the agent takes it to be. Under ``mode`` and ``weights`` there is an augmented filter in the
+    bank, which nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
+    """
+
+    def __init__(self, task: LooselyCoupledNavigation) -> None:
+        super().__init__(task)
+        self.innovation, self.available = task.reader("innovation_over_sigma"), task.reader("available")
+        self.axes = task.parameters.axes
+
+    def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
+        """Weigh the innovations of each axis."""
+        innovation, available = self.innovation(observation)[:, -self.axes :], self.available(observation)
+        # Shown is the mean over a decision's measurements of the compressed value; before the first there is one.
+        measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+        count = numpy.maximum(available * measurements, 1.0)
+        mean = signed_logarithm(innovation, numpy) * measurements / numpy.sqrt(count * COMPRESSED)
+        normalised = numpy.where(measurements > 1, mean, innovation)
+        return innovation_evidence(normalised, numpy.broadcast_to(available > 0.0, normalised.shape))

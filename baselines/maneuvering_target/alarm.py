@@ -1,0 +1,37 @@
+"""When something is wrong in ManeuveringTarget: the target turns, errors are larger, or scans are missed."""
+
+import numpy
+
+from ...envs.task import Task
+from ..alarm import Alarm, certain, innovation_evidence
+
+ROUNDING = 1e-6
+"""Of an interval, scan periods."""
+
+
+class RadarAlarm(Alarm):
+    """Innovations of the filter with the lowest gain that are larger, smaller or to one side; a filter of higher gain
+    that explains the scans better; or a scan that missed the target or came early, for which fixed gains are not made.
+    """
+
+    window = 50
+    false_alarms = 0.3
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.bank = task.control != "gain"
+        names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
+        self.read = [task.reader(name) for name in names]
+        self.available, self.elapsed = task.reader("available"), task.reader("elapsed")
+
+    def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
+        """Weigh scans, and what there is of them."""
+        there = self.available(observation) > 0.0
+        innovation, *likelihood = (read(observation) for read in self.read)
+        if self.bank:
+            y, log_likelihood = likelihood
+            innovation = numpy.stack([innovation[:, 0], y[:, 0]], axis=1)
+            likelihood = [log_likelihood[:, 1:] - log_likelihood[:, :1]]
+        weighed = innovation_evidence(innovation, numpy.broadcast_to(there, innovation.shape))
+        irregular = ~there | (numpy.abs(self.elapsed(observation) - 1.0) > ROUNDING)
+        return numpy.concatenate([weighed, *likelihood, certain(irregular[:, 0])], axis=1)

@@ -1,0 +1,33 @@
+"""When something is wrong in TightlyCoupledNavigation: a sensor is noisy or stuck."""
+
+import numpy
+
+from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
+from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
+from ..alarm import LARGER, Alarm, certain, scale_ratio
+
+
+class SensorAlarm(Alarm):
+    """Innovations of a group of sensors too large under every hypothesis, or accelerometers that repeat their last
+    reading exactly: noise never does. Satellites that are hidden are none of these: the filters are told of them.
+    """
+
+    window = 20
+
+    def __init__(self, task: TightlyCoupledNavigation) -> None:
+        super().__init__(task)
+        self.nis, self.accelerometer = task.reader("nis"), task.reader("accelerometer")
+        self.available = task.reader("pseudorange_available"), task.reader("rate_available")
+        self.others = [sensor.readings.stop - sensor.readings.start for sensor in task.sensors[2:]]
+
+    def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
+        """Weigh every group of sensors."""
+        count = len(observation)
+        here = [read(observation).sum(axis=1) for read in self.available]
+        here += [numpy.full(count, float(readings)) for readings in self.others]
+        # Shown is the mean over the readings and measurements of a decision; before the first there is one measurement.
+        measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+        degrees = measurements * numpy.stack(here, axis=1)
+        mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
+        stuck = (self.accelerometer(observation) == self.accelerometer(before)).all(axis=1)
+        return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)

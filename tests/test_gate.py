@@ -1,0 +1,403 @@
+"""Gates and alarms: silent where nothing is wrong, heard where something is, and the same in training as outside."""
+
+import dataclasses
+import importlib.util
+import os
+import pickle
+import signal
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from filtergym.agents.gate import Gate, Gated, PaperAction
+from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs import registration
+from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.competitors import ConstantPolicy, Policy
+from scipy.stats import norm
+
+from filtergym import evaluate, make_policy
+from filtergym.names import competitor
+
+ID = "filtergym/ManeuveringTarget-v0"
+
+
+class Scripted(Alarm):
+    """Speaks where the first field is above one."""
+
+    window = 3
+
+    def hear(self, observation, memory, start):
+        return observation[:, 0] > 1.0, None
+
+
+class Counting(Policy):
+    """Answers how many decisions of the episode it has been asked about, in thousandths."""
+
+    control = "gain"
+
+    def act(self, observation, state, start):
+        count = np.where(start, 0, 0 if state is None else state) + 1
+        return count[:, None] / 1000.0, count
+
+
+class Constant(ConstantPolicy):
+    control = "gain"
+    action = (0.5,)
+
+
+def test_gate_is_open_for_a_window_and_the_policy_remembers_what_it_was_not_asked_for():
+    task = make_task(ID, "gain")
+    policy = Gated(task, Counting, alarm=Scripted, fallback=Constant)
+    shown = np.zeros((12, 2, len(task.fields)))
+    shown[[2, 4], 0, 0] = shown[6, 1, 0] = 2.0
+    start = np.zeros((12, 2), dtype=bool)
+    start[0] = start[8, 1] = True
+    state, actions = None, []
+    for row, begun in zip(shown, start, strict=True):
+        action, state = policy.predict(row, state, begun)
+        actions.append(action[:, 0])
+    actions = 1000.0 * np.array(actions).T
+    shut = 500.0
+    np.testing.assert_allclose(actions[0], [shut, shut, 3, 4, 5, 6, 7, shut, shut, shut, shut, shut])
+    # The second episode of the other begins before its window ends.
+    np.testing.assert_allclose(actions[1], [*[shut] * 6, 7, 8, shut, shut, shut, shut])
+
+
+def test_evidence_is_the_ratio_of_densities():
+    z = np.linspace(-4.0, 4.0, 9)
+    wider = norm.logpdf(z, scale=np.sqrt(LARGER)) - norm.logpdf(z)
+    np.testing.assert_allclose(scale_ratio(z**2, 1.0, LARGER), wider, atol=1e-13)
+    np.testing.assert_allclose(shift_ratio(z, 0.5), norm.logpdf(z, 0.5) - norm.logpdf(z), atol=1e-13)
+
+
+class White(InnovationAlarm):
+    """On two innovations, without a task that shows them."""
+
+    def __init__(self, decisions):
+        self.decisions = decisions
+        self.innovation = lambda observation: observation
+        self.available = lambda observation: np.ones((len(observation), 1))
+
+
+def heard(alarm, shown):
+    """Whether the alarm speaks, ``(decisions, N)``."""
+    memory, found = None, []
+    for i, row in enumerate(shown):
+        spoken, memory = alarm.hear(row, memory, np.full(len(row), i == 0))
+        found.append(spoken)
+    return np.array(found)
+
+
+def test_false_alarms_are_as_rare_as_it_says():
+    noise = np.random.default_rng(0).normal(size=(300, 4000, 2))
+    alarm = White(300)
+    alarm.false_alarms = 0.3
+    assert 0.01 < heard(alarm, noise).any(axis=0).mean() <= 0.3
+
+
+@pytest.mark.parametrize(("factor", "mean"), [(2.0, 0.0), (0.4, 0.0), (1.0, 1.0), (1.0, -1.0)])
+def test_it_speaks_soon_and_falls_silent_when_it_is_over(factor, mean):
+    noise = np.random.default_rng(1).normal(size=(300, 200, 2))
+    noise[100:200, :, 0] = mean + factor * noise[100:200, :, 0]
+    spoken = heard(White(300), noise)
+    assert spoken[:100].any(axis=0).mean() < 0.05
+    assert spoken[100:160].any(axis=0).mean() > 0.95
+    assert spoken[150:200].mean() > 0.4
+    assert spoken[240:].any(axis=0).mean() < 0.05
+
+
+AS_MODELLED = [
+    ("LooselyCoupledNavigation", "noise", "paper", {}),
+    ("LooselyCoupledNavigation", "noise", "outage", {"decision_interval": 5}),
+    ("UavAutopilot", "noise", "paper-step", {}),
+    ("RadarEsmTracking", "evidence", "paper", {}),
+    ("TightlyCoupledNavigation", "gain", "matched", {"horizon": 150}),
+    ("TightlyCoupledNavigation", "gain", "two-satellites", {"horizon": 20}),
+]
+WRONG = {
+    "LooselyCoupledNavigation": ("noise", "jamming", {}),
+    "UavAutopilot": ("noise", "sensor-degradation", {}),
+    "RadarEsmTracking": ("evidence", "crowded", {}),
+    "TightlyCoupledNavigation": ("gain", "accelerometer-failure", {"horizon": 300}),
+    "ManeuveringTarget": ("gains", "missed-detections", {}),
+}
+
+
+def opened(name, control, scenario, episodes, **keywords):
+    """Share of episodes in which the gate opens, under the action zero."""
+    seen = []
+
+    class Listening(Gated):
+        def act(self, observation, state, start):
+            action, state = super().act(observation, state, start)
+            seen.append(state[1].since < self.gate.window)
+            return action, state
+
+    def make(task):
+        return Listening(task, PaperAction)
+
+    make.control = control
+    # Compiling takes longer than these episodes.
+    keywords = {"split": "validation", "backend": "numpy", **keywords}
+    evaluate(f"filtergym/{name}-v0", {"gated": make}, scenario, episodes, **keywords)
+    return np.array(seen)[:, :episodes].any(axis=0).mean()
+
+
+@pytest.mark.parametrize(("name", "control", "scenario", "keywords"), AS_MODELLED)
+def test_it_stays_shut_where_nothing_is_wrong(name, control, scenario, keywords):
+    episodes = 8 if scenario == "matched" else 64
+    assert opened(name, control, scenario, episodes, **keywords) < 0.06
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_alarms_hear_what_is_wrong(name):
+    control, scenario, keywords = WRONG[name]
+    assert opened(name, control, scenario, 16, **keywords) > 0.6
+
+
+def test_smaller_noise_is_wrong_too():
+    env = gymnasium.make_vec(
+        "filtergym/LooselyCoupledNavigation-v0", num_envs=8, scenario="paper", horizon=150
+    )
+    task = env.unwrapped.task
+    first, _ = env.reset(seed=0)
+    zero = np.zeros((8, 3))
+    shown = np.stack([first, *(env.step(zero)[0] for _ in range(149))])
+    alarm = baselines_of(task.id).alarm(task)
+    assert not heard(alarm, shown).any()
+    (column,) = task.columns(["innovation_over_sigma"])
+    innovation = shown[..., column]
+    shown[..., column] = np.sign(innovation) * np.log1p(np.expm1(np.abs(innovation)) / 3.0)
+    assert heard(alarm, shown)[100:].any(axis=0).all()
+
+
+def test_every_alarm_serves_every_control(env_id, control, short):
+    """Of every environment; it speaks or not, but answers what it should."""
+    task = make_task(env_id, control, **short)
+    alarm = (baselines_of(env_id).alarm or InnovationAlarm)(task)
+    env = gymnasium.make_vec(env_id, num_envs=3, control=control, backend="numpy", **short)
+    shown, _ = env.reset(seed=0)
+    memory, start = None, np.ones(3, dtype=bool)
+    for _ in range(4):
+        spoken, memory = alarm.hear(shown, memory, start)
+        assert spoken.shape == (3,)
+        assert spoken.dtype == bool
+        assert not np.isnan(memory.sums).any()
+        start = np.zeros(3, dtype=bool)
+        shown = env.step(env.action_space.sample())[0]
+
+
+def test_by_name_alone_and_stepped_it_is_the_same():
+    name = "gated:bptt"
+    data = evaluate(ID, {"gated": name}, episodes=3, scenario="glint")
+    alone = make_policy(ID, name, scenario="glint")
+    env = gymnasium.make(ID, **alone.keywords, detailed_info=True)
+    for i, seed in enumerate(data["episode_seed"].values):
+        shown, _ = env.reset(seed=int(seed))
+        state, costs, over = alone.begin([int(seed)]), [], False
+        while not over:
+            action, state = alone.predict(shown, state)
+            shown, _, _, over, info = env.step(action)
+            costs.append(info["cost"])
+        np.testing.assert_array_equal(costs, data["cost"].values[0, i])
+
+
+def test_gates_that_cannot_be():
+    with pytest.raises(ValueError, match="'kalman-imm' is of kind estimator and has no actions that a gate"):
+        competitor(ID, "gated:kalman-imm")
+    with pytest.raises(ValueError, match="unknown policy 'immm'"):
+        competitor(ID, "gated:immm")
+    with pytest.raises(
+        ValueError, match="has no constant action that is the paper's: give the gate a fallback"
+    ):
+        evaluate(ID, ["gated:hard-imm"], episodes=1)
+    with pytest.raises(ValueError, match="fallback is made for control 'gain', but the task has 'gains'"):
+        Gate(make_task(ID, "gains"), fallback=Constant)
+    with pytest.raises(ValueError, match="policy is made for control 'gain', but the task has 'gains'"):
+        Gated(make_task(ID, "gains"), Constant)
+    with pytest.raises(ValueError, match="window must be at least one decision, got 0"):
+        Gate(make_task(ID, "gain"), window=0)
+    with pytest.raises(ValueError, match="shows no 'innovation' under control 'gains'"):
+        InnovationAlarm(make_task(ID, "gains"))
+
+
+@pytest.fixture
+def pendulum():
+    """The environment of the documentation, which brings no alarm."""
+    file = Path(__file__).parent.parent / "docs" / "examples" / "inverted_pendulum.py"
+    spec = importlib.util.spec_from_file_location("inverted_pendulum", file)
+    sys.modules["inverted_pendulum"] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield "mine/InvertedPendulum-v0"
+    for table in (sys.modules, registration.ADDED, baselines.ADDED, gymnasium.registry):
+        table.pop("inverted_pendulum", None)
+        table.pop("mine/InvertedPendulum-v0", None)
+
+
+def test_an_environment_of_ones_own_has_the_general_alarm_or_brings_one(pendulum):
+    task = make_task(pendulum)
+    assert type(Gate(task).alarm) is InnovationAlarm
+    baselines.ADDED[pendulum] = dataclasses.replace(baselines_of(pendulum), alarm=Scripted)
+    assert type(Gate(task).alarm) is Scripted
+    assert Gate(task).window == 3
+    assert Gate(task, alarm=InnovationAlarm).window == InnovationAlarm.window
+
+
+# --- in training
+
+
+def native(**keywords):
+    from filtergym.agents import to_sb3
+
+    task = make_task(ID, "gain")
+    env = gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", control="gain", horizon=30)
+    made = to_sb3(env, staggered=True, **keywords)
+    made.seed(0)
+    return made, task
+
+
+def test_the_adapter_asks_the_gate_as_the_policy_does():
+    pytest.importorskip("stable_baselines3")
+    inside, task = native(gate=Gate(make_task(ID, "gain"), Constant))
+    outside, _ = native()
+    policy = Gated(task, Counting, fallback=Constant)
+    shown = inside.reset()
+    np.testing.assert_array_equal(outside.reset(), shown)
+    agent, memory, state, start = Counting(task), None, None, np.ones(5, dtype=bool)
+    for step in range(70):
+        raw, memory = agent.predict(shown, memory, start)
+        action, state = policy.predict(shown, state, start)
+        one, other = inside.step(raw), outside.step(action)
+        for mine, theirs in zip(one[:3], other[:3], strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+        if step == 40:
+            kept = pickle.dumps(inside.snapshot())
+            inside, _ = native(gate=Gate(task, Constant))
+            inside.restore(pickle.loads(kept))
+        shown, start = one[0], one[2]
+
+
+@pytest.fixture
+def small(monkeypatch, tmp_path):
+    """Train a few steps of an agent, as a function of the settings of the run."""
+    pytest.importorskip("sb3_contrib")
+    import torch
+    from filtergym.agents import training_run
+    from filtergym.agents.sb3_training import train_sb3
+
+    torch.set_num_threads(1)
+    monkeypatch.setattr(training_run, "VALIDATION_EPISODES", 16)
+
+    def train(folder, steps, resume=False, progress=lambda done: None, **around):
+        network = {"n_steps": 30, "batch_size": 60, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
+        asked = training_run.new_run(ID, "ppo", None, steps, 4, overrides=network, **around)
+        run = training_run.opened_run(tmp_path / folder, asked, resume)
+        return train_sb3(run, tmp_path / folder, resume, 10**9, progress, trust=True), tmp_path / folder
+
+    return train
+
+
+def test_what_was_around_an_agent_is_around_it_again(small):
+    from filtergym.agents.export import export_run
+    from filtergym.agents.training_run import load_run
+
+    run, folder = small("run", 240, residual_to="adaptive", gated=True)
+    assert run.control == "gain"
+    assert (load_run(folder).residual_to, load_run(folder).gated) == ("adaptive", True)
+    assert " --residual-to adaptive --gated --set " in run.command
+    export_run(folder, folder / "agent.safetensors")
+    names = [str(folder), str(folder / "best" / "model.zip"), str(folder / "agent.safetensors"), "adaptive"]
+    cost = evaluate(ID, names, episodes=16, split="validation", trust=True)["cost"].values
+    assert run.validation[0]["cost"] == pytest.approx(cost[0].mean(), rel=1e-6)
+    np.testing.assert_allclose(cost[1], cost[0], rtol=1e-4)
+    np.testing.assert_array_equal(cost[2], cost[0])
+    # In some episodes no alarm speaks, and then nothing is corrected.
+    unchanged = (cost[3] == cost[0]).all(axis=1)
+    assert 0 < unchanged.sum() < 16
+
+
+def test_resumed_run_inside_a_gate_equals_one_that_never_stopped(small):
+    from filtergym.agents.sb3_policy import load_sb3_policy
+
+    around = {"residual_to": "adaptive", "gated": True}
+    _, whole = small("whole", 480, **around)
+
+    def interrupt(done):
+        if done == 200:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run, parts = small("parts", 480, progress=interrupt, **around)
+    assert run.steps_done < 480
+    with pytest.raises(ValueError, match="holds a run with gated True, not False"):
+        small("parts", 480, resume=True, residual_to="adaptive")
+    run, parts = small("parts", 480, resume=True, **around)
+    assert run.steps_done == 480
+
+    def network(folder):
+        return load_sb3_policy(folder / "checkpoint" / "model.zip", trust=True).model.policy.state_dict()
+
+    for name, tensor in network(whole).items():
+        assert (tensor == network(parts)[name]).all(), name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "around", "message"),
+    [
+        ("bptt", {"residual_to": "adaptive"}, "'bptt' has no gradient of the policy that would be corrected"),
+        (
+            "ppo",
+            {"residual_to": "kalman-imm"},
+            "is of kind estimator and has no actions that could be corrected",
+        ),
+        ("ppo", {"residual_to": "hard-imm"}, "a residual action is added: control 'mode' has Discrete"),
+        (
+            "ppo",
+            {"residual_to": "adaptive", "control": "gains"},
+            "made for control 'gain', but the environment",
+        ),
+        ("ppo", {"residual_to": "imm-tuned"}, "acts under parameters of its own"),
+        ("ppo", {"gated": True, "control": "mode"}, "has no constant action that is the paper's"),
+    ],
+)
+def test_training_around_what_cannot_be(algorithm, around, message):
+    pytest.importorskip("sb3_contrib")
+    from filtergym.agents.training_run import new_run
+
+    with pytest.raises(ValueError, match=message):
+        new_run(ID, algorithm, **around)
+
+
+def test_gradient_through_the_gate_is_that_of_torch():
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("llvmlite")
+    from filtergym.agents.bptt import RecurrentPolicy, descend_episodes
+    from filtergym.agents.unrolled import Unrolled
+    from filtergym.envs.environment import TaskVectorEnv
+
+    keywords = {"control": "gain", "horizon": 12, "reward": "cost", "autoreset_mode": "Disabled"}
+    envs = [TaskVectorEnv(ID, 6, backend=backend, **keywords) for backend in ("torch", "compiled")]
+    torch.manual_seed(0)
+    policy = RecurrentPolicy(len(envs[0].task.fields), envs[0].task.action_space, 4).double()
+    policy.low, policy.high = policy.low.double(), policy.high.double()
+    found = []
+
+    def descend():
+        found.append(torch.cat([part.grad.ravel() for part in policy.parameters()]))
+        policy.zero_grad()
+
+    gates = [Gate(env.task, Constant, window=2) for env in envs]
+    for env in envs:
+        env.reset(seed=0)
+    costs = [
+        descend_episodes(envs[0], policy, 12, descend, gates[0]),
+        Unrolled(envs[1], policy, 12, gate=gates[1]).descend_episodes(descend),
+        Unrolled(envs[1], policy, 12).descend_episodes(descend),
+    ]
+    assert costs[1] == pytest.approx(costs[0], rel=1e-9)
+    torch.testing.assert_close(found[1], found[0], rtol=0.0, atol=1e-6 * float(found[0].abs().max()))
+    assert (found[2] - found[1]).abs().max() > 0.01 * found[1].abs().max()
