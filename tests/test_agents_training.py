@@ -142,18 +142,37 @@ def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
     assert train(run, tmp_path, resume=True).steps_done == 800
 
 
-def test_validation_is_that_of_evaluate(tmp_path):
-    run = train(small_run("ppo", 240), tmp_path)
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_validation_is_that_of_evaluate(algorithm, tmp_path):
+    run = train(small_run(algorithm, 240), tmp_path)
     (entry,) = run.validation
-    zip_file = str(tmp_path / "best" / "model.zip")
-    dataset = evaluate(ID, [zip_file, "imm"], episodes=16, split="validation", trust=True)
-    cost = dataset["cost"].mean(["episode", "time"])
-    # The mean of a bootstrap weights the episodes equally, in another order of summation.
-    assert entry["cost"] == pytest.approx(float(cost.sel(policy=zip_file)), rel=1e-12)
-    assert entry["paper_cost"] == pytest.approx(float(cost.sel(policy="imm")), rel=1e-12)
-    assert entry["relative_cost_difference"][0] == pytest.approx(
-        entry["cost"] / entry["paper_cost"] - 1, rel=1e-9
-    )
+    agent = str(tmp_path / "best" / "agent.safetensors")
+    costs = evaluate(ID, [agent, "imm"], episodes=16, split="validation")["cost"]
+    each = {name: costs.sel(policy=name).values.mean(axis=1) for name in (agent, "imm")}
+    for maker, name, control in (
+        (competitor(ID, agent), agent, "gain"),
+        (competitor(ID, "imm"), "imm", None),
+    ):
+        found = training_run.TrainingEpisodes(run, 16).costs(maker, control)
+        np.testing.assert_array_equal(found, each[name])
+    means = training_run.Bootstrap(16).means
+    assert entry["cost"] == means(each[agent])[0]
+    assert entry["paper_cost"] == means(each["imm"])[0]
+    assert entry["relative_cost_difference"][0] == entry["cost"] / entry["paper_cost"] - 1.0
+    if algorithm == "ppo":
+        # The model's actions are these arrays' but for rounding in float32.
+        model = str(tmp_path / "best" / "model.zip")
+        cost = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].mean()
+        assert entry["cost"] == pytest.approx(float(cost), rel=1e-5)
+
+
+def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
+    run = small_run("recurrent-ppo", 240)
+    run.hyperparameters["policy_kwargs"]["n_lstm_layers"] = 2
+    (entry,) = train(run, tmp_path).validation
+    model = str(tmp_path / "best" / "model.zip")
+    costs = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].values[0]
+    assert entry["cost"] == training_run.Bootstrap(16).means(costs.mean(axis=1))[0]
 
 
 @pytest.mark.parametrize(
@@ -419,3 +438,39 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
         books.safe_point(steps)
     assert saved == [10, 30]
     assert run.best["steps"] == 30
+
+
+def test_when_the_paper_was_beaten_is_noted(tmp_path):
+    lines, run = [], small_run("ppo", 100)
+    books = training_run.Bookkeeping(
+        run, tmp_path, 10, lambda _: None, lambda _: None, None, lambda: False, lines.append
+    )
+    # The mean alone below the paper's is not enough; what comes later does not matter.
+    highs = iter([0.3, 0.1, -0.1, 0.2, -0.2])
+    books.validation.score = lambda _: {
+        "steps": run.steps_done, "cost": 0.9, "paper": "imm", "paper_cost": 1.0,
+        "relative_cost_difference": [-0.1, -0.3, next(highs)],
+    }  # fmt: skip
+    for steps in (10, 20):
+        books.safe_point(steps)
+        assert load_run(tmp_path).beat_paper is None
+    for steps in (30, 40, 50):
+        books.safe_point(steps)
+    noted = load_run(tmp_path).beat_paper
+    assert noted["steps"] == 30
+    assert 0.0 < noted["seconds"] <= run.seconds
+    assert ["better than imm for the first time" in line for line in lines] == [False] * 2 + [True] + [
+        False
+    ] * 2
+
+
+def test_a_run_can_be_stopped_by_what_it_tells(tmp_path):
+    told = []
+
+    def validated(entry):
+        told.append(entry["steps"])
+        return len(told) == 2
+
+    run = train(small_run("bptt", 4000), tmp_path, interval=400, validated=validated)
+    assert told == [400, 800]
+    assert (run.steps_done, load_run(tmp_path).steps_done, run.finished) == (800, 800, False)
