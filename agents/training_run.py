@@ -362,6 +362,11 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
     return run
 
 
+def holds_run(folder: Path) -> bool:
+    """Whether a training run was begun in a folder, up to its first checkpoint at least."""
+    return (folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()
+
+
 def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
     """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
 
@@ -374,7 +379,7 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = Fals
     Raises:
         ValueError: if the folder cannot be written to, holds a run already, or holds another one.
     """
-    if not resume and ((folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()):
+    if not resume and holds_run(folder):
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
@@ -445,6 +450,7 @@ class TrainingEpisodes:
         competitor: Any,
         control: str | None = None,
         report: Callable[[Task, Episode], dict[str, numpy.ndarray]] = _cost,
+        episodes: int | None = None,
     ) -> dict[str, numpy.ndarray]:
         """Return what is reported, as means over every episode, ``(episodes,)``.
 
@@ -452,13 +458,14 @@ class TrainingEpisodes:
             competitor: policy, estimator or reference, or what makes it for a task.
             control: in which it acts; default: its own.
             report: as of :func:`.run_competitor`, with one number for every episode.
+            episodes: fly the first of them only.
         """
         kind = kind_of(competitor)
         control = control or getattr(competitor, "control", None)
         total: dict[str, Any] = {}
         for scenario, weight in self.weights.items():
             task = self._task(control, scenario, getattr(competitor, "task_keywords", {}))
-            series = run_competitor(task, made(competitor, task), kind, self.seeds, report)
+            series = run_competitor(task, made(competitor, task), kind, self.seeds[:episodes], report)
             for name, values in series.items():
                 mean = numpy.ascontiguousarray(values).mean(axis=1)
                 total[name] = total.get(name, 0.0) + weight * mean
@@ -467,6 +474,11 @@ class TrainingEpisodes:
     def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
         """Mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
         return self.means(competitor, control)["cost"]
+
+
+def validation_backend(run: TrainingRun) -> str:
+    """What computes the steps of a run's validations: policies answer in NumPy arrays, not in torch's."""
+    return "auto" if run.backend == "torch" else run.backend
 
 
 class Validation:
@@ -480,9 +492,7 @@ class Validation:
         self.run = run
         self.paper = baselines_of(run.environment).score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
-        self.episodes = TrainingEpisodes(
-            run, VALIDATION_EPISODES, "auto" if run.backend == "torch" else run.backend
-        )
+        self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
         # Once: neither the paper's algorithm nor the episodes change in a run.
         self.paper_cost = (
             self._costs(own_competitor(run.environment, self.paper), None) if self.paper else None
