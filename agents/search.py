@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from ..envs.catalogue import task_class
@@ -103,9 +104,10 @@ def _check_space(space: Any, path: str) -> None:
         for name, inner in space.items():
             _check_space(inner, f"{path}.{name}" if path else str(name))
         return
-    low, high = space.get("low"), space.get("high")
-    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high))
-    if space.keys() - RANGE or not numbers or low >= high or (space.get("log") and low <= 0):
+    ends = [space.get(name) for name in ("low", "high")]
+    numbers = [end for end in ends if isinstance(end, int | float) and not isinstance(end, bool)]
+    ascending = len(numbers) == 2 and numbers[0] < numbers[1] and (numbers[0] > 0 or not space.get("log"))
+    if space.keys() - RANGE or not ascending:
         raise ValueError(
             f"search space of {path}: a range has low and high, low below high, and may have log and prefix; got "
             f"{space!r}"
@@ -140,7 +142,7 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = optuna.storages.JournalStorage(
-        optuna.storages.journal.JournalFileBackend(str(writable_folder(folder) / "journal.log"))
+        JournalFileBackend(str(writable_folder(folder) / "journal.log"))
     )
     pruner = optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS)
     study = optuna.create_study(study_name="filtergym", storage=storage, pruner=pruner, load_if_exists=True)

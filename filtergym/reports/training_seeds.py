@@ -244,10 +244,9 @@ def _kept_file(waiting: Path, key: str, agent: Path | None) -> Path:
 def _write_means(
     path: Path, cost: numpy.ndarray, squares: dict[str, numpy.ndarray], units: dict[str, str]
 ) -> None:
+    arrays: dict[str, Any] = {f"squares_{name}": values for name, values in squares.items()}
     with whole_file(path) as partial, partial.open("wb") as file:
-        numpy.savez(
-            file, cost=cost, units=json.dumps(units), **{f"squares_{n}": v for n, v in squares.items()}
-        )
+        numpy.savez(file, cost=cost, units=json.dumps(units), **arrays)
 
 
 def _read_means(path: Path) -> tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]] | None:
