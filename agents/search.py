@@ -141,9 +141,7 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
         ValueError: if the folder holds a search for something else.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = optuna.storages.JournalStorage(
-        JournalFileBackend(str(writable_folder(folder) / "journal.log"))
-    )
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(writable_folder(folder) / "journal.log")))
     pruner = optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS)
     study = optuna.create_study(study_name="filtergym", storage=storage, pruner=pruner, load_if_exists=True)
     asked = json.loads(json.dumps(asdict(search)))
