@@ -84,7 +84,7 @@ $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
 
 $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,agents,dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,agents,search,dev]"
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made

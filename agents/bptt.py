@@ -12,6 +12,7 @@ times as fast; a task that cannot be compiled runs on torch tensors.
 import functools
 import io
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from .learned_policy import LearnedPolicy, write_arrays
 from .training_run import (
     Bookkeeping,
     TrainingRun,
+    Validated,
     curves_beside,
     interruption,
     logger_in,
@@ -201,6 +203,7 @@ def train_bptt(
     interval: int | None = None,
     progress: Callable[[int], None] = lambda steps: None,
     report: Callable[[str], None] = lambda line: None,
+    validated: Callable[[Validated], bool] = lambda entry: False,
 ) -> TrainingRun:
     """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
@@ -211,6 +214,7 @@ def train_bptt(
     """
     if resume and run.finished:
         return run
+    began = time.monotonic()
     space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, gymnasium.spaces.Box):
         raise ValueError(
@@ -271,6 +275,8 @@ def train_bptt(
             stop,
             report,
             curves_beside(logger),
+            validated,
+            began,
         )
         stopping = False
         while steps_done < run.steps and not stopping:

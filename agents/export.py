@@ -6,7 +6,7 @@ from pathlib import Path
 from ..evaluation.files import whole_files, writable_file
 from .learned_policy import stored_policy, write_arrays
 from .named_policies import zipped_model
-from .training_run import TrainingRun, best_agent, load_run, save_run, training_costs
+from .training_run import TrainingEpisodes, TrainingRun, best_agent, load_run, save_run
 
 CHECK_EPISODES = 32
 
@@ -39,7 +39,7 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
             agent = zipped_model(run.environment, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
-        costs = training_costs(run, stored_policy(run.environment, file), CHECK_EPISODES)
+        costs = TrainingEpisodes(run, CHECK_EPISODES).costs(stored_policy(run.environment, file))
         run.exported = {"episodes": CHECK_EPISODES, "cost": float(costs.mean())}
         save_run(run, file.with_suffix(".json"))
     return run

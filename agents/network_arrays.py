@@ -37,7 +37,7 @@ def _lstm(module: torch.nn.LSTM) -> dict[str, numpy.ndarray]:
 
 
 def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray], str, str]:
-    """Arrays, output and activation of a trained model's deterministic action.
+    """Arrays, float32, output and activation of a trained model's deterministic action.
 
     Raises:
         ValueError: for an algorithm or network that a learned policy cannot hold.
@@ -60,4 +60,5 @@ def network_arrays(agent: Any, algorithm: str) -> tuple[dict[str, numpy.ndarray]
     if agent.normalisation is not None:
         statistics: Any = agent.normalisation.obs_rms
         mean, scale = statistics.mean, numpy.sqrt(statistics.var + agent.normalisation.epsilon)
-    return {"observation_mean": mean, "observation_scale": scale, **arrays}, output, activation
+    found = {"observation_mean": mean, "observation_scale": scale, **arrays}
+    return {name: a.astype(numpy.float32) for name, a in found.items()}, output, activation

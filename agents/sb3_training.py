@@ -8,9 +8,11 @@ lie its plain arrays, which take none.
 
 import contextlib
 import copy
+import functools
 import io
 import pickle
 import random
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,16 +28,18 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
 from ..envs.catalogue import make_task
+from ..envs.task import Task
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .gate import Gate, PolicyMaker, as_trained
-from .learned_policy import write_arrays
+from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
 from .residual import policy_to_correct
 from .sb3_policy import Sb3Policy
 from .training_run import (
     Bookkeeping,
     TrainingRun,
+    Validated,
     check_trust,
     curves_beside,
     interruption,
@@ -110,6 +114,17 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
         write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
 
 
+def as_kept(agent: Sb3Policy, algorithm: str, task: Task) -> LearnedPolicy | Sb3Policy:
+    """Return an agent as :func:`save_agent` keeps it and an evaluation finds it: several times as fast as the model.
+
+    The model itself, if a learned policy cannot hold it.
+    """
+    try:
+        return LearnedPolicy(task, *network_arrays(agent, algorithm))
+    except ValueError:
+        return agent
+
+
 def save_checkpoint(
     model: BaseAlgorithm, env: TaskVecEnv, normalisation: VecNormalize | None, folder: Path
 ) -> None:
@@ -182,6 +197,7 @@ def train_sb3(
     interval: int | None = None,
     progress: Callable[[int], None] = lambda steps: None,
     report: Callable[[str], None] = lambda line: None,
+    validated: Callable[[Validated], bool] = lambda entry: False,
     *,
     trust: bool = False,
 ) -> TrainingRun:
@@ -193,7 +209,8 @@ def train_sb3(
         resume: go on from ``folder/checkpoint``.
         interval: environment steps between two validations; default: a twentieth of the run.
         progress: told of all environment steps done so far.
-        report: told of every validation.
+        report: told of every validation in words.
+        validated: told of every validation; returns whether to stop, with a checkpoint.
         trust: load the checkpoint, which can execute code; resuming takes it.
 
     Raises:
@@ -202,6 +219,7 @@ def train_sb3(
     """
     if resume and run.finished:
         return run
+    began = time.monotonic()
     check_algorithm(run)
     # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
     values = copy.deepcopy(run.hyperparameters)
@@ -231,10 +249,16 @@ def train_sb3(
             interval or max(1, run.steps // 20),
             lambda place: save_checkpoint(model, adapted, normalisation, place),
             lambda place: save_agent(policy, run, place),
-            PolicyMaker(policy, lambda task, agent: as_trained(task, agent, run.residual_to, run.gated)),
+            PolicyMaker(
+                functools.partial(as_kept, policy, run.algorithm),
+                lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
+                run.control,
+            ),
             stop,
             report,
             curves_beside(logger),
+            validated,
+            began,
         )
         trainer = _Trainer(books, progress)
         remaining = run.steps - model.num_timesteps

@@ -71,6 +71,47 @@ def parsed_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any
     return found["env"], found["algo"]
 
 
+def _read_table(path: Path, needs: str) -> dict[str, Any]:
+    """Read a YAML file of sections.
+
+    Raises:
+        ValueError: if it cannot be read, or is no mapping; ``needs`` says of what.
+    """
+    import yaml
+
+    try:
+        table = with_numbers(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"cannot read settings from {path}: {reason}") from error
+    if not isinstance(table, dict) or not table:
+        raise ValueError(f"{path} needs {needs}")
+    return table
+
+
+def _section(table: Mapping[str, Any], path: Path, id: str) -> Any:
+    """Return the section of an environment, or the default one.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    section = table.get(id, table.get("default"))
+    if section is None:
+        raise ValueError(
+            f"{path} has no section {id} and none called default: it has {', '.join(map(str, table))}"
+        )
+    return section
+
+
+def read_section(path: Path, id: str) -> Any:
+    """Return an environment's section of a YAML file of sections by environment id or ``default``.
+
+    Raises:
+        ValueError: if the file cannot be read, is of another form, or has no section for the environment.
+    """
+    return _section(_read_table(path, "sections by environment id or default"), path, id)
+
+
 def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a file of settings.
 
@@ -85,23 +126,11 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         ValueError: if the file cannot be read, is of another form, or has no section for the environment.
     """
-    import yaml
-
-    try:
-        table = with_numbers(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ValueError(f"cannot read settings from {path}: {reason}") from error
-    if not isinstance(table, dict) or not table:
-        raise ValueError(f"{path} needs sections by environment id or default, or the keys env and algo")
+    table = _read_table(path, "sections by environment id or default, or the keys env and algo")
     if table.keys() <= {"env", "algo"}:
         env, algo = table.get("env") or {}, table.get("algo") or {}
     else:
-        section = table.get(id, table.get("default"))
-        if section is None:
-            raise ValueError(
-                f"{path} has no section {id} and none called default: it has {', '.join(map(str, table))}"
-            )
+        section = _section(table, path, id)
         algo = dict(section) if isinstance(section, dict) else section
         env = (algo.pop("env_kwargs", None) or {}) if isinstance(algo, dict) else {}
     for what, part in (("environment", env), ("algorithm", algo)):

@@ -22,7 +22,8 @@ from typing import Any, NotRequired, TypedDict
 import numpy
 
 from ..baselines.catalogue import baselines_of
-from ..baselines.names import evaluate, own_competitor
+from ..baselines.names import own_competitor
+from ..envs.backend import task_on
 from ..envs.catalogue import (
     find_mixture,
     find_scenario,
@@ -34,9 +35,12 @@ from ..envs.catalogue import (
 )
 from ..envs.environment import DTYPES
 from ..envs.reward import REWARDS
-from ..envs.task import Task
+from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap
+from ..evaluation.competitors import kind_of, made
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
+from ..evaluation.rollout import run_competitor
+from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import read_json, restored
 from .gate import Gate
 from .residual import policy_to_correct
@@ -57,6 +61,14 @@ class Validated(TypedDict):
     paper_cost: NotRequired[float]
     relative_cost_difference: NotRequired[list[float]]
     """Value and 95 % interval."""
+
+
+class Passed(TypedDict):
+    """When an agent was first better than the paper's algorithm."""
+
+    steps: int
+    seconds: float
+    """Time spent till then, from the making of the environments on, validations included."""
 
 
 @dataclass
@@ -90,6 +102,8 @@ class TrainingRun:
     """Name of the policy that the agent corrects; none if empty."""
     gated: bool = False
     """Whether the agent acts only where something is wrong, see :mod:`.gate`."""
+    beat_paper: Passed | None = None
+    """The first validation whose cost is below that of the paper's algorithm with its whole interval."""
 
     @property
     def finished(self) -> bool:
@@ -383,6 +397,11 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
     return run
 
 
+def holds_run(folder: Path) -> bool:
+    """Whether a training run was begun in a folder, up to its first checkpoint at least."""
+    return (folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()
+
+
 def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
     """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
 
@@ -395,7 +414,7 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = Fals
     Raises:
         ValueError: if the folder cannot be written to, holds a run already, or holds another one.
     """
-    if not resume and ((folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()):
+    if not resume and holds_run(folder):
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
@@ -432,36 +451,71 @@ def _settings_in_words(run: TrainingRun) -> Iterator[str]:
     yield from differing("algo", values, shipped)
 
 
-def training_costs(
-    run: TrainingRun, policy: Any, episodes: int, control: str | None = None, backend: str = "auto"
-) -> numpy.ndarray:
-    """Mean cost of every episode of the validation split under what a run trains on, ``(episodes,)``.
+def _cost(task: Task, episode: Episode) -> dict[str, numpy.ndarray]:
+    return {"cost": task.cost(episode)}
 
-    Of a mixture, every scenario flies all episodes, and their costs are weighted as they are: the same expectation with
-    less variance than drawing.
+
+class TrainingEpisodes:
+    """Episodes of the validation split under what a run trains on; who flies them is scored.
+
+    Of a mixture, every scenario flies all episodes, and what is measured is weighted as they are: the same expectation
+    with less variance than drawing.
 
     Args:
         run: gives environment, scenario, and parameters of the task.
-        policy: to be scored.
         episodes: number of episodes.
-        control: in which it acts; default: its own.
         backend: what computes the steps.
     """
-    cls = task_class(run.environment)
-    total: Any = 0.0
-    for name, weight in (find_mixture(cls, run.scenario) or {run.scenario: 1.0}).items():
-        dataset = evaluate(
-            run.environment,
-            {"agent": policy},
-            name,
-            episodes,
-            split="validation",
-            control=control,
-            backend=backend,
-            **task_keywords(run),
-        )
-        total = total + weight * dataset["cost"].sel(policy="agent").values.mean(axis=1)
-    return total
+
+    def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
+        self.id, self.keywords, self.backend = run.environment, task_keywords(run), backend
+        self.weights = find_mixture(task_class(run.environment), run.scenario) or {run.scenario: 1.0}
+        self.seeds = episode_seeds("validation", 0, episodes)
+        self._tasks: dict[tuple[str | None, str, str], Task] = {}
+
+    def _task(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Task:
+        """Return a task that is made once: compiling it takes time."""
+        key = control, scenario, repr(keywords)
+        if key not in self._tasks:
+            self._tasks[key] = task_on(
+                self.backend, self.id, control, scenario, **{**keywords, **self.keywords}
+            )
+        return self._tasks[key]
+
+    def means(
+        self,
+        competitor: Any,
+        control: str | None = None,
+        report: Callable[[Task, Episode], dict[str, numpy.ndarray]] = _cost,
+        episodes: int | None = None,
+    ) -> dict[str, numpy.ndarray]:
+        """Return what is reported, as means over every episode, ``(episodes,)``.
+
+        Args:
+            competitor: policy, estimator or reference, or what makes it for a task.
+            control: in which it acts; default: its own.
+            report: as of :func:`.run_competitor`, with one number for every episode.
+            episodes: fly the first of them only.
+        """
+        kind = kind_of(competitor)
+        control = control or getattr(competitor, "control", None)
+        total: dict[str, Any] = {}
+        for scenario, weight in self.weights.items():
+            task = self._task(control, scenario, getattr(competitor, "task_keywords", {}))
+            series = run_competitor(task, made(competitor, task), kind, self.seeds[:episodes], report)
+            for name, values in series.items():
+                mean = numpy.ascontiguousarray(values).mean(axis=1)
+                total[name] = total.get(name, 0.0) + weight * mean
+        return total
+
+    def costs(self, competitor: Any, control: str | None = None) -> numpy.ndarray:
+        """Mean cost of every episode, ``(episodes,)``; arguments as of :meth:`means`."""
+        return self.means(competitor, control)["cost"]
+
+
+def validation_backend(run: TrainingRun) -> str:
+    """What computes the steps of a run's validations: policies answer in NumPy arrays, not in torch's."""
+    return "auto" if run.backend == "torch" else run.backend
 
 
 class Validation:
@@ -475,13 +529,15 @@ class Validation:
         self.run = run
         self.paper = baselines_of(run.environment).score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
+        self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_cost = self._costs(self.paper, None) if self.paper else None
+        self.paper_cost = (
+            self._costs(own_competitor(run.environment, self.paper), None) if self.paper else None
+        )
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
         """Mean cost over the episodes and over every resample of them."""
-        backend = "auto" if self.run.backend == "torch" else self.run.backend
-        return self.bootstrap.means(training_costs(self.run, policy, VALIDATION_EPISODES, control, backend))
+        return self.bootstrap.means(self.episodes.costs(policy, control))
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
@@ -569,8 +625,10 @@ class Bookkeeping:
         save_agent: writes the agent alone into an empty folder.
         policy: the agent as a policy for an evaluation.
         stop: whether somebody wishes to stop.
-        report: told of every validation.
+        report: told of every validation in words.
         log: writes numbers by name at so many environment steps.
+        validated: told of every validation; returns whether to stop.
+        began: when the run began to make its environments, of ``time.monotonic``.
     """
 
     def __init__(
@@ -584,13 +642,16 @@ class Bookkeeping:
         stop: Callable[[], bool],
         report: Callable[[str], None],
         log: Callable[[int, Mapping[str, float]], None] = lambda steps, values: None,
+        validated: Callable[[Validated], bool] = lambda entry: False,
+        began: float | None = None,
     ) -> None:
-        self.log = log
+        self.began = time.monotonic() if began is None else began
+        self.log, self.validated = log, validated
         self.run, self.folder, self.interval, self.policy, self.stop = run, folder, interval, policy, stop
         self.save_checkpoint, self.save_agent, self.report = save_checkpoint, save_agent, report
         self.validation = Validation(run)
         self.due = run.steps_done + interval
-        self.began, self.seconds_before = time.monotonic(), run.seconds
+        self.seconds_before = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:
         """Between two updates: validate and save if it is time; returns whether to stop."""
@@ -605,6 +666,9 @@ class Bookkeeping:
         run.validation.append(entry)
         self.log(steps_done, _curve(entry))
         run.seconds = self.seconds_before + time.monotonic() - self.began
+        passed = run.beat_paper is None and entry.get("relative_cost_difference", [0.0, 0.0, 0.0])[2] < 0.0
+        if passed:
+            run.beat_paper = {"steps": steps_done, "seconds": round(run.seconds, 3)}
         if is_best:
             with whole_folder(self.folder / "best") as best:
                 self.save_agent(best)
@@ -616,5 +680,7 @@ class Bookkeeping:
         if self.validation.paper:
             value, low, high = (f"{100 * x:+.1f} %" for x in entry["relative_cost_difference"])
             line += f", {entry['paper']} {entry['paper_cost']:.4g}, difference {value} ({low} to {high})"
+        if passed:
+            line += f"; better than {entry['paper']} for the first time, after {run.seconds:.1f} s"
         self.report(line)
-        return stopping
+        return self.validated(entry) or stopping

@@ -13,11 +13,12 @@ import xarray
 
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, make_task, nearest, opened, task_class
+from ..envs.compiled import Report
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .competitors import RANKED, Kind, check_competitor, kind_of, made
-from .rollout import Progress, run_bound, run_estimator, run_policy, run_reference, told
+from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
 
 CHUNK = 2048
@@ -105,43 +106,11 @@ def _measured_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
     return {**_measured(task, episode), **task.track(episode)}
 
 
-def _run_chunk(
-    task: Task,
-    actor: Any,
-    kind: str,
-    seeds: Sequence[int],
-    tick: Progress,
-    name: str,
-    first_episode: int,
-    tracks: bool,
-) -> dict[str, numpy.ndarray]:
-    """Errors and records of some episodes, ``(episodes, time, ...)``."""
-    series: dict[str, list[numpy.ndarray]] = {}
-
-    def keep(name: str, values: numpy.ndarray) -> None:
-        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
-
+def _report(task: Task, tracks: bool) -> Report:
+    """What is kept of every measurement of a task."""
     if task.has_truth:
-        report = _measured_and_tracked if tracks else _measured
-    else:
-        report = _said_and_tracked if tracks else _said
-
-    def keep_all(found: dict[str, numpy.ndarray]) -> None:
-        for name, values in found.items():
-            keep(name, values)
-
-    def record(episode: Episode) -> None:
-        keep_all(task.run(report, episode))
-
-    if kind == "policy":
-        run_policy(task, actor, seeds, keep_all, tick, report)
-    elif kind == "estimator":
-        run_estimator(task, actor, seeds, record, tick, name, first_episode)
-    elif kind == "reference":
-        run_reference(task, actor, seeds, record, tick)
-    else:
-        run_bound(task, actor, seeds, lambda mean_square: keep("mean_square", mean_square), tick)
-    return {name: numpy.stack(values, axis=1) for name, values in series.items()}
+        return _measured_and_tracked if tracks else _measured
+    return _said_and_tracked if tracks else _said
 
 
 def evaluate(
@@ -231,15 +200,15 @@ def evaluate(
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
     for name, maker in competitors.items():
         chunks = [
-            _run_chunk(
+            run_competitor(
                 tasks[name],
                 _made(name, maker, kinds[name], tasks[name]),
                 kinds[name],
                 seeds[i : i + CHUNK],
+                _report(tasks[name], tracks),
                 tick,
                 name,
                 i,
-                tracks,
             )
             for i in range(0, episodes, CHUNK)
         ]

@@ -13,6 +13,7 @@ from ..envs.compiled import Report
 from ..envs.lanes import Lanes
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task
+from .competitors import Kind
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
@@ -239,3 +240,52 @@ def run_bound(
     for _ in range(lanes.decisions_per_episode):
         lanes.step(update)
         tick(lanes.count * task.decision_interval)
+
+
+def run_competitor(
+    task: Task,
+    competitor: Any,
+    kind: Kind,
+    seeds: Sequence[int],
+    report: Report,
+    tick: Progress = lambda measurements: None,
+    name: str = "competitor",
+    first_episode: int = 0,
+) -> dict[str, numpy.ndarray]:
+    """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
+
+    Args:
+        task: the estimation problem.
+        competitor: made for the task.
+        kind: what it is.
+        seeds: as in :func:`run_policy`, likewise ``tick``.
+        report: function of the task and the state after the action, which returns arrays ``(..., N)`` by name; not
+            asked about bounds.
+        tick: likewise.
+        name: of the competitor, in errors.
+        first_episode: number of the first episode, in errors.
+
+    Returns:
+        Arrays ``(episodes, time, ...)`` by name; of a bound its ``mean_square``.
+    """
+    series: dict[str, list[numpy.ndarray]] = {}
+
+    def keep(name: str, values: numpy.ndarray) -> None:
+        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
+
+    def keep_all(found: dict[str, numpy.ndarray]) -> None:
+        for name, values in found.items():
+            keep(name, values)
+
+    def record(episode: Episode) -> None:
+        keep_all(task.run(report, episode))
+
+    if kind == "policy":
+        run_policy(task, competitor, seeds, keep_all, tick, report)
+    elif kind == "estimator":
+        run_estimator(task, competitor, seeds, record, tick, name, first_episode)
+    elif kind == "reference":
+        run_reference(task, competitor, seeds, record, tick)
+    else:
+        run_bound(task, competitor, seeds, lambda mean_square: keep("mean_square", mean_square), tick)
+    return {name: numpy.stack(values, axis=1) for name, values in series.items()}

@@ -28,6 +28,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "reproduce": report.reproduce,
     "animate": measure.animate,
     "train": improve.train,
+    "search": improve.search,
     "export": improve.export,
     "seeds": report.seeds,
 }

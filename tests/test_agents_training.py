@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import os
 import shutil
 import signal
@@ -9,11 +10,14 @@ import signal
 import gymnasium
 import numpy as np
 import pytest
+from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 
 from filtergym import evaluate
-from filtergym.names import competitor
+from filtergym.names import competitor, tidy_records
+from filtergym.reports import standing
+from filtergym.reports.tables import with_interval
 
 pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
@@ -142,18 +146,37 @@ def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
     assert train(run, tmp_path, resume=True).steps_done == 800
 
 
-def test_validation_is_that_of_evaluate(tmp_path):
-    run = train(small_run("ppo", 240), tmp_path)
+@pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
+def test_validation_is_that_of_evaluate(algorithm, tmp_path):
+    run = train(small_run(algorithm, 240), tmp_path)
     (entry,) = run.validation
-    zip_file = str(tmp_path / "best" / "model.zip")
-    dataset = evaluate(ID, [zip_file, "imm"], episodes=16, split="validation", trust=True)
-    cost = dataset["cost"].mean(["episode", "time"])
-    # The mean of a bootstrap weights the episodes equally, in another order of summation.
-    assert entry["cost"] == pytest.approx(float(cost.sel(policy=zip_file)), rel=1e-12)
-    assert entry["paper_cost"] == pytest.approx(float(cost.sel(policy="imm")), rel=1e-12)
-    assert entry["relative_cost_difference"][0] == pytest.approx(
-        entry["cost"] / entry["paper_cost"] - 1, rel=1e-9
-    )
+    agent = str(tmp_path / "best" / "agent.safetensors")
+    costs = evaluate(ID, [agent, "imm"], episodes=16, split="validation")["cost"]
+    each = {name: costs.sel(policy=name).values.mean(axis=1) for name in (agent, "imm")}
+    for maker, name, control in (
+        (competitor(ID, agent), agent, "gain"),
+        (competitor(ID, "imm"), "imm", None),
+    ):
+        found = training_run.TrainingEpisodes(run, 16).costs(maker, control)
+        np.testing.assert_array_equal(found, each[name])
+    means = training_run.Bootstrap(16).means
+    assert entry["cost"] == means(each[agent])[0]
+    assert entry["paper_cost"] == means(each["imm"])[0]
+    assert entry["relative_cost_difference"][0] == entry["cost"] / entry["paper_cost"] - 1.0
+    if algorithm == "ppo":
+        # The model's actions are these arrays' but for rounding in float32.
+        model = str(tmp_path / "best" / "model.zip")
+        cost = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].mean()
+        assert entry["cost"] == pytest.approx(float(cost), rel=1e-5)
+
+
+def test_a_network_that_arrays_cannot_hold_is_validated_as_a_model(tmp_path):
+    run = small_run("recurrent-ppo", 240)
+    run.hyperparameters["policy_kwargs"]["n_lstm_layers"] = 2
+    (entry,) = train(run, tmp_path).validation
+    model = str(tmp_path / "best" / "model.zip")
+    costs = evaluate(ID, [model], episodes=16, split="validation", trust=True)["cost"].values[0]
+    assert entry["cost"] == training_run.Bootstrap(16).means(costs.mean(axis=1))[0]
 
 
 @pytest.mark.parametrize(
@@ -357,7 +380,7 @@ class TestCommandLine:
         return ended.value.code, capsys.readouterr()
 
     def test_train_resume_export_evaluate(self, monkeypatch, capsys, tmp_path):
-        train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run")
+        train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run", "--no-compare")
         assert self.run(monkeypatch, capsys, *train, "--steps", 400)[0] == 0
         code, printed = self.run(monkeypatch, capsys, *train, "--steps", 400)
         assert code == 2
@@ -372,6 +395,56 @@ class TestCommandLine:
         file = tmp_path / "run" / "agent.safetensors"
         words = ("evaluate", ID, "--policy", file, "--policy", "imm", "--episodes", 4)
         assert self.run(monkeypatch, capsys, *words)[0] == 0
+
+    def test_seeds_are_trained_skipped_and_resumed(self, monkeypatch, capsys, tmp_path):
+        words = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "x", "--no-compare")
+
+        def train(*more):
+            return self.run(monkeypatch, capsys, *words, *more)
+
+        assert train("--seeds", "0,2", "--steps", 400)[0] == 0
+        assert train("--seeds", "2", "--steps", 800)[0] == 0
+        before = contents(tmp_path / "x-2")
+        code, printed = train("--seeds", "0-2", "--steps", 800)
+        assert code == 0
+        assert "x-2 is finished: 800 steps" in printed.out
+        assert contents(tmp_path / "x-2") == before
+        runs = {path.name: load_run(path) for path in tmp_path.iterdir()}
+        found = {name: (run.seed, run.steps_done, run.validation[0]["steps"]) for name, run in runs.items()}
+        # Validated every 20 of 400 steps before the first 400 are done, or every 40 of 800: an update is 200 steps.
+        assert found == {"x-0": (0, 800, 200), "x-1": (1, 800, 200), "x-2": (2, 800, 200)}
+        for more, message in (
+            (("--seeds", "0", "--seed", 3), "--seeds names every seed"),
+            (("--seeds", "2-1"), "--seeds needs whole numbers such as 0-4"),
+            (("--seeds", "0-3", "--envs", 3), "holds a run with envs 2, not 3"),
+        ):
+            code, printed = train(*more)
+            assert (code, printed.err.count("\n")) == (2, 1)
+            assert message in printed.err
+        assert not (tmp_path / "x-3").exists()
+
+    def test_seeds_of_stable_baselines3_are_resumed_with_trust(self, monkeypatch, capsys, tmp_path):
+        folder = tmp_path / "x-0"
+        train(small_run("ppo", 240), folder)
+        settings = [f"--set=algo.{name}={json.dumps(value)}" for name, value in SMALL["ppo"].items()]
+        words = (
+            "train",
+            ID,
+            "--control",
+            "gain",
+            "--envs",
+            4,
+            *settings,
+            "--out",
+            tmp_path / "x",
+            "--no-compare",
+        )
+        code, printed = self.run(monkeypatch, capsys, *words, "--seeds", "0-1", "--steps", 480)
+        assert code == 2
+        assert "add --trust" in printed.err
+        assert not (tmp_path / "x-1" / "run.json").exists()
+        assert self.run(monkeypatch, capsys, *words, "--seeds", "0", "--steps", 480, "--trust")[0] == 0
+        assert load_run(folder).steps_done == 480
 
     def test_wrong_input_writes_nothing(self, monkeypatch, capsys, tmp_path):
         code, printed = self.run(
@@ -419,3 +492,80 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
         books.safe_point(steps)
     assert saved == [10, 30]
     assert run.best["steps"] == 30
+
+
+def test_when_the_paper_was_beaten_is_noted(tmp_path):
+    lines, run = [], small_run("ppo", 100)
+    books = training_run.Bookkeeping(
+        run, tmp_path, 10, lambda _: None, lambda _: None, None, lambda: False, lines.append
+    )
+    # The mean alone below the paper's is not enough; what comes later does not matter.
+    highs = iter([0.3, 0.1, -0.1, 0.2, -0.2])
+    books.validation.score = lambda _: {
+        "steps": run.steps_done, "cost": 0.9, "paper": "imm", "paper_cost": 1.0,
+        "relative_cost_difference": [-0.1, -0.3, next(highs)],
+    }  # fmt: skip
+    for steps in (10, 20):
+        books.safe_point(steps)
+        assert load_run(tmp_path).beat_paper is None
+    for steps in (30, 40, 50):
+        books.safe_point(steps)
+    noted = load_run(tmp_path).beat_paper
+    assert noted["steps"] == 30
+    assert 0.0 < noted["seconds"] <= run.seconds
+    assert ["better than imm for the first time" in line for line in lines] == [False] * 2 + [True] + [
+        False
+    ] * 2
+
+
+def test_a_run_can_be_stopped_by_what_it_tells(tmp_path):
+    told = []
+
+    def validated(entry):
+        told.append(entry["steps"])
+        return len(told) == 2
+
+    run = train(small_run("bptt", 4000), tmp_path, interval=400, validated=validated)
+    assert told == [400, 800]
+    assert (run.steps_done, load_run(tmp_path).steps_done, run.finished) == (800, 800, False)
+
+
+def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
+    monkeypatch.setattr(standing, "SCREENING_SECONDS", 0.0)
+    # A policy, an estimator and a tuned one of each: all of them take long.
+    known = baselines_of(ID)
+    few = dataclasses.replace(
+        known,
+        policies={name: known.policies[name] for name in ("imm", "adaptive")},
+        estimators={"kalman-imm": known.estimators["kalman-imm"]},
+    )
+    tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
+    monkeypatch.setattr(standing, "baselines_of", lambda id: few)
+    monkeypatch.setattr(standing, "tuned_names", lambda id: tuned)
+    run = train(small_run("bptt", 400), tmp_path)
+    opponents = standing.Opponents(run)
+    names = [*few.policies, *few.estimators, *tuned, "known-turn"]
+    agent = training_run.best_agent(tmp_path)
+    lines = [standing.agent_standing(run, agent, "mine", opponents), *opponents.found]
+    dataset = evaluate(
+        ID, {"mine": str(agent), **{name: name for name in names}}, episodes=16, split="validation"
+    )
+    costs = {name: dataset["cost"].sel(policy=name).values.mean(axis=1) for name in ["mine", *names]}
+    classical = min(set(names) - {"imm", "known-turn"}, key=lambda name: costs[name].mean())
+    assert [(line.name, line.role) for line in lines] == [
+        ("mine", "agent"), ("imm", "paper"), (classical, "strongest classical"), ("known-turn", "reference"),
+    ]  # fmt: skip
+    records = {
+        (r.policy, r.metric): r
+        for r in tidy_records(dataset.sel(policy=[line.name for line in lines]))
+        if r.window == "all"
+    }
+    for line in lines:
+        np.testing.assert_array_equal(line.means["cost"], costs[line.name])
+        assert line.means["anees"].mean() == pytest.approx(records[line.name, "anees"].value, rel=1e-9)
+    table = standing.standing_table(lines[:1], opponents, "random")
+    difference = records["mine", "relative_cost_difference"]
+    cells = {column.header: list(column.cells) for column in table.columns}
+    assert cells["cost vs paper, %"][0] == with_interval(difference, 100.0, negligible=0.005)
+    median = records["mine", "median_cost_ratio"].value
+    assert cells["median, %"][0] == f"{100.0 * (median - 1.0):+.1f}"

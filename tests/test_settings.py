@@ -24,11 +24,11 @@ from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
 from filtergym.agents.settings import merged, parsed_settings, read_config
 from filtergym.agents.training_run import (
+    TrainingEpisodes,
     load_run,
     new_run,
     opened_run,
     stored_hyperparameters,
-    training_costs,
 )
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -328,11 +328,11 @@ def test_costs_of_a_mixture_are_weighted():
     run = new_run(ID, "ppo")
     paper = own_competitor(ID, "imm")
     run.scenario = "random:0.25,paper:0.75"
-    mixed = training_costs(run, paper, 4)
+    mixed = TrainingEpisodes(run, 4).costs(paper)
     parts = []
     for name in ("random", "paper"):
         run.scenario = name
-        parts.append(training_costs(run, paper, 4))
+        parts.append(TrainingEpisodes(run, 4).costs(paper))
     np.testing.assert_allclose(mixed, 0.25 * parts[0] + 0.75 * parts[1])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 
+from filtergym.reports import training_seeds
 from filtergym.reports.training_seeds import compare, episode_means, load_runs, spread
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -96,6 +97,40 @@ def test_the_numbers_follow_from_the_episodes(folders):
     assert (difference.unit, difference.episodes) == ("m", 30)
 
 
+def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
+    scored, whole = [], training_seeds.evaluate
+
+    def evaluate(id, competitors, *arguments):
+        if len(scored) == stop:
+            raise KeyboardInterrupt
+        scored.append(next(iter(competitors)))
+        return whole(id, competitors, *arguments)
+
+    monkeypatch.setattr(training_seeds, "evaluate", evaluate)
+    asked = (load_runs(folders), ["adaptive"], "random", 10, 0, "validation")
+    stop = 99
+    expected = episode_means(*asked)
+    scored.clear()
+    stop = 3
+    with pytest.raises(KeyboardInterrupt):
+        episode_means(*asked, waiting=tmp_path)
+    assert scored == ["agent", "agent", "imm"]
+    stop = 99
+    found = episode_means(*asked, waiting=tmp_path)
+    assert scored == ["agent", "agent", "imm", "adaptive"]
+    assert found.units == expected.units
+    np.testing.assert_equal(found.cost, expected.cost)
+    np.testing.assert_equal(found.squares, expected.squares)
+    # Another agent in the same folder, or other episodes, are something else.
+    shutil.copyfile(
+        PRETRAINED / "ManeuveringTarget-v0" / "ppo.safetensors", folders[1] / "best/agent.safetensors"
+    )
+    episode_means(*asked, waiting=tmp_path)
+    assert scored[4:] == ["agent"]
+    episode_means(asked[0], [], "random", 11, 0, "validation", waiting=tmp_path)
+    assert scored[5:] == ["agent", "agent", "imm"]
+
+
 def seeds_command(*arguments, cwd):
     return subprocess.run(
         [sys.executable, "-m", "filtergym", "seeds", *map(str, arguments)],
@@ -129,6 +164,7 @@ def test_command_fills_the_page(folders, tmp_path):
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
         assert word in text
     assert (tmp_path / "curves.png").stat().st_size > 10_000
+    assert not (tmp_path / "seeds.json.unfinished").exists()
     records = json.loads((tmp_path / "seeds.json").read_text())
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 

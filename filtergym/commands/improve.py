@@ -6,13 +6,17 @@ from typing import Annotated, Any
 
 import typer
 
+from ..agents import training_run
 from ..agents.export import export_run
+from ..agents.settings import parsed_settings
+from ..agents.training_run import TrainingRun, best_agent
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation.files import writable_file
+from ..reports import standing
 from ..reports.tables import tuned_table
-from .terminal import Backend, Environment, TrainingScenario, Trust, console, progress_bar
+from .terminal import Backend, Environment, TrainingScenario, Trust, console, progress_bar, whole_numbers
 
 
 def tune_policy(
@@ -52,6 +56,29 @@ def tune_policy(
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
+def _trainer(algo: str, trust: bool = False) -> Any:
+    """Return what trains with an algorithm.
+
+    Raises:
+        ValueError: if it needs packages that are not installed.
+    """
+    try:
+        import torch
+
+        if algo == "bptt":
+            from ..agents.bptt import train_bptt as trainer
+        else:
+            from ..agents.sb3_training import train_sb3
+
+            trainer = functools.partial(train_sb3, trust=trust)
+    except ImportError as error:
+        raise ValueError(
+            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
+        ) from error
+    torch.set_num_threads(1)  # networks this small run slower on more
+    return trainer
+
+
 def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
@@ -62,7 +89,16 @@ def train(
     scenario: TrainingScenario = None,
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
     envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the training episodes and the network.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option(help="Of the training episodes and the network; default: 0.")
+    ] = None,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            help="Train one run each, such as 0-4, in folders called --out, a dash and the seed; finished ones are "
+            "skipped, unfinished ones resumed."
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
     validate_every: Annotated[
         int | None, typer.Option(help="Environment steps between validations; default: a twentieth.")
@@ -87,11 +123,15 @@ def train(
     gated: Annotated[
         bool, typer.Option("--gated", help="The agent acts only where an alarm says that something is wrong.")
     ] = False,
+    compare: Annotated[
+        bool,
+        typer.Option(help="Say at the end how the best agent stands against paper, classical and reference."),
+    ] = True,
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
-    A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one also takes --trust. One of bptt
-    cannot.
+    A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one, with --resume or --seeds, also
+    takes --trust. One of bptt cannot.
 
     Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
     settings of the run, and refuses others.
@@ -100,55 +140,152 @@ def train(
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --set env.range_sigma=50 --set algo.learning_rate=3e-4 \
     --out runs/precise
+
+    Example: filtergym train filtergym/ManeuveringTarget-v0 --algo bptt --seeds 0-4 --out runs/bptt
     """
-    try:
-        import torch
-
-        from ..agents import training_run
-        from ..agents.settings import parsed_settings
-
-        trainer: Any
-        if algo == "bptt":
-            from ..agents.bptt import train_bptt as trainer
-        else:
-            from ..agents.sb3_training import train_sb3
-
-            trainer = functools.partial(train_sb3, trust=trust)
-    except ImportError as error:
+    trainer = _trainer(algo, trust)
+    if seeds is not None and (seed is not None or resume):
         raise ValueError(
-            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
-        ) from error
-    torch.set_num_threads(1)  # networks this small run slower on more
+            "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
+        )
     keywords, hyperparameters = parsed_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward
-    run = training_run.new_run(
-        environment,
+
+    def asked(number: int) -> TrainingRun:
+        return training_run.new_run(
+            environment,
+            algo,
+            control,
+            steps,
+            envs,
+            number,
+            scenario,
+            hyperparameters,
+            backend,
+            keywords,
+            config,
+            residual_to,
+            gated,
+        )
+
+    # Every run is opened before any is trained, so that a wrong word costs nothing.
+    runs: dict[Path, tuple[TrainingRun, bool]] = {}
+    if seeds is None:
+        same = not (keywords or hyperparameters or config)
+        runs[out] = training_run.opened_run(out, asked(seed or 0), resume, same), resume
+    else:
+        for number in whole_numbers("--seeds", seeds):
+            folder = out.with_name(f"{out.name}-{number}")
+            begun = training_run.holds_run(folder)
+            run = training_run.opened_run(folder, asked(number), begun)
+            if begun and not run.finished and algo != "bptt":
+                training_run.check_trust(
+                    f"{folder} goes on from a checkpoint that is loaded with pickle", trust
+                )
+            runs[folder] = run, begun
+    for folder, (run, begun) in runs.items():
+        if begun and run.finished:
+            console.print(f"{folder} is finished: {run.steps_done:,} steps")
+            continue
+        if seeds is not None:
+            console.print(f"{folder}: seed {run.seed}")
+        with progress_bar() as bar:
+            line = bar.add_task(f"training {algo}", total=run.steps)
+            trainer(
+                run,
+                folder,
+                begun,
+                validate_every,
+                progress=lambda done, bar=bar, line=line: bar.update(line, completed=done),
+                report=lambda text: console.print(text, highlight=False),
+            )
+        console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
+        if not run.finished:
+            return  # somebody wished to stop
+    if compare:
+        _print_standing({folder: run for folder, (run, _) in runs.items()}, trust)
+
+
+def search(
+    environment: Environment,
+    out: Annotated[Path, typer.Option(help="Folder of the search: journal, runs, best.yml.")],
+    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    trials: Annotated[int, typer.Option(help="In all, those before an interruption included.")] = 50,
+    steps: Annotated[int, typer.Option(help="Environment steps of each run.")] = 100_000,
+    seeds: Annotated[str, typer.Option(help="Training seeds of every trial, such as 0-2.")] = "0",
+    control: Annotated[
+        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+    ] = None,
+    scenario: TrainingScenario = None,
+    seed: Annotated[int, typer.Option(help="Of what is drawn to be tried.")] = 0,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="NAME=VALUE", help="What stays as it is, env.NAME=VALUE or algo.NAME=VALUE."
+        ),
+    ] = None,
+    space: Annotated[
+        Path | None, typer.Option(help="YAML file of what is searched; default: that of the algorithm.")
+    ] = None,
+) -> None:
+    """Search hyperparameters on the validation split with Optuna; afterwards train --config OUT/best.yml uses them.
+
+    Trials that fall behind are pruned. Ctrl-C or SIGTERM stops; the same command goes on, without the trial under way.
+
+    Example: filtergym search filtergym/ManeuveringTarget-v0 --algo ppo --steps 77000 --trials 50 --out searches/ppo
+    """
+    trainer = _trainer(algo)
+    try:
+        from ..agents import search as searching
+    except ImportError as error:
+        raise ValueError(
+            f"searching needs more packages: pip install 'filtergym[agents,search]' ({error})"
+        ) from error
+    keywords, hyperparameters = parsed_settings(set_ or [])
+    if algo not in training_run.FILES:
+        raise nearest("algorithm", algo, training_run.FILES)
+    wanted = searching.Search(
+        importable_name(task_class(environment)),
         algo,
         control,
-        steps,
-        envs,
-        seed,
         scenario,
-        hyperparameters,
-        backend,
+        steps,
+        tuple(whole_numbers("--seeds", seeds)),
         keywords,
-        config,
-        residual_to,
-        gated,
+        hyperparameters,
+        searching.read_space(task_class(environment).id, algo, space),
+        seed,
     )
-    run = training_run.opened_run(out, run, resume, same=not (keywords or hyperparameters or config))
+    wanted.run(wanted.seeds[0], {})  # a wrong word costs nothing
     with progress_bar() as bar:
-        line = bar.add_task(f"training {algo}", total=run.steps)
-        trainer(
-            run,
+        line = bar.add_task(f"searching {algo}", total=trials)
+        searching.search_hyperparameters(
+            wanted,
             out,
-            resume,
-            validate_every,
+            trials,
+            trainer,
             progress=lambda done: bar.update(line, completed=done),
-            report=lambda text: console.print(text, highlight=False),
+            report=lambda text: console.print(text, highlight=False, soft_wrap=True),
         )
-    console.print(f"{run.steps_done:,} steps done; best agent in {out / 'best'}, checkpoint beside it")
+    best = out / "best.yml"
+    if best.exists():
+        console.print(f"best settings: filtergym train {environment} --algo {algo} --config {best} --out RUN")
+
+
+def _print_standing(runs: dict[Path, TrainingRun], trust: bool) -> None:
+    """Print how the best agents of runs that differ in their seed stand against who was not trained."""
+    first = next(iter(runs.values()))
+    agents = {folder: best_agent(folder) for folder in runs}
+    if any(agent.suffix != ".safetensors" for agent in agents.values()) and not trust:
+        console.print("an agent that plain arrays cannot hold is compared with --trust only")
+        return
+    opponents = standing.Opponents(first)
+    found = [
+        standing.agent_standing(runs[folder], agent, str(folder), opponents, trust)
+        for folder, agent in agents.items()
+    ]
+    console.print(standing.standing_table(found, opponents, first.scenario))
 
 
 def export(

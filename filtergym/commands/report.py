@@ -1,5 +1,6 @@
 """Commands that write tables and pages: comparison, room, reproductions, training seeds."""
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -130,7 +131,8 @@ def seeds(
 ) -> None:
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
 
-    A run's best agent is plain arrays; where it is a model only, loading can execute code and needs --trust.
+    A run's best agent is plain arrays; where it is a model only, loading can execute code and needs --trust. With --out
+    what is scored is kept beside it until all is done: after an interruption the same command goes on.
 
     Example: filtergym seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
     """
@@ -142,6 +144,7 @@ def seeds(
     for file in (out, curves):
         if file is not None:
             writable_file(file)
+    waiting = None if out is None else writable_folder(out.with_name(f"{out.name}.unfinished"))
     if into is not None:
         check_markers(into, [marker])
     if curves is not None:
@@ -157,6 +160,7 @@ def seeds(
             split,
             lambda done: bar.update(line, advance=done),
             trust,
+            waiting,
         )
     if out is not None:
         write_records(out, records)
@@ -165,5 +169,7 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
+    if waiting is not None:
+        shutil.rmtree(waiting)  # measured by this code: another time it is measured anew
     for grid in grids:
         console.print(grid_table(grid))

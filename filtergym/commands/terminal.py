@@ -111,6 +111,21 @@ def pair(option: str, text: str) -> tuple[float, float]:
     return first, second
 
 
+def whole_numbers(option: str, text: str) -> list[int]:
+    """Turn ``0-2,7`` into 0, 1, 2 and 7, each once."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        try:
+            numbers = range(int(first), int(last if dash else first) + 1)
+        except ValueError:
+            numbers = range(0)
+        if not numbers:
+            raise ValueError(f"{option} needs whole numbers such as 0-4 or 0,3,5-7, got {text!r}")
+        found += [number for number in numbers if number not in found]
+    return found
+
+
 def parsed_settings(settings: list[str]) -> dict[str, Any]:
     """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
     keywords: dict[str, Any] = {}

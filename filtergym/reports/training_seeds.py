@@ -4,6 +4,8 @@ One agent says little about its algorithm. Here the runs of several training see
 that what comes from the training seed and what comes from the episodes can be told apart.
 """
 
+import hashlib
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy
 from scipy.special import stdtrit
 
-from ..agents.training_run import TrainingRun, best_agent, load_run
+from ..agents.training_run import TrainingRun, best_agent, installed_versions, load_run
 from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.names import evaluate
 from ..baselines.reproduction import Grid, markdown_table
@@ -20,6 +22,7 @@ from ..envs.catalogue import task_class
 from ..evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from ..evaluation.competitors import kind_of
 from ..evaluation.figures import draw_learning_curves
+from ..evaluation.files import whole_file
 from ..evaluation.metrics import reported_components, score, squared_errors
 from ..names import competitor
 from .tables import shown_components, with_interval
@@ -191,10 +194,12 @@ def episode_means(
     split: str,
     progress: Callable[[int], None] = lambda done: None,
     trust: bool = False,
+    waiting: Path | None = None,
 ) -> EpisodeMeans:
     """Evaluate runs and opponents on the same episodes, one after the other to save memory.
 
-    With ``trust``, models that can execute code are loaded.
+    With ``trust``, models that can execute code are loaded. In the folder ``waiting`` the means of each are kept as
+    soon as they are there, and those that are kept there are taken from it.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
@@ -210,17 +215,53 @@ def episode_means(
     cost: dict[str, numpy.ndarray] = {}
     squares: dict[str, dict[str, numpy.ndarray]] = {}
     units: dict[str, str] = {}
+    agents = {member.name: member.agent for member in runs}
     for name, (maker, control) in policies.items():
-        known_as = name if control is None else "agent"
-        dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
-        data = dataset.isel(policy=0)
-        cost[name] = data["cost"].values.mean(axis=1)
-        first, last = dataset.attrs["windows"]["all"]
-        units = reported_components(dataset)
-        for component in shown_components(list(units)):
-            values = squared_errors(data, component, dataset.attrs["groups"])[:, first - 1 : last]
-            squares.setdefault(component, {})[name] = values.mean(axis=1)
+        key = json.dumps(
+            [installed_versions(), id, task_class(id).interface, scenario, episodes, seed, split, name]
+        )
+        kept = None if waiting is None else _kept_file(waiting, key, agents.get(name))
+        found = None if kept is None else _read_means(kept)
+        if found is None:
+            known_as = name if control is None else "agent"
+            dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
+            data = dataset.isel(policy=0)
+            first, last = dataset.attrs["windows"]["all"]
+            known = reported_components(dataset)
+            errors = {}
+            for component in shown_components(list(known)):
+                values = squared_errors(data, component, dataset.attrs["groups"])[:, first - 1 : last]
+                errors[component] = values.mean(axis=1)
+            found = data["cost"].values.mean(axis=1), errors, known
+            if kept is not None:
+                _write_means(kept, *found)
+        cost[name], errors, units = found
+        for component, values in errors.items():
+            squares.setdefault(component, {})[name] = values
     return EpisodeMeans(cost, squares, units)
+
+
+def _kept_file(waiting: Path, key: str, agent: Path | None) -> Path:
+    """File of one competitor's means; another one if the agent is trained on, or anything else is asked for."""
+    digest = hashlib.sha256(key.encode() + (b"" if agent is None else agent.read_bytes()))
+    return waiting / f"{digest.hexdigest()[:32]}.npz"
+
+
+def _write_means(
+    path: Path, cost: numpy.ndarray, squares: dict[str, numpy.ndarray], units: dict[str, str]
+) -> None:
+    arrays: dict[str, Any] = {f"squares_{name}": values for name, values in squares.items()}
+    with whole_file(path) as partial, partial.open("wb") as file:
+        numpy.savez(file, cost=cost, units=json.dumps(units), **arrays)
+
+
+def _read_means(path: Path) -> tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]] | None:
+    """Return cost, squares by component, and units; None if they are not there yet."""
+    if not path.exists():
+        return None
+    with numpy.load(path, allow_pickle=False) as kept:
+        squares = {name.removeprefix("squares_"): kept[name] for name in kept if name.startswith("squares_")}
+        return kept["cost"], squares, json.loads(str(kept["units"]))
 
 
 def compare(
@@ -368,12 +409,16 @@ def compare_scenarios(
     split: str,
     progress: Callable[[int], None] = lambda done: None,
     trust: bool = False,
+    waiting: Path | None = None,
 ) -> tuple[list[Comparison], list[Grid]]:
-    """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them."""
+    """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them.
+
+    Arguments as of :func:`episode_means`.
+    """
     records: list[Comparison] = []
     grids: list[Grid] = []
     for scenario in scenarios:
-        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress, trust)
+        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress, trust, waiting)
         comparisons = compare(runs, means, scenario, seed, split)
         records += comparisons
         grids += comparison_grids(runs, comparisons)
