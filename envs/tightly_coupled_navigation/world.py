@@ -213,7 +213,8 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """Legs of rest, straight flight and manoeuvre at random, and the velocity at the start."""
         xp, p = self.xp, self.parameters
         columns: list[tuple[Array, ...]] = []
-        start = kind = velocity = None
+        start: Array = None
+        kind = velocity = start
         for leg in range(p.legs):
             chosen = draws.unit(f"kind_{leg}")
             seconds = draws.uniform(f"duration_{leg}", p.leg_duration)
