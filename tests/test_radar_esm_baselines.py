@@ -361,7 +361,7 @@ def significance(dataset, name, optimum):
 def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
     """Types redrawn, nothing refused: posterior weights minimise the mean square error."""
     names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "paper", 1500, **NEVER_REFUSED)
+    dataset = evaluate(ID, names, "paper", 600, **NEVER_REFUSED)
     for name in names:
         assert significance(dataset, name, "quasi-optimal") > -3.0, name
 
@@ -369,14 +369,14 @@ def test_nothing_beats_the_paper_where_it_is_exactly_bayesian():
 def test_refused_decisions_are_all_that_can_be_won_on_paper():
     """The agent is shown them; with one emitter they are as good as any, and nothing beats using them."""
     names = ["ungated", "quasi-optimal", "joint-type", "leaky", "radar-only"]
-    dataset = evaluate(ID, names, "paper", 4000)
+    dataset = evaluate(ID, names, "paper", 2000)
     for name in names[1:]:
         assert significance(dataset, name, "ungated") > 3.0, name
 
 
 def test_nothing_beats_the_joint_posterior_for_one_type():
     names = [name for name in baselines_of(ID).policies if name != "ungated"]
-    dataset = evaluate(ID, names, "fixed-type", 1500, **NEVER_REFUSED)
+    dataset = evaluate(ID, names, "fixed-type", 600, **NEVER_REFUSED)
     for name in names:
         assert significance(dataset, name, "joint-type") > -3.0, name
 
@@ -384,7 +384,7 @@ def test_nothing_beats_the_joint_posterior_for_one_type():
 def test_nothing_beats_the_ideal_filter():
     names = [*baselines_of(ID).policies, "ideal"]
     for scenario in ("paper", "class-change"):
-        dataset = evaluate(ID, names, scenario, 600)
+        dataset = evaluate(ID, names, scenario, 300)
         for name in names:
             assert significance(dataset, name, "ideal") > -3.0, name
 
