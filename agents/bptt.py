@@ -7,6 +7,8 @@ descended every ``truncation`` decisions (truncated back-propagation): values go
 
 Compiled episodes are differentiated by the code of :mod:`.unrolled`, with the same gradients as torch's and several
 times as fast; a task that cannot be compiled runs on torch tensors.
+
+A learned estimator (``kalman-net``) is trained by the same descent: its network steers a filter of its own.
 """
 
 import functools
@@ -21,8 +23,11 @@ import torch
 
 from ..envs.catalogue import find_mixture, make_task, task_class
 from ..envs.environment import TaskVectorEnv
+from ..envs.task import Task
 from ..evaluation.seeds import episode_seeds
+from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
+from .settings import ESTIMATORS
 from .training_run import (
     Bookkeeping,
     TrainingRun,
@@ -142,12 +147,12 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
     if mixture is not None:
         if run.backend == "compiled":
             raise ValueError(
-                "algorithm 'bptt' learns mixtures of scenarios on torch only: leave out the backend"
+                f"algorithm {run.algorithm!r} learns mixtures of scenarios on torch only: leave out the backend"
             )
         tasks = [make_task(run.environment, run.control, name, **task_keywords(run)) for name in mixture]
         if len({task.horizon for task in tasks}) > 1:
             raise ValueError(
-                f"algorithm 'bptt' learns from episodes of one length, not from {run.scenario}: set env.horizon"
+                f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: set env.horizon"
             )
     elif run.backend in ("auto", "compiled"):
         env = make(backend=run.backend)
@@ -200,7 +205,7 @@ def train_bptt(
     space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, gymnasium.spaces.Box):
         raise ValueError(
-            f"algorithm 'bptt' needs the gradient of continuous actions, but control {run.control!r} has "
+            f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} has "
             f"{space}: choose dqn or ppo, or another control"
         )
     values = run.hyperparameters
@@ -240,6 +245,9 @@ def train_bptt(
         torch.save(kept, written)
         (place / "checkpoint.pt").write_bytes(written.getvalue())
 
+    def agent(task: Task) -> LearnedPolicy:
+        return LearnedPolicy(task, policy.arrays(), "tanh")
+
     def save_agent(place: Path) -> None:
         write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
 
@@ -252,7 +260,7 @@ def train_bptt(
             interval or max(1, run.steps // 20),
             save_checkpoint,
             save_agent,
-            lambda task: LearnedPolicy(task, policy.arrays(), "tanh"),
+            agent if run.algorithm not in ESTIMATORS else EstimatorMaker(run.control, agent),
             stop,
             report,
             curves_beside(logger),

@@ -20,6 +20,7 @@ from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
+from .learned_estimator import EstimatorMaker
 from .training_run import task_keywords
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -240,8 +241,8 @@ class _Stored:
         return LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
 
 
-def stored_policy(id: str, path: Path) -> _Stored:
-    """Load a learned policy from a file.
+def stored_policy(id: str, path: Path) -> _Stored | EstimatorMaker:
+    """Load a learned policy or estimator from a file: what makes it for a task.
 
     Raises:
         ValueError: if the file is not one, or it is of another environment.
@@ -249,7 +250,7 @@ def stored_policy(id: str, path: Path) -> _Stored:
     stored = _Stored(path)
     if stored.header["environment"] != task_class(id).id:
         raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {task_class(id).id}")
-    return stored
+    return EstimatorMaker(stored.control, stored) if stored.control in task_class(id).trained_banks else stored
 
 
 def pretrained_path(id: str, name: str) -> Path:

@@ -24,6 +24,7 @@ import numpy
 from ..baselines.catalogue import baselines_of
 from ..baselines.names import evaluate
 from ..envs.catalogue import (
+    catalogue,
     find_mixture,
     find_scenario,
     importable_name,
@@ -38,9 +39,16 @@ from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.stored import read_json, restored
-from .settings import OPTIONS, check_hyperparameters, check_keywords, merged, read_config
+from .settings import ESTIMATORS, OPTIONS, check_hyperparameters, check_keywords, merged, read_config
 
-FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
+FILES = {
+    "ppo": "ppo",
+    "recurrent-ppo": "ppo_lstm",
+    "sac": "sac",
+    "dqn": "dqn",
+    "bptt": "bptt",
+    "kalman-net": "kalman_net",
+}
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 VALIDATION_EPISODES = 512
 
@@ -140,8 +148,9 @@ def new_run(
     of_environment = merged(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     control = control or named["control"]
-    if control is not None and control not in cls.controls:
-        raise nearest("control", control, cls.controls)
+    controls = controls_of(cls, algorithm)
+    if control is not None and control not in controls:
+        raise nearest("control", control, controls)
     backend = backend if backend != "auto" or named["backend"] is None else named["backend"]
     flown = training_scenarios(cls, named["scenario"] if scenario is None else scenario)
     parameters = {name: value for name, value in of_environment.items() if name in parameter_names(cls)}
@@ -160,7 +169,7 @@ def new_run(
         raise ValueError(f"seed must not be negative, got {seed}")
     return TrainingRun(
         importable_name(cls),
-        control or cls.controls[0],
+        control or controls[0],
         in_words(flown),
         algorithm,
         seed,
@@ -170,6 +179,22 @@ def new_run(
         backend,
         interface=cls.interface,
     )
+
+
+def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
+    """What an algorithm can steer: the controls of an environment, or the filter of a learned estimator.
+
+    Raises:
+        ValueError: if the environment has no such filter.
+    """
+    if algorithm not in ESTIMATORS:
+        return cls.controls
+    if algorithm not in cls.trained_banks:
+        having = [other.id for other in catalogue().values() if algorithm in other.trained_banks]
+        raise ValueError(
+            f"{cls.id} has no filter for {algorithm!r} to steer: choose another algorithm, or {', '.join(having)}"
+        )
+    return (algorithm,)
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
@@ -448,7 +473,8 @@ class Validation:
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
-        cost = self._costs(policy, self.run.control)
+        acts = self.run.algorithm not in ESTIMATORS
+        cost = self._costs(policy, self.run.control if acts else None)
         entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry

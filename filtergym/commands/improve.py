@@ -55,7 +55,7 @@ def tune_policy(
 def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
-    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt or kalman-net.")] = "ppo",
     control: Annotated[
         str | None, typer.Option(help="What the agent steers; default: the environment's first.")
     ] = None,
@@ -85,7 +85,7 @@ def train(
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one also takes --trust. One of bptt
-    cannot.
+    or kalman-net cannot.
 
     Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
     settings of the run, and refuses others.
@@ -99,10 +99,10 @@ def train(
         import torch
 
         from ..agents import training_run
-        from ..agents.settings import parsed_settings
+        from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
 
         trainer: Any
-        if algo == "bptt":
+        if algo in THROUGH_THE_FILTER:
             from ..agents.bptt import train_bptt as trainer
         else:
             from ..agents.sb3_training import train_sb3
