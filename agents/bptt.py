@@ -83,7 +83,11 @@ class RecurrentPolicy(torch.nn.Module):
 
 
 def descend_episodes(
-    env: TaskVectorEnv, policy: RecurrentPolicy, truncation: int, descend: Callable[[], None]
+    env: TaskVectorEnv,
+    policy: RecurrentPolicy,
+    truncation: int,
+    descend: Callable[[], None],
+    largest: float | None = None,
 ) -> float:
     """Fly one episode in every environment and descend the gradient of the mean cost.
 
@@ -93,6 +97,9 @@ def descend_episodes(
         truncation: decisions through which the gradient flows back.
         descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
             the mean cost of a decision since the last time; uses and clears them.
+        largest: norm to which the gradient of an episode's costs since the last time with respect to one of its actions
+            is cut. Some episodes lose the track, and then the gradient grows with every decision that it flows back:
+            uncut, few episodes say where all go.
 
     Returns:
         Mean cost of a measurement, in the unit of the reward and compressed as there.
@@ -100,10 +107,18 @@ def descend_episodes(
     observation, _ = env.reset()
     hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)
     total, pending = 0.0, torch.zeros(())
+
+    def cut(gradient: torch.Tensor) -> torch.Tensor:
+        size = gradient.norm(dim=1, keepdim=True) * (window * env.num_envs)
+        return gradient * (largest / size.clamp_min(largest))
+
     for decision in range(1, env.last_decision + 1):
         action, hidden = policy(observation, hidden)
         # In double, so that the filter's state is not rounded to the network's precision.
-        observation, reward, _, _, _ = env.step(action.double())
+        action = action.double()
+        if largest is not None:
+            action.register_hook(cut)
+        observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
         window = (decision - 1) % truncation + 1
         if window == truncation or decision == env.last_decision:
@@ -152,7 +167,8 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
         tasks = [make_task(run.environment, run.control, name, **task_keywords(run)) for name in mixture]
         if len({task.horizon for task in tasks}) > 1:
             raise ValueError(
-                f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: set env.horizon"
+                f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: "
+                "set env.horizon"
             )
     elif run.backend in ("auto", "compiled"):
         env = make(backend=run.backend)
@@ -222,10 +238,11 @@ def train_bptt(
     else:
         measure_normalisation(env, policy)
 
+    largest = values.get("max_action_grad")
     if env.backend == "compiled":
-        fly = Unrolled(env, policy, values["truncation"], _descended(run)).descend_episodes
+        fly = Unrolled(env, policy, values["truncation"], _descended(run), largest).descend_episodes
     else:
-        fly = functools.partial(descend_episodes, env, policy, values["truncation"])
+        fly = functools.partial(descend_episodes, env, policy, values["truncation"], largest=largest)
 
     def descend() -> None:
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])

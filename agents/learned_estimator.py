@@ -43,7 +43,8 @@ class LearnedEstimator:
         state = bank.predict(memory.bank, measurement)
         shown = self.task.observe(Episode(None, measurement, state))
         action, network = self.network.predict(shown.T, memory.network)
-        state = bank.act(state, measurement, action.T)
+        # In double: arithmetic with constants would stay in the network's precision.
+        state = bank.act(state, measurement, action.T.astype(float))
         return bank.mean(state), bank.covariance(state), Filtered(state, network)
 
 
@@ -61,4 +62,5 @@ class EstimatorMaker:
         self.bank, self.policy = bank, policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
+        """Make it on NumPy, whatever the task computes on."""
         return LearnedEstimator(self.policy(task.on_numpy().under(self.bank)))

@@ -250,7 +250,9 @@ def stored_policy(id: str, path: Path) -> _Stored | EstimatorMaker:
     stored = _Stored(path)
     if stored.header["environment"] != task_class(id).id:
         raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {task_class(id).id}")
-    return EstimatorMaker(stored.control, stored) if stored.control in task_class(id).trained_banks else stored
+    return (
+        EstimatorMaker(stored.control, stored) if stored.control in task_class(id).trained_banks else stored
+    )
 
 
 def pretrained_path(id: str, name: str) -> Path:

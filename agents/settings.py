@@ -133,7 +133,9 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
         shipped: those of the file that is shipped.
     """
     known = {"n_envs", "n_timesteps", *shipped}
-    if algorithm not in THROUGH_THE_FILTER:
+    if algorithm in THROUGH_THE_FILTER:
+        known |= {"max_action_grad"}
+    else:
         from .sb3_training import ALGORITHMS
 
         cls = ALGORITHMS[algorithm]

@@ -158,13 +158,21 @@ class Unrolled:
             noise.
         policy: a :class:`~.bptt.RecurrentPolicy`.
         truncation: most decisions of a window.
-        reward: that is ascended, "cost" or "log-likelihood".
+        reward: that is ascended, as in :mod:`~..envs.reward`, but "relative".
+        largest: see :func:`.bptt.descend_episodes`.
     """
 
-    def __init__(self, env: TaskVectorEnv, policy: Any, truncation: int, reward: str = "cost") -> None:
+    def __init__(
+        self,
+        env: TaskVectorEnv,
+        policy: Any,
+        truncation: int,
+        reward: str = "cost",
+        largest: float | None = None,
+    ) -> None:
         lanes: Any = env.lanes  # of one task
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
-        self._truncation = min(truncation, env.last_decision)
+        self._truncation, self._largest = min(truncation, env.last_decision), largest
         self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
         fields = env.task.fields
@@ -222,6 +230,9 @@ class Unrolled:
                 if interval > 1:
                     rollout.shown_adjoint[self._last] = 0.0
                 of_action = of_action + rollout.action_adjoint[:, :count]
+            if self._largest is not None:
+                size = numpy.sqrt((of_action * of_action).sum(axis=0)) / (share * interval)
+                of_action *= self._largest / numpy.maximum(size, self._largest)
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
             if interval > 1:
                 rollout.shown_adjoint[self._mean] /= interval

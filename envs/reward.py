@@ -4,10 +4,10 @@
 on average, and compressed: with the charge ``x`` in that unit the agent is paid ``-30 log(1 + x / 30)``. That is about
 ``-x`` while the estimator works, and falls by 30 log(2) with every doubling once the track is lost: it always pays to
 find it again, and one lost track does not drown all that can be learned elsewhere. ``log-likelihood``: the logarithm of
-the reported Gaussian's density at the truth, which pays for an honest covariance too. ``cost-and-likelihood``: the sum of
-``cost`` and of ``log-likelihood`` over the number of components, for what must be both accurate and consistent. ``relative``: the ``cost`` reward
-with what the paper's algorithm is charged on the same noise added back (a control variate): positive where the agent
-does better than the paper. Which is the default, :attr:`.Task.reward` says.
+the reported Gaussian's density at the truth, which pays for an honest covariance too. ``cost-and-likelihood``: the sum
+of ``cost`` and of ``log-likelihood`` over the number of components, for what must be both accurate and consistent.
+``relative``: the ``cost`` reward with what the paper's algorithm is charged on the same noise added back (a control
+variate): positive where the agent does better than the paper. Which is the default, :attr:`.Task.reward` says.
 
 What an evaluation compares is the cost, neither compressed nor in another unit.
 """

@@ -1,11 +1,11 @@
 r"""The filter of LooselyCoupledNavigation that a recurrent network steers from inside: the learned estimator
 ``kalman-net``.
 
-The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with six
-numbers a in [-1, 1]:
+The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with
+six numbers a in [-1, 1]:
 
     noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise``
-    gain     K = diag(gain_range^(a4, a5, a6)) P' H^T / (H P' H^T + R)
+    gain     K = diag(1, rate_range^a5, rate_range^a6) P' H^T / (H P' H^T + caution^a4 R)
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
 All zero is the augmented filter. Without a fix K is zero. References and reading stand in
@@ -24,9 +24,11 @@ from ..task import Initial
 from .banks import NOISES, Augmented, NoiseBank
 from .world import Measurement
 
-GAIN_RANGE = 10.0
-"""Largest factor and divisor of an entry of the Kalman gain."""
-GAINS = ("position", "drift", "coloured")
+CAUTION = 100.0
+"""Largest factor and divisor of the receiver's variance in the gain alone."""
+RATE_RANGE = 3.0
+"""Largest factor and divisor of the gains of the rate errors."""
+GAINS = ("caution", "drift_gain", "coloured_gain")
 
 
 class KalmanNetBank(NoiseBank):
@@ -41,15 +43,25 @@ class KalmanNetBank(NoiseBank):
         unit = 1.0 / math.hypot(p.drift, p.coloured)
         return (
             *super().blocks,
-            Block("drift", lambda f, _: f.drift * unit, "estimated drift over a usual rate error", self.axes, SIGNED_LOG),
             Block(
-                "coloured", lambda f, _: f.coloured * unit, "estimated coloured rate error likewise", self.axes, SIGNED_LOG
+                "drift",
+                lambda f, _: f.drift * unit,
+                "estimated drift over a usual rate error",
+                self.axes,
+                SIGNED_LOG,
+            ),
+            Block(
+                "coloured",
+                lambda f, _: f.coloured * unit,
+                "estimated coloured rate error likewise",
+                self.axes,
+                SIGNED_LOG,
             ),
         )
 
     def last_action(self) -> Block:
         """Block of the action applied before."""
-        return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *(f"{g}_gain" for g in GAINS)))
+        return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
 
     def start(self, initial: Initial) -> Augmented:
         """Start where INS and reference agree, with the modelled prior of the rate errors."""
@@ -67,8 +79,12 @@ class KalmanNetBank(NoiseBank):
         a = xp.clip(action, -1.0, 1.0)
         P = self.predicted_covariance(state, a[: len(NOISES)])
         R = self.receiver_variance(measurement, a)
-        factor = measurement.available * xp.exp(math.log(GAIN_RANGE) * a[len(NOISES) :]) / (P.position + R)
-        gain = ins_gnss.AugmentedGain(factor[0] * P.position, factor[1] * P.position_drift, factor[2] * P.position_coloured)
+        caution, *rates = a[len(NOISES) :]
+        share = measurement.available / (P.position + xp.exp(math.log(CAUTION) * caution) * R)
+        by_drift, by_coloured = (share * xp.exp(math.log(RATE_RANGE) * rate) for rate in rates)
+        gain = ins_gnss.AugmentedGain(
+            share * P.position, by_drift * P.position_drift, by_coloured * P.position_coloured
+        )
         return state._replace(
             position=state.position + gain.position * innovation,
             drift=state.drift - gain.drift * innovation,

@@ -5,19 +5,22 @@ the frame of the predicted velocity (along it, and across it to the left, a rota
 
     motion   over the next interval T a turn at the rate a_across / v, and speed times 1 + a_along T / v,
              a = largest_acceleration (a8, a9);  F is the Jacobian of the turn
-    noise    sigma = nominal_acceleration noise_range^(a1, a2),  Q = G U diag(sigma^2) U^T G^T,  G = [T^2 / 2 I, T I],
-             R = scale variance,  scale = noise_range^a3
-    gain     K = diag(U, U) diag(gain_range^(a4 .. a7)) diag(U, U)^T  P' H^T (H P' H^T + R)^-1,  P' = F P F^T + Q
+    noise    sigma = nominal_acceleration noise_range^(a1, a2),  R = noise_range^a3 diag(variance)
+             Q(sigma) = G U diag(sigma^2) U^T G^T,  G = [T^2 / 2 I, T I],  P' = F P F^T + Q(sigma)
+    gain     K = M H^T (H M H^T + W R W^T)^-1,  W = U diag(caution^(a4, a5)) U^T,
+             M = F P F^T + Q(agility^(a6, a7) sigma)
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
 All zero is the Kalman filter of constant velocity under white acceleration. Without a measurement K is zero.
 
 The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering for
 Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547; the covariance by Joseph's form with that
-gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman Filtering for
-State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their network answers with the gain itself;
-here with factors of the Kalman gain of its own noises, so that a network that knows nothing is a filter that works. Their
-dynamics are given; here the network also answers with the acceleration, the part of them that nobody knows.
+gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman Filtering
+for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks answer with the gain
+itself; here with the noises of a Kalman gain, so that a network that knows nothing is a filter that works. They are not
+those of the covariance: what is good for one need not be for the other. (Factors of the gain's rows were as good, but
+could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part of
+them that nobody knows.
 """
 
 import math
@@ -37,14 +40,16 @@ from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
 if TYPE_CHECKING:
-    from .task import ManeuveringTarget
+    pass
 
 NOMINAL_ACCELERATION = 1.0
 """Standard deviation of the acceleration without the network, m/s^2, about that of all flights of ``random``."""
 NOISE_RANGE = 20.0
 """Largest factor and divisor of the standard deviation of the acceleration, and of the variance of a measurement."""
-GAIN_RANGE = 4.0
-"""Largest factor and divisor of a row of the Kalman gain."""
+CAUTION = 5.0
+"""Largest factor and divisor of the measurement's sigma in the gain alone."""
+AGILITY = 5.0
+"""Likewise of the acceleration's."""
 LARGEST_ACCELERATION = 8.0
 """Of what the network predicts along and across, m/s^2: one third more than any flight of ``random`` has."""
 LEAST_SPEED = 20.0
@@ -94,6 +99,12 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
     parameters: ManeuveringTargetParameters
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
 
+    def __init__(self, task: "ManeuveringTarget") -> None:
+        super().__init__(task)
+        # Columns of the identity.
+        columns = numpy.eye(4)[:, :, None]
+        self.positions, self.velocities = task.constant(columns[:, :2]), task.constant(columns[:, 2:])
+
     @property
     def blocks(self) -> Sequence[Block]:
         """Innovations and what the filter and the radar say of them, what was answered last, and the clock."""
@@ -127,7 +138,9 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
                 FRAME,
                 KEPT_AS_LOG,
             ),
-            Block("measurement_correlation", lambda f, _: f.coupling, "correlation of the measurement's errors"),
+            Block(
+                "measurement_correlation", lambda f, _: f.coupling, "correlation of the measurement's errors"
+            ),
             Block(
                 "acceleration",
                 lambda f, _: f.acceleration * (1.0 / LARGEST_ACCELERATION),
@@ -166,9 +179,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         none = 0.0 * initial.mean[:2]
         sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
         deviation = NOMINAL_ACCELERATION + none
-        return Track(
-            initial.mean, initial.covariance, none, deviation, none, none, sensor, sensor, none[0]
-        )
+        return Track(initial.mean, initial.covariance, none, deviation, none, none, sensor, sensor, none[0])
 
     def predict(self, state: Track, measurement: Measurement) -> Track:
         """Predict to the scan by the acceleration that was answered, and compare."""
@@ -218,9 +229,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         E = outer(variance[0] * frame[0], frame[0]) + outer(variance[1] * frame[1], frame[1])
         square = T * T
         corner, middle, velocity = (0.25 * square * square) * E, (0.5 * square * T) * E, square * E
-        return xp.concat(
-            [xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)]
-        )
+        return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
 
     def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
         """Update by the gain that was answered, and keep the acceleration for the next prediction."""
@@ -230,23 +239,17 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         inverse = transpose(frame)
         deviation = NOMINAL_ACCELERATION * xp.exp(math.log(NOISE_RANGE) * a[:2])
         P = state.covariance + self.noise(frame, deviation, measurement.interval)
+        agile = deviation * xp.exp(math.log(AGILITY) * a[5:7])
+        M = state.covariance[:, :2] + self.noise(frame, agile, measurement.interval)[:, :2]
         R = self.sensor(measurement) * xp.exp(math.log(NOISE_RANGE) * a[2])
-        S = P[:2, :2] + R
+        caution = product(inverse, xp.exp(math.log(CAUTION) * a[3:5])[:, None] * frame)
+        S = M[:2] + product(product(caution, R), caution)
         share = available / (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1])
         inverted = share * xp.stack([xp.stack([S[1, 1], -S[0, 1]]), xp.stack([-S[0, 1], S[0, 0]])])
-        nominal = product(P[:, :2], inverted)
-        factor = xp.exp(math.log(GAIN_RANGE) * a[3:7])
-        K = xp.concat(
-            [
-                product(inverse, factor[rows, None] * product(frame, nominal[rows]))
-                for rows in (slice(0, 2), slice(2, 4))
-            ]
-        )
-        innovation = apply(inverse, state.innovation)
-        correction = apply(K, innovation)
-        # (I - K H) P' needs no product: H picks the first two rows.
-        rest = P - product(K, P[:2])
-        joseph = rest - product(rest[:, :2], transpose(K)) + product(product(K, R), transpose(K))
+        K = product(M, inverted)
+        correction = apply(K, apply(inverse, state.innovation))
+        rest = xp.concat([self.positions - K, self.velocities + 0.0 * K], axis=1)
+        joseph = product(product(rest, P), transpose(rest)) + product(product(K, R), transpose(K))
         return state._replace(
             mean=state.mean + correction,
             covariance=0.5 * (joseph + transpose(joseph)),
