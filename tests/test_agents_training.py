@@ -75,7 +75,7 @@ def weights(algorithm, folder):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "kalman-net"])
 def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
-    # Interrupted at about a third, in the middle of an episode except for bptt and kalman-net, which learn from whole ones.
+    # Interrupted at about a third, in the middle of an episode; bptt and kalman-net learn from whole ones.
     steps = 1200 if algorithm in THROUGH_THE_FILTER else 720
     train(small_run(algorithm, steps), tmp_path / "whole")
     parts = tmp_path / "parts"

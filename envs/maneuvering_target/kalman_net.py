@@ -19,8 +19,8 @@ gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Dee
 for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks answer with the gain
 itself; here with the noises of a Kalman gain, so that a network that knows nothing is a filter that works. They are not
 those of the covariance: what is good for one need not be for the other. (Factors of the gain's rows were as good, but
-could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part of
-them that nobody knows.
+could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part
+of them that nobody knows.
 """
 
 import math
@@ -40,7 +40,7 @@ from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 
 if TYPE_CHECKING:
-    pass
+    from .task import ManeuveringTarget
 
 NOMINAL_ACCELERATION = 1.0
 """Standard deviation of the acceleration without the network, m/s^2, about that of all flights of ``random``."""

@@ -80,7 +80,9 @@ def train(
     config: Annotated[
         Path | None, typer.Option(help="YAML file of settings, in rl-zoo3's form or with keys env and algo.")
     ] = None,
-    reward: Annotated[str | None, typer.Option(help="cost, log-likelihood, cost-and-likelihood or relative.")] = None,
+    reward: Annotated[
+        str | None, typer.Option(help="cost, log-likelihood, cost-and-likelihood or relative.")
+    ] = None,
 ) -> None:
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
