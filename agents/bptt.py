@@ -7,6 +7,8 @@ descended every ``truncation`` decisions (truncated back-propagation): values go
 
 Compiled episodes are differentiated by the code of :mod:`.unrolled`, with the same gradients as torch's and several
 times as fast; a task that cannot be compiled runs on torch tensors.
+
+A learned estimator (``kalman-net``) is trained by the same descent: its network steers a filter of its own.
 """
 
 import functools
@@ -23,9 +25,12 @@ import torch
 from ..envs.backend import host_array
 from ..envs.catalogue import find_mixture, make_task, task_class
 from ..envs.environment import TaskVectorEnv
+from ..envs.task import Task
 from ..evaluation.seeds import episode_seeds
 from .gate import Gate, as_trained
+from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
+from .settings import ESTIMATORS
 from .training_run import (
     Bookkeeping,
     TrainingRun,
@@ -87,6 +92,7 @@ def descend_episodes(
     truncation: int,
     descend: Callable[[], None],
     gate: Gate | None = None,
+    largest: float | None = None,
 ) -> float:
     """Fly one episode in every environment and descend the gradient of the mean cost.
 
@@ -97,6 +103,9 @@ def descend_episodes(
         descend: called every ``truncation`` decisions and at the end, when the policy's gradients are those of
             the mean cost of a decision since the last time; uses and clears them.
         gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
+        largest: norm to which the gradient of an episode's costs since the last time with respect to one of its actions
+            is cut. Some episodes lose the track, and then the gradient grows with every decision that it flows back:
+            uncut, few episodes say where all go.
 
     Returns:
         Mean cost of a measurement, in the unit of the reward and compressed as there.
@@ -105,6 +114,11 @@ def descend_episodes(
     hidden = policy.mean.new_zeros(env.num_envs, policy.gru.hidden_size)
     total, pending = 0.0, torch.zeros(())
     memory, start = None, numpy.ones(env.num_envs, dtype=bool)
+
+    def cut(gradient: torch.Tensor) -> torch.Tensor:
+        size = gradient.norm(dim=1, keepdim=True) * (window * env.num_envs)
+        return gradient * (largest / size.clamp_min(largest))
+
     for decision in range(1, env.last_decision + 1):
         action, hidden = policy(observation, hidden)
         # In double, so that the filter's state is not rounded to the network's precision.
@@ -114,6 +128,8 @@ def descend_episodes(
             chosen, opened, memory = gate.choose(shown, answer, memory, start)
             start = numpy.zeros(env.num_envs, dtype=bool)
             action = torch.where(torch.as_tensor(opened)[:, None], action, torch.as_tensor(chosen))
+        if largest is not None:
+            action.register_hook(cut)
         observation, reward, _, _, _ = env.step(action)
         pending = pending - reward.mean()
         window = (decision - 1) % truncation + 1
@@ -158,12 +174,13 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
     if mixture is not None:
         if run.backend == "compiled":
             raise ValueError(
-                "algorithm 'bptt' learns mixtures of scenarios on torch only: leave out the backend"
+                f"algorithm {run.algorithm!r} learns mixtures of scenarios on torch only: leave out the backend"
             )
         tasks = [make_task(run.environment, run.control, name, **task_keywords(run)) for name in mixture]
         if len({task.horizon for task in tasks}) > 1:
             raise ValueError(
-                f"algorithm 'bptt' learns from episodes of one length, not from {run.scenario}: set env.horizon"
+                f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: "
+                "set env.horizon"
             )
     elif run.backend in ("auto", "compiled"):
         env = make(backend=run.backend)
@@ -218,7 +235,7 @@ def train_bptt(
     space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, gymnasium.spaces.Box):
         raise ValueError(
-            f"algorithm 'bptt' needs the gradient of continuous actions, but control {run.control!r} has "
+            f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} has "
             f"{space}: choose dqn or ppo, or another control"
         )
     values = run.hyperparameters
@@ -235,11 +252,14 @@ def train_bptt(
     else:
         measure_normalisation(env, policy)
 
+    largest = values.get("max_action_grad")
     gate = Gate(env.task) if run.gated else None
     if env.backend == "compiled":
-        fly = Unrolled(env, policy, values["truncation"], _descended(run), gate).descend_episodes
+        fly = Unrolled(env, policy, values["truncation"], _descended(run), gate, largest).descend_episodes
     else:
-        fly = functools.partial(descend_episodes, env, policy, values["truncation"], gate=gate)
+        fly = functools.partial(
+            descend_episodes, env, policy, values["truncation"], gate=gate, largest=largest
+        )
 
     def descend() -> None:
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
@@ -259,6 +279,9 @@ def train_bptt(
         torch.save(kept, written)
         (place / "checkpoint.pt").write_bytes(written.getvalue())
 
+    def agent(task: Task) -> LearnedPolicy:
+        return as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated)
+
     def save_agent(place: Path) -> None:
         write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
 
@@ -271,7 +294,7 @@ def train_bptt(
             interval or max(1, run.steps // 20),
             save_checkpoint,
             save_agent,
-            lambda task: as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated),
+            agent if run.algorithm not in ESTIMATORS else EstimatorMaker(run.control, agent),
             stop,
             report,
             curves_beside(logger),

@@ -21,6 +21,7 @@ from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
 from .gate import as_trained
+from .learned_estimator import EstimatorMaker
 from .training_run import task_keywords
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -244,8 +245,8 @@ class _Stored:
         return as_trained(task, network, *self.around)
 
 
-def stored_policy(id: str, path: Path) -> _Stored:
-    """Load a learned policy from a file.
+def stored_policy(id: str, path: Path) -> _Stored | EstimatorMaker:
+    """Load a learned policy or estimator from a file: what makes it for a task.
 
     Raises:
         ValueError: if the file is not one, or it is of another environment.
@@ -253,7 +254,9 @@ def stored_policy(id: str, path: Path) -> _Stored:
     stored = _Stored(path)
     if stored.header["environment"] != task_class(id).id:
         raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {task_class(id).id}")
-    return stored
+    return (
+        EstimatorMaker(stored.control, stored) if stored.control in task_class(id).trained_banks else stored
+    )
 
 
 def pretrained_path(id: str, name: str) -> Path:

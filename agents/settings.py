@@ -18,6 +18,10 @@ OPTIONS = ("control", "scenario", "backend")
 """Keywords of an environment that a run has options for."""
 SETTABLE = (*OPTIONS, "reward", "dtype")
 """Keywords of an environment, beside its parameters, that training takes."""
+ESTIMATORS = ("kalman-net",)
+"""Algorithms that make a learned estimator: they steer a filter of their own (``Task.trained_banks``)."""
+THROUGH_THE_FILTER = ("bptt", *ESTIMATORS)
+"""Algorithms of :mod:`.bptt`."""
 OF_THE_RUN = {"self", "env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 """Arguments of an algorithm that a run gives itself."""
 
@@ -145,8 +149,8 @@ def check_keywords(id: str, algorithm: str, keywords: Mapping[str, Any]) -> None
     for name in keywords:
         if name not in known:
             raise nearest("setting", f"env.{name}", [f"env.{other}" for other in known])
-    if algorithm == "bptt" and keywords.get("dtype", "float64") != "float64":
-        raise ValueError("algorithm 'bptt' is shown float64: leave out env.dtype")
+    if algorithm in THROUGH_THE_FILTER and keywords.get("dtype", "float64") != "float64":
+        raise ValueError(f"algorithm {algorithm!r} is shown float64: leave out env.dtype")
 
 
 def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
@@ -158,7 +162,9 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
         shipped: those of the file that is shipped.
     """
     known = {"n_envs", "n_timesteps", *shipped}
-    if algorithm != "bptt":
+    if algorithm in THROUGH_THE_FILTER:
+        known |= {"max_action_grad"}
+    else:
         from .sb3_training import ALGORITHMS
 
         cls = ALGORITHMS[algorithm]

@@ -25,6 +25,7 @@ from ..baselines.catalogue import baselines_of
 from ..baselines.names import own_competitor
 from ..envs.backend import task_on
 from ..envs.catalogue import (
+    catalogue,
     find_mixture,
     find_scenario,
     importable_name,
@@ -44,9 +45,16 @@ from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import read_json, restored
 from .gate import Gate
 from .residual import policy_to_correct
-from .settings import OPTIONS, check_hyperparameters, check_keywords, merged, read_config
+from .settings import ESTIMATORS, OPTIONS, check_hyperparameters, check_keywords, merged, read_config
 
-FILES = {"ppo": "ppo", "recurrent-ppo": "ppo_lstm", "sac": "sac", "dqn": "dqn", "bptt": "bptt"}
+FILES = {
+    "ppo": "ppo",
+    "recurrent-ppo": "ppo_lstm",
+    "sac": "sac",
+    "dqn": "dqn",
+    "bptt": "bptt",
+    "kalman-net": "kalman_net",
+}
 """Algorithms and the files of their hyperparameters, which have rl-zoo3's names."""
 VALIDATION_EPISODES = 512
 
@@ -168,8 +176,9 @@ def new_run(
     control = control or named["control"]
     if residual_to and control is None:
         control = getattr(own_competitor(cls.id, residual_to), "control", None)
-    if control is not None and control not in cls.controls:
-        raise nearest("control", control, cls.controls)
+    controls = controls_of(cls, algorithm)
+    if control is not None and control not in controls:
+        raise nearest("control", control, controls)
     backend = backend if backend != "auto" or named["backend"] is None else named["backend"]
     flown = training_scenarios(cls, named["scenario"] if scenario is None else scenario)
     parameters = {name: value for name, value in of_environment.items() if name in parameter_names(cls)}
@@ -190,7 +199,7 @@ def new_run(
         raise ValueError(f"seed must not be negative, got {seed}")
     return TrainingRun(
         importable_name(cls),
-        control or cls.controls[0],
+        control or controls[0],
         in_words(flown),
         algorithm,
         seed,
@@ -210,6 +219,10 @@ def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, 
         raise ValueError(
             "a policy to correct and a gate are made for the parameters of one scenario: train on one, not on a mixture"
         )
+    if (residual_to or gated) and algorithm in ESTIMATORS:
+        raise ValueError(
+            f"algorithm {algorithm!r} trains an estimator, which corrects no policy and has no gate"
+        )
     if residual_to and algorithm == "bptt":
         raise ValueError(
             "algorithm 'bptt' has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or sac"
@@ -217,6 +230,22 @@ def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, 
     corrected = policy_to_correct(task, residual_to) if residual_to else None
     if gated:
         Gate(task, corrected)
+
+
+def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
+    """What an algorithm can steer: the controls of an environment, or the filter of a learned estimator.
+
+    Raises:
+        ValueError: if the environment has no such filter.
+    """
+    if algorithm not in ESTIMATORS:
+        return cls.controls
+    if algorithm not in cls.trained_banks:
+        having = [other.id for other in catalogue().values() if algorithm in other.trained_banks]
+        raise ValueError(
+            f"{cls.id} has no filter for {algorithm!r} to steer: choose another algorithm, or {', '.join(having)}"
+        )
+    return (algorithm,)
 
 
 def training_scenarios(cls: type[Task], scenario: Any) -> dict[str, float]:
@@ -541,7 +570,8 @@ class Validation:
 
     def score(self, policy: Any) -> Validated:
         """Return an entry of ``TrainingRun.validation``."""
-        cost = self._costs(policy, self.run.control)
+        acts = self.run.algorithm not in ESTIMATORS
+        cost = self._costs(policy, self.run.control if acts else None)
         entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry

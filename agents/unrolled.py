@@ -159,8 +159,9 @@ class Unrolled:
             noise.
         policy: a :class:`~.bptt.RecurrentPolicy`.
         truncation: most decisions of a window.
-        reward: that is ascended, "cost" or "log-likelihood".
+        reward: that is ascended, as in :mod:`~..envs.reward`, but "relative".
         gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
+        largest: see :func:`.bptt.descend_episodes`.
     """
 
     def __init__(
@@ -170,10 +171,11 @@ class Unrolled:
         truncation: int,
         reward: str = "cost",
         gate: Gate | None = None,
+        largest: float | None = None,
     ) -> None:
         lanes: Any = env.lanes  # of one task
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
-        self._truncation = min(truncation, env.last_decision)
+        self._truncation, self._largest = min(truncation, env.last_decision), largest
         self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
         self._gate: Any = gate
@@ -239,6 +241,9 @@ class Unrolled:
                 of_action = of_action + rollout.action_adjoint[:, :count]
             if self._gate is not None:
                 of_action = of_action * self._opened[decision]
+            if self._largest is not None:
+                size = numpy.sqrt((of_action * of_action).sum(axis=0)) / (share * interval)
+                of_action *= self._largest / numpy.maximum(size, self._largest)
             rollout.shown_adjoint[:, :count] = policy.backward(decision, of_action)
             if interval > 1:
                 rollout.shown_adjoint[self._mean] /= interval

@@ -349,7 +349,7 @@ def make_task(
     """
     cls = task_class(id)
     control = cls.controls[0] if control is None else control
-    if control not in cls.controls:
+    if control not in (*cls.controls, *cls.trained_banks):
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})

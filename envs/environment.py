@@ -431,8 +431,8 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture,
             ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these weights from
             the episode's generator.
-        reward: "cost", "log-likelihood" or "relative", see :mod:`.reward`; default: the environment's own, and
-            zero on a recording without truth.
+        reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative", see :mod:`.reward`; default: the
+            environment's own, and zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
@@ -601,7 +601,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
-        reward: "cost", "log-likelihood" or "relative"; default: the environment's own.
+        reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative"; default: the environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the

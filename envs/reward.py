@@ -4,9 +4,10 @@
 on average, and compressed: with the charge ``x`` in that unit the agent is paid ``-30 log(1 + x / 30)``. That is about
 ``-x`` while the estimator works, and falls by 30 log(2) with every doubling once the track is lost: it always pays to
 find it again, and one lost track does not drown all that can be learned elsewhere. ``log-likelihood``: the logarithm of
-the reported Gaussian's density at the truth, which pays for an honest covariance too. ``relative``: the ``cost`` reward
-with what the paper's algorithm is charged on the same noise added back (a control variate): positive where the agent
-does better than the paper. Which is the default, :attr:`.Task.reward` says.
+the reported Gaussian's density at the truth, which pays for an honest covariance too. ``cost-and-likelihood``: the sum
+of ``cost`` and of ``log-likelihood`` over the number of components, for what must be both accurate and consistent.
+``relative``: the ``cost`` reward with what the paper's algorithm is charged on the same noise added back (a control
+variate): positive where the agent does better than the paper. Which is the default, :attr:`.Task.reward` says.
 
 What an evaluation compares is the cost, neither compressed nor in another unit.
 """
@@ -39,6 +40,11 @@ def log_likelihood_reward(task: Task, state: Any) -> Array:
     return log_density(task.error(state), task.covariance(state))[0]
 
 
+def cost_and_likelihood_reward(task: Task, state: Any) -> Array:
+    """Both: minus the compressed charge, plus the log-density of a component, ``(N,)``."""
+    return cost_reward(task, state) + log_likelihood_reward(task, state) * (1.0 / len(task.components))
+
+
 def no_reward(task: Task, state: Any) -> Array:
     """Zero, ``(N,)``: nobody knows the truth."""
     return 0.0 * task.mean(state)[0]
@@ -47,6 +53,7 @@ def no_reward(task: Task, state: Any) -> Array:
 OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
+    "cost-and-likelihood": cost_and_likelihood_reward,
     "relative": cost_reward,
     "none": no_reward,
 }

@@ -342,6 +342,9 @@ class Task(ABC):
     """What the action can steer, and the bank that it steers; the first is the default."""
     controls: ClassVar[tuple[str, ...]]
     """Names of ``banks``."""
+    trained_banks: ClassVar[Mapping[str, type[Bank]]] = {}
+    """Filters that a network of their own steers, by the algorithm that trains it: learned estimators. An environment
+    steers them like any bank, to train them; nobody else's policy acts in them."""
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
     of_world_only: ClassVar[tuple[str, ...]] = ()
@@ -412,7 +415,7 @@ class Task(ABC):
         else:
             self.flights = recording.lengths_within(self.horizon, self.decision_interval)
             self.world = recording.world(self)
-        self.bank = self.banks[control](self)
+        self.bank = {**self.banks, **self.trained_banks}[control](self)
         self._outside = OutsideBank(self)
         self.noise = self._noise_layout()
         self._blocks = Blocks(self.bank.blocks, self.bank.quantities, xp)

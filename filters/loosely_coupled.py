@@ -267,3 +267,29 @@ def update_augmented(
         P.drift_coloured - gain.drift * P.position_coloured,
         P.coloured - gain.coloured * P.position_coloured,
     )
+
+
+def update_augmented_by(P: AugmentedCovariance, R: Array, gain: AugmentedGain) -> AugmentedCovariance:
+    """Covariance after a measurement of delta that was taken in with any gain, ``(I - K H) P (I - K H)^T + K R K^T``
+    (Joseph form).
+
+    Args:
+        P: of the prediction.
+        R: variance of the measurement, m^2.
+        gain: K; zero where there is no measurement.
+    """
+    rest = 1.0 - gain.position
+    drift = P.position_drift - gain.drift * P.position
+    coloured = P.position_coloured - gain.coloured * P.position
+    noise = gain.position * R
+    return AugmentedCovariance(
+        rest * rest * P.position + noise * gain.position,
+        rest * drift + noise * gain.drift,
+        rest * coloured + noise * gain.coloured,
+        P.drift - gain.drift * (P.position_drift + drift) + gain.drift * gain.drift * R,
+        P.drift_coloured
+        - gain.coloured * P.position_drift
+        - gain.drift * coloured
+        + gain.drift * gain.coloured * R,
+        P.coloured - gain.coloured * (P.position_coloured + coloured) + gain.coloured * gain.coloured * R,
+    )

@@ -65,9 +65,11 @@ def test_shipped_agent_does_not_beat_what_is_optimal(file):
 
 
 def test_there_are_shipped_agents():
-    """Those of the other environments are withdrawn: they were trained for an earlier interface."""
+    """Policies of the other environments are withdrawn: they were trained for an earlier interface."""
     assert [f"{file.parent.name}/{file.stem}" for file in SHIPPED] == [
+        "LooselyCoupledNavigation-v0/kalman-net",
         "ManeuveringTarget-v0/bptt",
+        "ManeuveringTarget-v0/kalman-net",
         "ManeuveringTarget-v0/ppo",
     ]
 
@@ -219,7 +221,7 @@ def test_shipped_agents_need_no_torch():
     code = (
         "import sys, filtergym\n"
         "from filtergym import evaluate\n"
-        f"evaluate({ID!r}, ['ppo', 'bptt'], episodes=2)\n"
+        f"evaluate({ID!r}, ['ppo', 'bptt', 'kalman-net'], episodes=2)\n"
         "assert not {'torch', 'stable_baselines3', 'yaml'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -43,8 +43,10 @@ SMALL = {
     "sac": {"learning_starts": 60, "buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}},
     "dqn": {"learning_starts": 60, "buffer_size": 500, "batch_size": 16, "policy_kwargs": {"net_arch": [8]}},
     "bptt": {"hidden_size": 4, "truncation": 40},
+    "kalman-net": {"hidden_size": 4, "truncation": 40},
 }  # fmt: skip
-CONTROL = {"dqn": "mode"}
+CONTROL = {"dqn": "mode", "kalman-net": "kalman-net"}
+THROUGH_THE_FILTER = ("bptt", "kalman-net")
 
 
 @pytest.fixture(autouse=True)
@@ -59,12 +61,12 @@ def small_run(algorithm, steps, envs=4, **keywords):
 
 def train(run, folder, **keywords):
     folder.mkdir(exist_ok=True)
-    trainer = train_bptt if run.algorithm == "bptt" else functools.partial(train_sb3, trust=True)
+    trainer = train_bptt if run.algorithm in THROUGH_THE_FILTER else functools.partial(train_sb3, trust=True)
     return trainer(run, folder, interval=keywords.pop("interval", 10**9), **keywords)
 
 
 def weights(algorithm, folder):
-    if algorithm == "bptt":
+    if algorithm in THROUGH_THE_FILTER:
         return torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]
     agent = load_sb3_policy(folder / "checkpoint" / "model.zip", trust=True)
     statistics = agent.normalisation.obs_rms
@@ -75,10 +77,10 @@ def weights(algorithm, folder):
     }
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt"])
+@pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo", "sac", "dqn", "bptt", "kalman-net"])
 def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
-    # Interrupted at about a third, in the middle of an episode except for bptt, which learns from whole ones.
-    steps = 1200 if algorithm == "bptt" else 720
+    # Interrupted at about a third, in the middle of an episode; bptt and kalman-net learn from whole ones.
+    steps = 1200 if algorithm in THROUGH_THE_FILTER else 720
     train(small_run(algorithm, steps), tmp_path / "whole")
     parts = tmp_path / "parts"
     asked = []
@@ -202,6 +204,20 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     # float32 in both, with sums in another order.
     np.testing.assert_allclose(action, expected, atol=3e-6)
     assert load_run(tmp_path).command == read_header(file)["run"]["command"]
+
+
+def test_an_exported_estimator_is_what_was_validated(tmp_path):
+    run = train(small_run("kalman-net", 400), tmp_path)
+    file = tmp_path / "agent.safetensors"
+    exported = export_run(tmp_path, file).exported
+    assert exported is not None
+    dataset = evaluate(ID, [str(file), str(tmp_path)], episodes=32, split="validation")
+    assert dataset["kind"].values.tolist() == ["estimator", "estimator"]
+    cost = dataset["cost"].mean(["episode", "time"]).values
+    np.testing.assert_array_equal(cost, exported["cost"])
+    # The validation has half of these episodes.
+    half = float(dataset["cost"][0, :16].mean())
+    assert run.validation[-1]["cost"] == pytest.approx(half, rel=1e-9)
 
 
 def test_exported_recurrent_policy_acts_like_the_network(tmp_path):

@@ -71,7 +71,7 @@ def test_every_scenario_is_that_of_numpy(env_id, short):
             assert_near(one, other, env_id)
 
 
-@pytest.mark.parametrize("reward", ["cost", "relative", "log-likelihood"])
+@pytest.mark.parametrize("reward", ["cost", "relative", "log-likelihood", "cost-and-likelihood"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
     envs = pair(env_id, 5, reward=reward, autoreset_mode=mode, **short)

@@ -116,6 +116,8 @@ def random_policy(env, dtype):
     [
         ("ManeuveringTarget", "gain", {}, 1e-9),
         ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, 1e-9),
+        ("ManeuveringTarget", "kalman-net", {}, 1e-9),
+        ("LooselyCoupledNavigation", "kalman-net", {}, 1e-9),
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 1e-9),
         ("UavAutopilot", "gain", {}, 1e-9),
         ("RadarEsmTracking", "evidence", {}, 1e-9),
@@ -123,7 +125,8 @@ def random_policy(env, dtype):
         ("TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, 1e-9),
     ],
 )
-def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, tolerance):
+@pytest.mark.parametrize("largest", [None, 0.01])
+def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, tolerance, largest):
     # Windows of three decisions, three and one; five episodes in eight lanes.
     envs = [
         TaskVectorEnv(
@@ -142,8 +145,8 @@ def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, toler
     for env in envs:
         env.reset(seed=0)
     costs = [
-        descend_episodes(envs[0], policy, 3, descend),
-        Unrolled(envs[1], policy, 3).descend_episodes(descend),
+        descend_episodes(envs[0], policy, 3, descend, largest),
+        Unrolled(envs[1], policy, 3, largest=largest).descend_episodes(descend),
     ]
     assert costs[1] == pytest.approx(costs[0], rel=1e-11)
     windows = len(found) // 2

@@ -136,7 +136,10 @@ def combinations(cls, count, seed):
         scenario = str(rng.choice(list(tables)))
         names = rng.choice(list(tables[scenario]), size=rng.integers(1, 7), replace=False)
         chosen = {str(n): tables[scenario][n][rng.integers(len(tables[scenario][n]))] for n in names}
-        yield {"control": str(rng.choice(cls.controls)), "scenario": scenario, **chosen}, REWARDS[i % 3]
+        yield (
+            {"control": str(rng.choice(cls.controls)), "scenario": scenario, **chosen},
+            REWARDS[i % len(REWARDS)],
+        )
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

@@ -66,7 +66,17 @@ def test_the_default_is_the_environments_own(env_id, short, random_actions):
     assert (cost != relative).any()
 
 
-@pytest.mark.parametrize("kind", ["cost", "relative", "log-likelihood"])
+def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_actions):
+    kinds = ("cost", "log-likelihood", "cost-and-likelihood")
+    envs = [TaskVectorEnv(env_id, 3, reward=kind, **short) for kind in kinds]
+    for env in envs:
+        env.reset(seed=4)
+    actions = random_actions(envs[0].single_action_space, 3, 0)
+    cost, likelihood, both = (env.step(actions)[1] for env in envs)
+    np.testing.assert_allclose(both, cost + likelihood / len(envs[0].task.components), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["cost", "relative", "log-likelihood", "cost-and-likelihood"])
 def test_what_else_is_told_leaves_the_reward_alone(env_id, kind, short, random_actions):
     """To the last bit: compiled logarithms may round otherwise than NumPy's."""
     envs = [

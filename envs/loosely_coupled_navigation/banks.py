@@ -294,6 +294,13 @@ class NoiseBank(_KalmanBucyBank):
         white_growth = coloured * residual + white * (displacement - residual)
         return ins_gnss.predict_augmented(state.covariance, p.sampling, coloured * growth, white_growth)
 
+    def receiver_variance(self, measurement: Measurement, action: Array) -> Array:
+        """Variance of a measurement by an action, ``(N,)``, m^2."""
+        p = self.parameters
+        up, down = math.log(p.receiver_scale), math.log(p.receiver_reduction)
+        scale = self.xp.exp(self.xp.where(action[0] > 0.0, up * action[0], down * action[0]))
+        return scale * measurement.reported_deviation * measurement.reported_deviation
+
     def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
         """Predict by the increment of the INS less the estimated rate errors; show it with the last action's noises."""
         s = self.parameters.sampling
@@ -308,11 +315,9 @@ class NoiseBank(_KalmanBucyBank):
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
         """Update by the Kalman gain that follows from the noises of the action."""
-        xp, p, innovation = self.xp, self.parameters, state.seen.innovation
-        action = xp.clip(action, -1.0, 1.0)
-        up, down = math.log(p.receiver_scale), math.log(p.receiver_reduction)
-        scale = xp.exp(xp.where(action[0] > 0.0, up * action[0], down * action[0]))
-        R = scale * measurement.reported_deviation * measurement.reported_deviation
+        innovation = state.seen.innovation
+        action = self.xp.clip(action, -1.0, 1.0)
+        R = self.receiver_variance(measurement, action)
         predicted = self.predicted_covariance(state, action)
         gain, P = ins_gnss.update_augmented(predicted, R, measurement.available)
         return state._replace(

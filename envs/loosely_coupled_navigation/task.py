@@ -19,6 +19,7 @@ from ..recorded_tables import Columns, Recorded
 from ..recording import Started
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
+from .kalman_net import KalmanNetBank
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
@@ -113,6 +114,7 @@ class LooselyCoupledNavigation(Task):
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
+    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     modes = SCHEMES
     cost_description = "squared error of position over the nominal variance of a measurement"

@@ -18,6 +18,7 @@ from ..recording import Started
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
+from .kalman_net import KalmanNetBank
 from .parameters import ManeuveringTargetParameters
 from .recorded import COLUMNS, FARTHEST_RANGE, recorded, scanned_regularly, started
 from .scenarios import SCENARIOS
@@ -114,6 +115,7 @@ class ManeuveringTarget(Task):
         "mode": FilterBank,
         "weights": FilterBank,
     }
+    trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     components = (
         Component("position_x", "m"),

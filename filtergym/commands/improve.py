@@ -8,7 +8,7 @@ import typer
 
 from ..agents import training_run
 from ..agents.export import export_run
-from ..agents.settings import parsed_settings
+from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
 from ..agents.training_run import TrainingRun, best_agent
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
@@ -65,7 +65,7 @@ def _trainer(algo: str, trust: bool = False) -> Any:
     try:
         import torch
 
-        if algo == "bptt":
+        if algo in THROUGH_THE_FILTER:
             from ..agents.bptt import train_bptt as trainer
         else:
             from ..agents.sb3_training import train_sb3
@@ -82,7 +82,7 @@ def _trainer(algo: str, trust: bool = False) -> Any:
 def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
-    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn or bptt.")] = "ppo",
+    algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt or kalman-net.")] = "ppo",
     control: Annotated[
         str | None, typer.Option(help="What the agent steers; default: the environment's first.")
     ] = None,
@@ -116,7 +116,9 @@ def train(
     config: Annotated[
         Path | None, typer.Option(help="YAML file of settings, in rl-zoo3's form or with keys env and algo.")
     ] = None,
-    reward: Annotated[str | None, typer.Option(help="cost, log-likelihood or relative.")] = None,
+    reward: Annotated[
+        str | None, typer.Option(help="cost, log-likelihood, cost-and-likelihood or relative.")
+    ] = None,
     residual_to: Annotated[
         str, typer.Option(metavar="POLICY", help="Policy of the environment that the agent corrects.")
     ] = "",
@@ -131,7 +133,7 @@ def train(
     """Train an agent; Ctrl-C or SIGTERM stops it with a checkpoint that --resume goes on from.
 
     A checkpoint of Stable-Baselines3 can execute code when it is loaded: to resume one, with --resume or --seeds, also
-    takes --trust. One of bptt cannot.
+    takes --trust. One of bptt or kalman-net cannot.
 
     Settings go before those of --config, and these before the shipped hyperparameters. --resume goes on with the
     settings of the run, and refuses others.
@@ -179,7 +181,7 @@ def train(
             folder = out.with_name(f"{out.name}-{number}")
             begun = training_run.holds_run(folder)
             run = training_run.opened_run(folder, asked(number), begun)
-            if begun and not run.finished and algo != "bptt":
+            if begun and not run.finished and algo not in THROUGH_THE_FILTER:
                 training_run.check_trust(
                     f"{folder} goes on from a checkpoint that is loaded with pickle", trust
                 )

@@ -157,7 +157,7 @@ def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
     if name == paper:
         return " (paper)"
     if name in learned:
-        return " (learned)"
+        return " (learned estimator)" if kind == "estimator" else " (learned)"
     return "" if kind == "policy" else f" ({kind})"
 
 

@@ -1,0 +1,66 @@
+"""A learned estimator: a filter with a network inside, as plain arrays.
+
+The filter is a bank of the environment (``Task.trained_banks``), the network is a learned policy that acts in it. From
+outside there is neither observation nor action: measurements go in, mean and covariance come out.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+from ..envs.observation import Array
+from ..envs.task import Episode, Task
+from ..evaluation.competitors import Kind, Policy
+
+
+class Filtered(NamedTuple):
+    """Memory of a learned estimator."""
+
+    bank: Any
+    """State of the filter."""
+    network: Any
+    """Memory of the network; None before the first measurement."""
+
+
+class LearnedEstimator:
+    """A trained bank with its network, see :class:`~..evaluation.competitors.Estimator`.
+
+    Args:
+        network: a policy made for the task under the bank's name, on NumPy.
+    """
+
+    kind: ClassVar[Kind] = "estimator"
+
+    def __init__(self, network: Policy) -> None:
+        self.network, self.task = network, network.task
+
+    def start(self, initial: Any, N: int) -> Filtered:
+        """Start the filter where everyone starts."""
+        return Filtered(self.task.bank.start(initial), None)
+
+    def update(self, measurement: Any, memory: Filtered) -> tuple[Array, Array, Filtered]:
+        """Predict, show the network what comes of it, and update as it answers."""
+        bank = self.task.bank
+        state = bank.predict(memory.bank, measurement)
+        shown = self.task.observe(Episode(None, measurement, state))
+        action, network = self.network.predict(shown.T, memory.network)
+        # In double: arithmetic with constants would stay in the network's precision.
+        state = bank.act(state, measurement, action.T.astype(float))
+        return bank.mean(state), bank.covariance(state), Filtered(state, network)
+
+
+class EstimatorMaker:
+    """Makes a learned estimator for a task; what an evaluation calls.
+
+    Args:
+        bank: name of the filter in ``task.trained_banks``.
+        policy: what makes the network for the task under that name.
+    """
+
+    kind: ClassVar[Kind] = "estimator"
+
+    def __init__(self, bank: str, policy: Callable[[Task], Policy]) -> None:
+        self.bank, self.policy = bank, policy
+
+    def __call__(self, task: Task) -> LearnedEstimator:
+        """Make it on NumPy, whatever the task computes on."""
+        return LearnedEstimator(self.policy(task.on_numpy().under(self.bank)))

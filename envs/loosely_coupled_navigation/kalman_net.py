@@ -1,0 +1,94 @@
+r"""The filter of LooselyCoupledNavigation that a recurrent network steers from inside: the learned estimator
+``kalman-net``.
+
+The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with
+six numbers a in [-1, 1]:
+
+    noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise``
+    gain     K = diag(1, rate_range^a5, rate_range^a6) P' H^T / (H P' H^T + caution^a4 R)
+    update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
+
+All zero is the augmented filter. Without a fix K is zero. References and reading stand in
+``maneuvering_target/kalman_net.py``.
+"""
+
+import math
+from collections.abc import Sequence
+
+import gymnasium
+import numpy
+
+from ...filters import loosely_coupled as ins_gnss
+from ..observation import SIGNED_LOG, Array, Block
+from ..task import Initial
+from .banks import NOISES, Augmented, NoiseBank
+from .world import Measurement
+
+CAUTION = 100.0
+"""Largest factor and divisor of the receiver's variance in the gain alone."""
+RATE_RANGE = 3.0
+"""Largest factor and divisor of the gains of the rate errors."""
+GAINS = ("caution", "drift_gain", "coloured_gain")
+
+
+class KalmanNetBank(NoiseBank):
+    """The augmented filter, whose noises and gain the action sets."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What control ``noise`` shows, and the estimated rate errors."""
+        p = self.parameters
+        unit = 1.0 / math.hypot(p.drift, p.coloured)
+        return (
+            *super().blocks,
+            Block(
+                "drift",
+                lambda f, _: f.drift * unit,
+                "estimated drift over a usual rate error",
+                self.axes,
+                SIGNED_LOG,
+            ),
+            Block(
+                "coloured",
+                lambda f, _: f.coloured * unit,
+                "estimated coloured rate error likewise",
+                self.axes,
+                SIGNED_LOG,
+            ),
+        )
+
+    def last_action(self) -> Block:
+        """Block of the action applied before."""
+        return Block("last_action", lambda f, _: f.action, "action applied before", (*NOISES, *GAINS))
+
+    def start(self, initial: Initial) -> Augmented:
+        """Start where INS and reference agree, with the modelled prior of the rate errors."""
+        state = super().start(initial)
+        return state._replace(action=self.xp.concat([state.action, state.action]))
+
+    def predict(self, state: Augmented, measurement: Measurement) -> Augmented:
+        """Predict as under control ``noise``, whose action is the first part of this one."""
+        predicted = super().predict(state._replace(action=state.action[: len(NOISES)]), measurement)
+        return predicted._replace(action=state.action)
+
+    def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
+        """Update by the gain that was answered."""
+        xp, innovation = self.xp, state.seen.innovation
+        a = xp.clip(action, -1.0, 1.0)
+        P = self.predicted_covariance(state, a[: len(NOISES)])
+        R = self.receiver_variance(measurement, a)
+        caution, *rates = a[len(NOISES) :]
+        share = measurement.available / (P.position + xp.exp(math.log(CAUTION) * caution) * R)
+        by_drift, by_coloured = (share * xp.exp(math.log(RATE_RANGE) * rate) for rate in rates)
+        gain = ins_gnss.AugmentedGain(
+            share * P.position, by_drift * P.position_drift, by_coloured * P.position_coloured
+        )
+        return state._replace(
+            position=state.position + gain.position * innovation,
+            drift=state.drift - gain.drift * innovation,
+            coloured=state.coloured - gain.coloured * innovation,
+            covariance=ins_gnss.update_augmented_by(P, R, gain),
+            action=a,
+        )

@@ -1,0 +1,267 @@
+r"""The filter of ManeuveringTarget that a recurrent network steers from inside: the learned estimator ``kalman-net``.
+
+An extended Kalman filter of position and velocity. At every scan the network answers with nine numbers a in [-1, 1], in
+the frame of the predicted velocity (along it, and across it to the left, a rotation U):
+
+    motion   over the next interval T a turn at the rate a_across / v, and speed times 1 + a_along T / v,
+             a = largest_acceleration (a8, a9);  F is the Jacobian of the turn
+    noise    sigma = nominal_acceleration noise_range^(a1, a2),  R = noise_range^a3 diag(variance)
+             Q(sigma) = G U diag(sigma^2) U^T G^T,  G = [T^2 / 2 I, T I],  P' = F P F^T + Q(sigma)
+    gain     K = M H^T (H M H^T + W R W^T)^-1,  W = U diag(caution^(a4, a5)) U^T,
+             M = F P F^T + Q(agility^(a6, a7) sigma)
+    update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
+
+All zero is the Kalman filter of constant velocity under white acceleration. Without a measurement K is zero.
+
+The gain of a network on innovations is that of Revach and others, "KalmanNet: Neural Network Aided Kalman Filtering for
+Partially Known Dynamics", IEEE Trans. Signal Processing 70 (2022) 1532-1547; the covariance by Joseph's form with that
+gain and learned noises is that of Mortada and others, "Recursive KalmanNet: Deep Learning-Augmented Kalman Filtering
+for State Estimation with Consistent Uncertainty Quantification" (2025). Reading: their networks answer with the gain
+itself; here with the noises of a Kalman gain, so that a network that knows nothing is a filter that works. They are not
+those of the covariance: what is good for one need not be for the other. (Factors of the gain's rows were as good, but
+could make the filter diverge.) Their dynamics are given; here the network also answers with the acceleration, the part
+of them that nobody knows.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import gymnasium
+import numpy
+
+from ...filters import coordinated_turn
+from ...filters.array_namespace import namespace
+from ...filters.small_matrices import apply, outer, product, transpose
+from ..observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block
+from ..task import Bank, Initial
+from .banks import SCANS_SHOWN
+from .parameters import ManeuveringTargetParameters
+from .world import Measurement
+
+if TYPE_CHECKING:
+    from .task import ManeuveringTarget
+
+NOMINAL_ACCELERATION = 1.0
+"""Standard deviation of the acceleration without the network, m/s^2, about that of all flights of ``random``."""
+NOISE_RANGE = 20.0
+"""Largest factor and divisor of the standard deviation of the acceleration, and of the variance of a measurement."""
+CAUTION = 5.0
+"""Largest factor and divisor of the measurement's sigma in the gain alone."""
+AGILITY = 5.0
+"""Likewise of the acceleration's."""
+LARGEST_ACCELERATION = 8.0
+"""Of what the network predicts along and across, m/s^2: one third more than any flight of ``random`` has."""
+LEAST_SPEED = 20.0
+"""What a turn is divided by at least, m/s: a target that stands still has no direction."""
+ANSWERS = 9
+FRAME = ("along", "across")
+
+
+class Track(NamedTuple):
+    """The filter at one moment."""
+
+    mean: Array
+    """x, y (m), vx, vy (m/s), ``(4, N)``; predicted between :meth:`KalmanNetBank.predict` and the action."""
+    covariance: Array
+    """``(4, 4, N)``; likewise, and then without process noise."""
+    acceleration: Array
+    """Predicted for the time to the next scan, along and across, m/s^2, ``(2, N)``."""
+    deviation: Array
+    """Standard deviation of the acceleration in the last scan, likewise."""
+    correction: Array
+    """Velocity corrected by in the last scan, likewise, m/s."""
+    innovation: Array
+    """m, along and across the predicted velocity, ``(2, N)``."""
+    prior: Array
+    """Variance of the predicted position with the noise of the last scan, likewise, m^2."""
+    sensor: Array
+    """Variance of the measurement, likewise, m^2."""
+    coupling: Array
+    """Its correlation between along and across, ``(N,)``."""
+
+
+def speed_of(velocity: Array, least: float = 1e-3) -> Array:
+    """Speed, ``(N,)``, smoothly never below the least, m/s."""
+    return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
+
+
+def frame_of(velocity: Array) -> Array:
+    """Rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``."""
+    xp = namespace(velocity)
+    direction = velocity / speed_of(velocity)
+    return xp.stack([direction, xp.stack([-direction[1], direction[0]])])
+
+
+class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
+    """An extended Kalman filter whose noises, gain and motion the action sets."""
+
+    parameters: ManeuveringTargetParameters
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
+
+    def __init__(self, task: "ManeuveringTarget") -> None:
+        super().__init__(task)
+        # Columns of the identity.
+        columns = numpy.eye(4)[:, :, None]
+        self.positions, self.velocities = task.constant(columns[:, :2]), task.constant(columns[:, 2:])
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """Innovations and what the filter and the radar say of them, what was answered last, and the clock."""
+        xp, p = self.xp, self.parameters
+        return (
+            Block(
+                "innovation",
+                lambda f, _: f.innovation / xp.sqrt(f.prior + f.sensor),
+                "the innovation over its predicted sigma",
+                FRAME,
+                SIGNED_LOG,
+            ),
+            Block(
+                "correction",
+                lambda f, _: f.correction * (1.0 / (NOMINAL_ACCELERATION * p.sampling_interval)),
+                "the last correction of the velocity over what 1 m/s^2 makes of it in a scan period",
+                FRAME,
+                SIGNED_LOG,
+            ),
+            Block(
+                "prior",
+                lambda f, _: 0.5 * xp.log(f.prior / f.sensor),
+                "the sigma of the predicted position over that of the measurement",
+                FRAME,
+                KEPT_AS_LOG,
+            ),
+            Block(
+                "measurement_sigma",
+                lambda f, _: 0.5 * xp.log(f.sensor * (1.0 / p.range_sigma**2)),
+                "the measurement's sigma over range_sigma",
+                FRAME,
+                KEPT_AS_LOG,
+            ),
+            Block(
+                "measurement_correlation", lambda f, _: f.coupling, "correlation of the measurement's errors"
+            ),
+            Block(
+                "acceleration",
+                lambda f, _: f.acceleration * (1.0 / LARGEST_ACCELERATION),
+                "acceleration predicted for this scan over the largest",
+                FRAME,
+            ),
+            Block(
+                "deviation",
+                lambda f, _: xp.log(f.deviation * (1.0 / NOMINAL_ACCELERATION)),
+                "the sigma of the acceleration in the last scan over the nominal one",
+                FRAME,
+                KEPT_AS_LOG,
+            ),
+            Block(
+                "speed",
+                lambda f, _: xp.log(speed_of(f.mean[2:], LEAST_SPEED) * 0.01),
+                "the predicted speed over 100 m/s",
+                shown=KEPT_AS_LOG,
+            ),
+            Block(
+                "scan",
+                lambda _, measurement: xp.clip(measurement.scan * (1.0 / SCANS_SHOWN), None, 1.0),
+                f"scans since the start over {SCANS_SHOWN}, saturating at 1",
+            ),
+            Block("available", lambda _, measurement: measurement.available, "1 if the scan saw the target"),
+            Block(
+                "interval",
+                lambda _, measurement: xp.log(measurement.interval * (1.0 / p.sampling_interval)),
+                "the time since the scan before over sampling_interval",
+                shown=KEPT_AS_LOG,
+            ),
+        )
+
+    def start(self, initial: Initial) -> Track:
+        """Start where everyone starts."""
+        none = 0.0 * initial.mean[:2]
+        sensor = self.xp.stack([initial.covariance[0, 0], initial.covariance[1, 1]])
+        deviation = NOMINAL_ACCELERATION + none
+        return Track(initial.mean, initial.covariance, none, deviation, none, none, sensor, sensor, none[0])
+
+    def predict(self, state: Track, measurement: Measurement) -> Track:
+        """Predict to the scan by the acceleration that was answered, and compare."""
+        xp, T = self.xp, measurement.interval
+        along, across = state.acceleration[0], state.acceleration[1]
+        rate = 1.0 / speed_of(state.mean[2:], LEAST_SPEED)
+        turning = xp.concat([state.mean, (across * rate)[None]])
+        turned = coordinated_turn.turned(turning, T)
+        faster = T * along * rate
+        position = state.mean[:2] + (1.0 + 0.5 * faster) * (turned[:2] - state.mean[:2])
+        mean = xp.concat([position, (1.0 + faster) * turned[2:4]])
+        F = coordinated_turn.jacobian(turning, T)[:4, :4]
+        carried = product(product(F, state.covariance), transpose(F))
+        frame = frame_of(mean[2:])
+        noise = self.noise(frame, state.deviation, T)
+        R = self.sensor(measurement)
+        sensor = product(product(frame, R), transpose(frame))
+        prior = product(product(frame, carried[:2, :2] + noise[:2, :2]), transpose(frame))
+        innovation = measurement.available * (measurement.position - position)
+        variances = xp.stack([sensor[0, 0], sensor[1, 1]])
+        return state._replace(
+            mean=mean,
+            covariance=carried,
+            innovation=apply(frame, innovation),
+            prior=xp.stack([prior[0, 0], prior[1, 1]]),
+            sensor=variances,
+            coupling=sensor[0, 1] / xp.sqrt(variances[0] * variances[1]),
+        )
+
+    def sensor(self, measurement: Measurement) -> Array:
+        """Covariance of a measurement, ``(2, 2, N)``, m^2."""
+        xp, none = self.xp, 0.0 * measurement.variance[0]
+        return xp.stack(
+            [xp.stack([measurement.variance[0], none]), xp.stack([none, measurement.variance[1]])]
+        )
+
+    def noise(self, frame: Array, deviation: Array, T: Array) -> Array:
+        """Process noise over intervals of accelerations along and across, ``(4, 4, N)``.
+
+        Args:
+            frame: rows along and across, ``(2, 2, N)``.
+            deviation: of each, m/s^2, ``(2, N)``.
+            T: s, ``(N,)``.
+        """
+        xp = self.xp
+        variance = deviation * deviation
+        E = outer(variance[0] * frame[0], frame[0]) + outer(variance[1] * frame[1], frame[1])
+        square = T * T
+        corner, middle, velocity = (0.25 * square * square) * E, (0.5 * square * T) * E, square * E
+        return xp.concat([xp.concat([corner, middle], axis=1), xp.concat([middle, velocity], axis=1)])
+
+    def act(self, state: Track, measurement: Measurement, action: Array) -> Track:
+        """Update by the gain that was answered, and keep the acceleration for the next prediction."""
+        xp, available = self.xp, measurement.available
+        a = xp.clip(action, -1.0, 1.0)
+        frame = frame_of(state.mean[2:])
+        inverse = transpose(frame)
+        deviation = NOMINAL_ACCELERATION * xp.exp(math.log(NOISE_RANGE) * a[:2])
+        P = state.covariance + self.noise(frame, deviation, measurement.interval)
+        agile = deviation * xp.exp(math.log(AGILITY) * a[5:7])
+        M = state.covariance[:, :2] + self.noise(frame, agile, measurement.interval)[:, :2]
+        R = self.sensor(measurement) * xp.exp(math.log(NOISE_RANGE) * a[2])
+        caution = product(inverse, xp.exp(math.log(CAUTION) * a[3:5])[:, None] * frame)
+        S = M[:2] + product(product(caution, R), caution)
+        share = available / (S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1])
+        inverted = share * xp.stack([xp.stack([S[1, 1], -S[0, 1]]), xp.stack([-S[0, 1], S[0, 0]])])
+        K = product(M, inverted)
+        correction = apply(K, apply(inverse, state.innovation))
+        rest = xp.concat([self.positions - K, self.velocities + 0.0 * K], axis=1)
+        joseph = product(product(rest, P), transpose(rest)) + product(product(K, R), transpose(K))
+        return state._replace(
+            mean=state.mean + correction,
+            covariance=0.5 * (joseph + transpose(joseph)),
+            acceleration=LARGEST_ACCELERATION * a[7:9],
+            deviation=deviation,
+            correction=apply(frame, correction[2:]),
+        )
+
+    def mean(self, state: Track) -> Array:
+        """Position and velocity, ``(4, N)``."""
+        return state.mean
+
+    def covariance(self, state: Track) -> Array:
+        """Covariance by the gain and the noises that were answered, ``(4, 4, N)``."""
+        return state.covariance

@@ -1,0 +1,218 @@
+"""The learned estimator kalman-net: its filters against matrices written out, its training, its file."""
+
+import json
+
+import numpy as np
+import pytest
+from filtergym.agents.learned_estimator import EstimatorMaker
+from filtergym.agents.learned_policy import LearnedPolicy, stored_policy, write_arrays
+from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.draws import Draws
+from filtergym.envs.maneuvering_target import kalman_net as radar
+from filtergym.envs.task import Episode
+from filtergym.evaluation.competitors import kind_of
+from filtergym.filters import coordinated_turn, kalman, loosely_coupled
+
+import filtergym
+
+RADAR, FUSION = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
+NAME = "kalman-net"
+HAVING = [id for id, cls in catalogue().items() if NAME in cls.trained_banks]
+
+
+def network(task, answer=0.0):
+    """A network that always answers the same, or with arrays of random weights."""
+    fields, count = len(task.fields), task.action_space.shape[0]
+    rng = np.random.default_rng(5)
+    random = answer == "random"
+    arrays = {
+        "observation_mean": np.zeros(fields, np.float32),
+        "observation_scale": np.ones(fields, np.float32),
+        "gru_input_weight": rng.normal(0.0, 0.3, (12, fields)).astype(np.float32),
+        "gru_input_bias": np.zeros(12, np.float32),
+        "gru_memory_weight": rng.normal(0.0, 0.3, (12, 4)).astype(np.float32),
+        "gru_memory_bias": np.zeros(12, np.float32),
+        "weight_0": (rng.normal(0.0, 0.5, (count, 4)) * random).astype(np.float32),
+        "bias_0": np.full(count, 0.0 if random else np.arctanh(answer), np.float32),
+    }
+    return LearnedPolicy(task, arrays, "tanh")
+
+
+def episodes(id, count, steps, **keywords):
+    """Initial, and the measurements of episodes of the training distribution."""
+    task = make_task(id, NAME, **keywords)
+    rng = np.random.default_rng(2)
+    draws = Draws(rng.random((task.noise.uniforms, count)), np)
+    truth, initial = task.world.begin(draws, rng.normal(size=(task.noise.initial_normals, count)))
+    found = []
+    for _ in range(steps):
+        noise = rng.normal(size=(task.noise.normals, count)), rng.random((task.noise.row_uniforms, count))
+        truth, measurement = task.world.advance(truth, np.concatenate(noise), None)
+        found.append(measurement)
+    return task, initial, found
+
+
+def test_who_has_one():
+    assert HAVING == [FUSION, RADAR]
+
+
+def test_of_a_radar_zero_answers_are_a_kalman_filter():
+    task, initial, measurements = episodes(RADAR, 8, 60, undisturbed=0.0)
+    assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
+    estimator = EstimatorMaker(NAME, network)(task)
+    memory = estimator.start(initial, 8)
+    H = np.eye(2, 4)
+    mean, P = [initial.mean[:, i] for i in range(8)], [initial.covariance[:, :, i] for i in range(8)]
+    for measurement in measurements:
+        said = estimator.update(measurement, memory)
+        memory = said[2]
+        for i in range(8):
+            F, Q = (np.array(part) for part in kalman.white_acceleration(measurement.interval[i], 1.0, 2))
+            mean[i], P[i] = F @ mean[i], F @ P[i] @ F.T + Q
+            if measurement.available[i]:
+                K = P[i] @ H.T @ np.linalg.inv(H @ P[i] @ H.T + np.diag(measurement.variance[:, i]))
+                mean[i] = mean[i] + K @ (measurement.position[:, i] - H @ mean[i])
+                P[i] = P[i] - K @ H @ P[i]
+    # The frame is a rotation to 1e-10: its direction is that of a speed larger by a rounding.
+    np.testing.assert_allclose(said[0], np.stack(mean, axis=1), rtol=1e-9)
+    np.testing.assert_allclose(said[1], np.stack(P, axis=2), rtol=1e-8, atol=1e-6)
+
+
+def test_of_an_ins_zero_answers_are_the_augmented_filter():
+    competitors = {"augmented": "augmented", "net": EstimatorMaker(NAME, network)}
+    dataset = filtergym.evaluate(FUSION, competitors, episodes=16, horizon=300)
+    for name in ("error", "nees"):
+        augmented, net = dataset[name].values
+        np.testing.assert_allclose(net, augmented, rtol=0.0, atol=1e-11)
+
+
+def test_of_a_radar_any_answer_is_what_the_description_says():
+    """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
+    task, initial, measurements = episodes(RADAR, 16, 3)
+    rng, bank = np.random.default_rng(0), task.bank
+    state = bank.start(initial)
+    for measurement in measurements:
+        before, state = state, bank.predict(state, measurement)
+        action = rng.uniform(-1.2, 1.2, (radar.ANSWERS, 16))
+        predicted, state = state, bank.act(state, measurement, action)
+        for i, a in enumerate(np.clip(action, -1.0, 1.0).T):
+            T, speed = measurement.interval[i], np.hypot(*before.mean[2:, i])
+            along, across = before.acceleration[:, i] / np.hypot(speed, radar.LEAST_SPEED)
+            turning = np.append(before.mean[:, i], across)
+            moved = coordinated_turn.turned(turning, T)
+            x = np.append(
+                before.mean[:2, i] + (1.0 + 0.5 * T * along) * (moved[:2] - before.mean[:2, i]),
+                (1.0 + T * along) * moved[2:4],
+            )
+            np.testing.assert_allclose(predicted.mean[:, i], x, rtol=1e-12)
+            F = coordinated_turn.jacobian(turning, T)[:4, :4]
+            c, s = x[2:] / np.hypot(*x[2:])
+            U = np.array([[c, -s], [s, c]])
+            G = np.concatenate([T**2 / 2 * U, T * U])
+            sigma = radar.NOMINAL_ACCELERATION * radar.NOISE_RANGE ** a[:2]
+            P = F @ before.covariance[:, :, i] @ F.T + G @ np.diag(sigma**2) @ G.T
+            R = radar.NOISE_RANGE ** a[2] * np.diag(measurement.variance[:, i])
+            W = U @ np.diag(radar.CAUTION ** a[3:5]) @ U.T
+            agile = radar.AGILITY ** a[5:7] * sigma
+            M = F @ before.covariance[:, :, i] @ F.T + G @ np.diag(agile**2) @ G.T
+            H = np.eye(2, 4)
+            K = measurement.available[i] * M @ H.T @ np.linalg.inv(H @ M @ H.T + W @ R @ W.T)
+            rest = np.eye(4) - K @ H
+            mean = x + K @ (measurement.position[:, i] - x[:2])
+            # The frame's direction is that of a speed 1e-3 m/s larger.
+            np.testing.assert_allclose(state.mean[:, i], mean, rtol=1e-7, atol=1e-5)
+            joseph = rest @ P @ rest.T + K @ R @ K.T
+            np.testing.assert_allclose(state.covariance[:, :, i], joseph, rtol=1e-6, atol=1e-4)
+            np.testing.assert_allclose(state.acceleration[:, i], radar.LARGEST_ACCELERATION * a[7:])
+
+
+def test_covariance_of_the_augmented_filter_under_any_gain_is_josephs():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    P, R, K = root @ root.T, 0.7, rng.normal(size=3)
+    packed = loosely_coupled.AugmentedCovariance(P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
+    found = loosely_coupled.update_augmented_by(packed, R, loosely_coupled.AugmentedGain(*K))
+    rest = np.eye(3) - np.outer(K, [1.0, 0.0, 0.0])
+    joseph = rest @ P @ rest.T + R * np.outer(K, K)
+    np.testing.assert_allclose(found, joseph[np.triu_indices(3)], rtol=1e-12)
+
+
+@pytest.mark.parametrize("id", HAVING)
+@pytest.mark.parametrize("answer", [-0.999, 0.999, "random"])
+def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, answer):
+    """An evaluation refuses what is not finite, symmetric and positive definite."""
+    maker = EstimatorMaker(NAME, lambda task: network(task, answer))
+    cost = filtergym.evaluate(id, {"net": maker}, episodes=16)["cost"]
+    assert float(cost.max()) < 1e6
+
+
+@pytest.mark.parametrize("id", HAVING)
+def test_the_estimator_is_the_policy_in_its_bank(id):
+    """What is trained in the environment is what is evaluated outside of it."""
+    task, initial, measurements = episodes(id, 8, 40)
+    estimator, policy = (
+        EstimatorMaker(NAME, lambda task: network(task, "random"))(task),
+        network(task, "random"),
+    )
+    memory, state, hidden = estimator.start(initial, 8), task.bank.start(initial), None
+    for measurement in measurements:
+        mean, covariance, memory = estimator.update(measurement, memory)
+        episode = Episode(None, measurement, task.bank.predict(state, measurement))
+        action, hidden = policy.predict(task.observe(episode).T, hidden)
+        state = task.act(episode, action.T.astype(float)).bank
+        np.testing.assert_array_equal(mean, task.bank.mean(state))
+        np.testing.assert_array_equal(covariance, task.bank.covariance(state))
+
+
+@pytest.fixture
+def stored(tmp_path):
+    from filtergym.agents.training_run import new_run
+
+    task = make_task(RADAR, NAME)
+    path = tmp_path / "net.safetensors"
+    write_arrays(path, network(task, 0.3).arrays, new_run(RADAR, NAME), "tanh")
+    return path
+
+
+def test_a_file_is_an_estimator(stored, command):
+    pytest.importorskip("stable_baselines3")
+    assert kind_of(stored_policy(RADAR, stored)) == "estimator"
+    code, out, _ = command("evaluate", RADAR, "--policy", stored, "--policy", "imm", "--episodes", 2)
+    assert code == 0
+    assert "(est" in out
+
+
+def test_a_file_is_refused_elsewhere(stored):
+    with pytest.raises(ValueError, match=f"was trained on {RADAR}, not on {FUSION}"):
+        filtergym.evaluate(FUSION, [str(stored)], episodes=1)
+    with pytest.raises(ValueError, match="does not act: of kind estimator"):
+        filtergym.make_policy(RADAR, str(stored))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"interface": "1"}, r"its interface 1, now 2\): train it again"),
+        ({"fields": json.dumps(["innovation_along"])}, "is not a learned policy of filtergym"),
+        ({"control": "gain"}, "was trained on other fields"),
+    ],
+)
+def test_a_file_that_does_not_fit(stored, change, message):
+    from safetensors import safe_open
+    from safetensors.numpy import load_file, save_file
+
+    with safe_open(stored, "numpy") as file:
+        header = file.metadata()
+    save_file(load_file(stored), stored, header | change)
+    with pytest.raises(ValueError, match=message):
+        filtergym.evaluate(RADAR, [str(stored)], episodes=1)
+
+
+def test_training_of_an_environment_without_one(command, tmp_path):
+    pytest.importorskip("stable_baselines3")
+    code, _, error = command("train", "filtergym/UavAutopilot-v0", "--algo", NAME, "--out", tmp_path / "run")
+    assert code == 2
+    assert f"has no filter for '{NAME}' to steer: choose another algorithm, or {FUSION}, {RADAR}" in error
+    code, _, error = command("train", RADAR, "--algo", NAME, "--control", "gain", "--out", tmp_path / "run")
+    assert code == 2
+    assert "unknown control 'gain'" in error
