@@ -349,8 +349,7 @@ def make_task(
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})
-    replayed = () if chosen.recording is None else (chosen.recording,)
-    return cls(parameters, control, xp, device, *replayed)
+    return cls(parameters, control, xp, device, chosen.recording)
 
 
 def register() -> None:
