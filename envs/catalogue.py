@@ -247,10 +247,11 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     for file in files:
         try:
             found.append(_read_recording(file, found[0].environment if found else environment, keywords))
-        except ValueError as error:
+        except Exception as error:  # readers raise whatever a broken file makes them stumble over
+            reason = " ".join(str(error).split()) or type(error).__name__
             if len(files) == 1:
-                raise
-            left_out.append(f"{file.name}: left out: {str(error).partition(f'recording {file}: ')[2]}")
+                raise ValueError(f"recording {file}: {reason}") from error
+            left_out.append(f"{file.name}: left out: {reason}")
     if not found:
         further = f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
         raise ValueError(f"nothing of {str(path)!r} can be replayed: {'; '.join(left_out[:3])}{further}")
@@ -262,24 +263,19 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
 
 def _read_recording(file: Path, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
     """Read one file."""
-    try:
-        if not file.is_file():
-            raise ValueError("there is no such file")
-        if file.stat().st_size > MOST_BYTES:
-            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        if names_environment(file):
-            recording = read_netcdf(file, task_class, environment, keywords)
-        elif environment is None:
-            raise ValueError(
-                "it does not say of which environment it is: give its id, as the argument environment or before "
-                "--recording"
-            )
-        else:
-            recording = read_columns(file, task_class(environment), keywords)
-        recording.scenario(task_class(recording.environment), {})
-    except Exception as error:  # readers raise whatever a broken file makes them stumble over
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"recording {file}: {reason}") from error
+    if not file.is_file():
+        raise ValueError("there is no such file")
+    if file.stat().st_size > MOST_BYTES:
+        raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
+    if names_environment(file):
+        recording = read_netcdf(file, task_class, environment, keywords)
+    elif environment is None:
+        raise ValueError(
+            "it does not say of which environment it is: give its id, as the argument environment or before --recording"
+        )
+    else:
+        recording = read_columns(file, task_class(environment), keywords)
+    recording.scenario(task_class(recording.environment), {})
     return recording
 
 
@@ -353,8 +349,7 @@ def make_task(
         raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
     parameters = cls.Parameters(**{**chosen.parameters, **keywords})
-    replayed = () if chosen.recording is None else (chosen.recording,)
-    return cls(parameters, control, xp, device, *replayed)
+    return cls(parameters, control, xp, device, chosen.recording)
 
 
 def register() -> None:

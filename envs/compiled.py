@@ -272,11 +272,10 @@ def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
     return other
 
 
-def _traced(cls: type[Task], parameters: Any, control: str, *replayed: Any) -> Programs:
+def _traced(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        device = (None,) if replayed else ()
-        programs = Programs(cls(parameters, control, namespace, *device, *replayed), graph)
+        programs = Programs(cls(parameters, control, namespace, None, recording), graph)
     _ = programs.later
     return programs
 
@@ -307,8 +306,7 @@ def compiled(task: Task, threads: int = 1) -> Task:
         raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
     # Parameters that hold arrays are traced each time.
     trace = _remembered if _hashes(task.parameters) else _traced
-    replayed = () if task.recording is None else (task.recording,)
-    return _wrapped(task, trace(type(task), task.parameters, task.control, *replayed), threads)
+    return _wrapped(task, trace(type(task), task.parameters, task.control, task.recording), threads)
 
 
 def warn_of(what: str, error: BaseException) -> None:

@@ -11,9 +11,12 @@ import math
 from collections.abc import Container, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy
+
+if TYPE_CHECKING:
+    import xarray
 
 FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz")
 """Files that can be read."""
@@ -80,15 +83,32 @@ def _csv(file: Path, known: Container[str]) -> dict[str, Any]:
     return table
 
 
-def _netcdf(file: Path, known: Container[str]) -> dict[str, Any]:
+def opened_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
+    """Open a NetCDF file, of the third or the fourth version.
+
+    Args:
+        file: its path.
+        **decoding: as of ``xarray.open_dataset``.
+
+    Raises:
+        ValueError: if it is none, or needs a package that is not installed.
+    """
     import xarray
 
     # From memory: a mapped file stays open where its reading fails.
     content = file.read_bytes()
+    if not content:
+        raise ValueError("it is empty")
     engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
+    if engine == "scipy" and not content.startswith(b"CDF"):
+        raise ValueError("it is no NetCDF")
     if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
         raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
-    with xarray.open_dataset(io.BytesIO(content), engine=engine, decode_timedelta=False) as data:
+    return xarray.open_dataset(io.BytesIO(content), engine=engine, **decoding)
+
+
+def _netcdf(file: Path, known: Container[str]) -> dict[str, Any]:
+    with opened_netcdf(file, decode_timedelta=False) as data:
         table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
         for name in table:
             if name.lower() not in known:

@@ -8,7 +8,6 @@ and what everyone is told of the start of the track, ``initial_mean``, ``initial
 """
 
 import dataclasses
-import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from .flight_tables import MOST_BYTES
+from .flight_tables import MOST_BYTES, opened_netcdf
 from .recording import MOST_NUMBERS, Recording
 from .task import Task
 
@@ -86,23 +85,8 @@ def names_environment(path: Path) -> bool:
     """
     if path.suffix != ".nc":
         return False
-    with _opened(path) as data:
+    with opened_netcdf(path, decode_times=False) as data:
         return "environment" in data.attrs
-
-
-def _opened(path: Path) -> "xarray.Dataset":
-    import xarray
-
-    # From memory: a mapped file stays open where its reading fails.
-    content = path.read_bytes()
-    if not content:
-        raise ValueError("it is empty")
-    engine: Any = "h5netcdf" if content.startswith(b"\x89HDF") else "scipy"
-    if engine == "scipy" and not content.startswith(b"CDF"):
-        raise ValueError("it is no NetCDF")
-    if engine == "h5netcdf" and engine not in xarray.backends.list_engines():
-        raise ValueError("NetCDF-4 needs one more package: pip install 'filtergym[flights]'")
-    return xarray.open_dataset(io.BytesIO(content), engine=engine, decode_times=False)
 
 
 def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
@@ -174,7 +158,7 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
     Raises:
         ValueError: if it cannot be read, or is of another environment.
     """
-    with _opened(path) as data:
+    with opened_netcdf(path, decode_times=False) as data:
         attrs = data.attrs
         cls: type[Task] = cls_of(str(attrs.get("environment", environment)))
         if environment is not None and cls is not cls_of(environment):

@@ -434,13 +434,8 @@ class Task(ABC):
 
     def __reduce__(self) -> Any:
         """Pickle what it is made of; a module, its array namespace, cannot be."""
-        named = (self.parameters, self.control, self.xp.__name__, self.device)
-        return _made_again, (type(self), *named, *self._replayed)
-
-    @property
-    def _replayed(self) -> tuple[Any, ...]:
-        """Last argument of the constructor, where there is a recording."""
-        return () if self.recording is None else (self.recording,)
+        named = (self.parameters, self.control, self.xp.__name__, self.device, self.recording)
+        return _made_again, (type(self), *named)
 
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""
@@ -547,11 +542,11 @@ class Task(ABC):
 
     def under(self, control: str) -> "Task":
         """Return the same problem with another control."""
-        return type(self)(self.parameters, control, self.xp, self.device, *self._replayed)
+        return type(self)(self.parameters, control, self.xp, self.device, self.recording)
 
     def on_numpy(self) -> "Task":
         """Return the same problem on NumPy arrays, not compiled."""
-        return type(self)(self.parameters, self.control, numpy, None, *self._replayed)
+        return type(self)(self.parameters, self.control, numpy, None, self.recording)
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
         """Call ``function(task, *parts)`` on this task's backend.
@@ -649,9 +644,9 @@ class Task(ABC):
 
 
 def _made_again(
-    cls: type[Task], parameters: Any, control: str, namespace: str, device: Any, *replayed: Any
+    cls: type[Task], parameters: Any, control: str, namespace: str, device: Any, recording: Any
 ) -> Task:
-    return cls(parameters, control, importlib.import_module(namespace), device, *replayed)
+    return cls(parameters, control, importlib.import_module(namespace), device, recording)
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:

@@ -51,18 +51,15 @@ def record(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     chosen = find_scenario(cls, opened(cls, scenario), keywords)
     plain = task_on("numpy", cls.id, scenario=chosen, **keywords)
-    if chosen.recording is None:
-        arrays = dict(named_arrays(measured_once(plain)[1]))
-        row = (
-            sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(plain.components) + 1
-        )
-        if row * episodes * (plain.horizon + 1) > MOST_NUMBERS:
-            raise ValueError(
-                f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
-                "that a recording may hold: record fewer"
-            )
-    else:
+    if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
+    arrays = dict(named_arrays(measured_once(plain)[1]))
+    row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(plain.components) + 1
+    if row * episodes * (plain.horizon + 1) > MOST_NUMBERS:
+        raise ValueError(
+            f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
+            "that a recording may hold: record fewer"
+        )
     task = task_on(backend, cls.id, scenario=chosen, **keywords).estimated_outside()
     seeds = episode_seeds(split, seed, episodes)
     chunks = [
