@@ -16,7 +16,7 @@ class SensorAlarm(Alarm):
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         super().__init__(task)
-        self.nis, self.accelerometer = task.reader("nis"), task.reader("accelerometer")
+        self.nis, self.repeat = task.reader("nis"), task.reader("accelerometers_repeat")
         self.available = task.reader("pseudorange_available"), task.reader("rate_available")
         self.others = [sensor.readings.stop - sensor.readings.start for sensor in task.sensors[2:]]
 
@@ -29,5 +29,5 @@ class SensorAlarm(Alarm):
         measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
         degrees = measurements * numpy.stack(here, axis=1)
         mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
-        stuck = (self.accelerometer(observation) == self.accelerometer(before)).all(axis=1)
+        stuck = self.repeat(observation)[:, 0] > 0.0
         return numpy.concatenate([scale_ratio(degrees * mean, degrees, LARGER), certain(stuck)], axis=1)

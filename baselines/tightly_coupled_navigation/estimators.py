@@ -6,13 +6,9 @@ from typing import NamedTuple
 
 from ...envs.observation import Array
 from ...envs.task import Initial
-from ...envs.tightly_coupled_navigation.banks import Filters, HypothesisBank
+from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
-
-EFFICIENT = 1.345
-"""Threshold that keeps 95 % of the efficiency where the noise is Gaussian (Huber, Robust Statistics, 1981)."""
-
 
 class HuberBank(HypothesisBank):
     """The paper's bank with thresholds of the robust update.

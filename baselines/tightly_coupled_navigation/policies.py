@@ -92,6 +92,27 @@ class FixedGain(ConstantPolicy):
         self.action = action
 
 
+class FixedRobust(ConstantPolicy):
+    """The paper's probabilities over a robust update, always; accelerometers are left out while they repeat themselves.
+
+    The robust update makes nothing of an outlier, nor of a manoeuvre that begins; see ``HuberBank``.
+
+    Args:
+        task: the problem.
+        accelerometers: action that makes them noisier throughout.
+        pseudoranges: strength of the robust update of these, 0 to 1.
+        rates: likewise of their rates.
+    """
+
+    control = "robust"
+
+    def __init__(
+        self, task: Task, accelerometers: float = 0.0, pseudoranges: float = 1.0, rates: float = 1.0
+    ) -> None:
+        super().__init__(task)
+        self.action = (0.0, 0.0, accelerometers, 0.0, 1.0, pseudoranges, rates)
+
+
 class NisAdaptive(Policy):
     """Innovation-based adaptation of the noise, under the paper's probabilities.
 
@@ -144,23 +165,21 @@ class NisAdaptive(Policy):
 class StuckCheck(NisAdaptive):
     """Accelerometers that repeat their last reading exactly are switched off; otherwise as told by the NIS.
 
-    Noise never repeats itself, so a reading held over a whole decision is a stuck sensor for certain; until
-    the decision after it sticks the filter trusts it.
+    Noise never repeats itself, so a reading that does is a stuck sensor for certain; until the decision after it sticks
+    the filter trusts it.
     """
 
     def __init__(self, task: TightlyCoupledNavigation, threshold: float = 3.0, rates: float = 0.0) -> None:
         super().__init__(task, threshold, rates, accelerometers=0.0)
-        self.readings = task.reader("accelerometer")
+        self.repeat = task.reader("accelerometers_repeat")
         self.switch = [sensor.name for sensor in task.sensors].index("accelerometers")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Compare with the readings of the last decision."""
+        """Look whether any reading of the last decision has repeated the one before it."""
         action, _ = super().act(observation, None, start)
-        readings = self.readings(observation)
-        if state is not None:
-            stuck = (readings == state).all(axis=1) & ~start
-            action[:, self.switch] = numpy.where(stuck, 1.0, action[:, self.switch])
-        return action, readings
+        stuck = self.repeat(observation)[:, 0] > 0.0
+        action[:, self.switch] = numpy.where(stuck, 1.0, action[:, self.switch])
+        return action, None
 
 
 class StuckCheckFallback(StuckCheck):
@@ -172,9 +191,9 @@ class StuckCheckFallback(StuckCheck):
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Keep what is said of the accelerometers."""
-        action, readings = super().act(observation, state, start)
+        action, _ = super().act(observation, state, start)
         only = numpy.arange(action.shape[1]) == self.switch
-        return action * only, readings
+        return action * only, None
 
 
 # --- what can be tuned
@@ -220,6 +239,12 @@ TUNABLE = {
         {"threshold": 3.0, "rates": 0.0},
         _adaptive(StuckCheck),
     ),
+    "fixed-robust": Tunable(
+        "robust",
+        {"accelerometers": (0.0, 0.5), "pseudoranges": (0.0, 1.0), "rates": (0.0, 1.0)},
+        {"accelerometers": 0.0, "pseudoranges": 1.0, "rates": 1.0},
+        lambda values: ({}, lambda task: FixedRobust(task, **values)),
+    ),
     "huber-stuck-check": Tunable(
         None,
         {"rates": (0.5, 6.0), "manoeuvre": (1.0, 20.0)},
@@ -238,6 +263,7 @@ BASELINES = Baselines(
         "stuck-check": StuckCheck,
         "stuck-check-fallback": StuckCheckFallback,
         "fixed-gain": FixedGain,
+        "fixed-robust": FixedRobust,
         "singer": Singer,
         "constant-velocity": ConstantVelocity,
         "rest": Rest,

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
     from .task import TightlyCoupledNavigation
 
 
+EFFICIENT = 1.345
+"""Threshold that keeps 95 % of the efficiency where the noise is Gaussian (Huber, Robust Statistics, 1981)."""
+LEAST_STRENGTH = 1e-9
+"""Of the robust update: with a threshold of 1e9 deviations it is the plain one."""
+
+
 class Prediction(NamedTuple):
     """What the bank expects at a measurement, steps 1 to 4; M = 3 hypotheses."""
 
@@ -57,6 +63,10 @@ class Filters(NamedTuple):
     """Of the measurement as the filters predict it with the nominal noise, ``(N,)``."""
     average_nis: Array
     """Short average of the same per reading, ``(4, M, N)``."""
+    accelerometers: Array
+    """Their last readings, ``(3, N)``, m/s^2; infinite before the first."""
+    repeated: Array
+    """1 where they repeat the readings before exactly, ``(N,)``."""
     range_innovation: Array
     """Of the combined prediction: S pseudoranges, m, S rates, m/s; ``(2 S, N)``."""
     probabilities: Array
@@ -132,6 +142,11 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
                 "accelerometer", lambda f, y: y.readings[forces.readings] / p.gravity, "specific force",
                 ("forward", "right", "down"), SIGNED_LOG, unit=f"{p.gravity:g} m/s^2",
             ),
+            Block(
+                "accelerometers_repeat", lambda f, y: f.repeated,
+                "1 where the accelerometers repeat their last readings exactly, as noise never does",
+                over_interval="mean",
+            ),
             innovation("pseudorange", ranges),
             innovation("rate", rates),
             available("pseudorange", ranges),
@@ -181,6 +196,8 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             nis=nis,
             log_density=zeros,
             average_nis=nis + 1.0,
+            accelerometers=xp.stack([zeros + math.inf] * 3),
+            repeated=zeros,
             range_innovation=xp.stack([zeros] * task.tracked.stop),
             probabilities=probabilities,
             mean=initial.mean,
@@ -206,9 +223,13 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, task, combined = self.xp, self.task, state.predicted.combined
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
-        update = self._updated(state, measurement, task.sensor_variance)
+        update = self._updated(
+            state, measurement, task.sensor_variance, self.thresholds(state, measurement)
+        )
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
+        accelerometers = measurement.readings[task.sensors[2].readings]
+        repeated = xp.all(accelerometers == state.accelerometers, axis=0)
         return state._replace(
             means=update.mean,
             covariances=update.covariance,
@@ -216,11 +237,17 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             nis=nis,
             log_density=imm.log_mixture_density(state.predicted.log_probabilities, update.log_likelihood),
             average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
+            accelerometers=accelerometers,
+            repeated=xp.astype(repeated, combined.dtype),
             range_innovation=innovation,
         )
 
     def _updated(
-        self, state: Filters, measurement: Measurement, variance: Sequence[Any]
+        self,
+        state: Filters,
+        measurement: Measurement,
+        variance: Sequence[Any],
+        thresholds: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
         predicted = state.predicted
@@ -239,7 +266,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             rows,
             variance,
             measurement.available,
-            self.thresholds(state, measurement),
+            thresholds,
         )
 
     def thresholds(self, state: Filters, measurement: Measurement) -> Sequence[Array] | None:
@@ -318,20 +345,30 @@ class NoiseBank(HypothesisBank):
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update with the noise that the action asks for, and weigh by Bayes' rule."""
-        xp, p, task = self.xp, self.parameters, self.task
+        xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
-        up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
-        factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
-        variance = [
-            nominal * factor[i]
-            for i, sensor in enumerate(task.sensors)
-            for nominal in task.sensor_variance[sensor.readings]
-        ]
-        update = self._updated(state, measurement, variance)
+        update = self._updated(
+            state, measurement, self._variance(exponent, state), self._thresholds(exponent)
+        )
         state = state._replace(
             means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
         )
         return self.weigh_by_bayes(state, exponent)
+
+    def _variance(self, exponent: Array, state: Filters) -> list[Array]:
+        """Of the noise of every reading, ``(N,)`` each."""
+        xp, p, task = self.xp, self.parameters, self.task
+        up, down = 2.0 * math.log(p.noise_scale), 2.0 * math.log(p.noise_reduction)
+        factor = xp.exp(xp.where(exponent > 0.0, up * exponent, down * exponent))
+        return [
+            nominal * factor[i]
+            for i, sensor in enumerate(task.sensors)
+            for nominal in task.sensor_variance[sensor.readings]
+        ]
+
+    def _thresholds(self, exponent: Array) -> Sequence[Array] | None:
+        """Of the robust update of every reading, ``(N,)`` each; None: the plain update."""
+        return None
 
     def covariance(self, state: Filters) -> Array:
         """Of the combination, when it is steered times the short average of the NIS per reading if that is above one.
@@ -343,3 +380,41 @@ class NoiseBank(HypothesisBank):
         average = weighted_sum(state.probabilities, ordered_sum(state.average_nis)) / groups
         steered = self.xp.any(state.last_action != 0.0, axis=0)
         return super().covariance(state) * self.xp.where(steered, self.xp.clip(average, 1.0, None), 1.0)
+
+
+class RobustBank(NoiseBank):
+    """Control ``robust``: noise as under ``gain``, and what to do with a reading that repeats itself or is an outlier.
+
+    What a reading is shows only with the measurement, between two decisions; so the action says beforehand what is to be
+    done then.
+    """
+
+    @property
+    def actions(self) -> Sequence[str]:
+        """The groups of sensors, accelerometers that repeat themselves, outliers of ranges and rates."""
+        ranges, rates = (sensor.name for sensor in self.task.sensors[:2])
+        return [*super().actions, "accelerometers_repeated", f"{ranges}_outliers", f"{rates}_outliers"]
+
+    def _variance(self, exponent: Array, state: Filters) -> list[Array]:
+        """As under ``gain``; accelerometers that repeat their last reading are noisier by an action of their own."""
+        xp, forces = self.xp, self.task.sensors[2].readings
+        groups = len(self.task.sensors)
+        variance = super()._variance(exponent[:groups], state)
+        own = 2.0 * math.log(self.parameters.noise_scale) * xp.clip(exponent[groups], 0.0, None)
+        factor = xp.exp(own * state.repeated)
+        return [*variance[: forces.start], *(v * factor for v in variance[forces]), *variance[forces.stop :]]
+
+    def _thresholds(self, exponent: Array) -> Sequence[Array]:
+        """Huber's for an action of 1, none for 0 or less."""
+        xp, task = self.xp, self.task
+        groups = len(task.sensors)
+        none = math.inf + 0.0 * exponent[0]
+        each = [none] * groups
+        for i in (0, 1):
+            strength = xp.clip(exponent[groups + 1 + i], LEAST_STRENGTH, None)
+            each[i] = EFFICIENT / strength
+        return [
+            threshold
+            for sensor, threshold in zip(task.sensors, each, strict=True)
+            for _ in range(sensor.readings.start, sensor.readings.stop)
+        ]

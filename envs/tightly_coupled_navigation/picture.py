@@ -34,6 +34,8 @@ MOTION_ROW = -1.0
 """Where the true hypothesis is drawn below the faults."""
 LEAST_REACH = 30.0
 """Half width of the course that is shown at least, m."""
+NOISE_CONTROLS = ("gain", "robust")
+"""Controls whose actions are drawn."""
 
 
 class TightlyCoupledNavigationPicture(Picture):
@@ -77,8 +79,8 @@ class TightlyCoupledNavigationPicture(Picture):
             "rate_innovation": float(numpy.abs(innovation[S:]).max()),
         }
         values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
-        if task.control == "gain":
-            values |= {f"gain.{i}": bank.last_action[i, lane] for i in range(len(task.sensors))}
+        if task.control in NOISE_CONTROLS:
+            values |= {f"gain.{i}": bank.last_action[i, lane] for i in range(len(task.bank.actions))}
         return {name: float(value) for name, value in values.items()}
 
     def begin(self, state: Episode) -> None:
@@ -111,8 +113,8 @@ class TightlyCoupledNavigationPicture(Picture):
         names = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(names)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
-        if self.task.control == "gain":
-            gains = {sensor.name: f"gain.{i}" for i, sensor in enumerate(self.task.sensors)}
+        if self.task.control in NOISE_CONTROLS:
+            gains = {name.replace("_", " "): f"gain.{i}" for i, name in enumerate(self.task.bank.actions)}
             steered.append(
                 Strip(
                     "action",
