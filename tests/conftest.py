@@ -4,6 +4,7 @@ A test that asks for ``env_id`` runs once for every environment; one that asks f
 every control of every environment. A new environment is covered without an edit.
 """
 
+import gc
 import importlib
 
 import gymnasium as gym
@@ -20,6 +21,12 @@ hypothesis.settings.load_profile("repeatable")
 
 DECISIONS = 5
 """Length of the short episodes, in decisions."""
+
+
+def pytest_collection_finish(session):
+    """Spare the garbage collector what stays to the end, libraries and tests; it would look through it many times."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_generate_tests(metafunc):
