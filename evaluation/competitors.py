@@ -182,6 +182,7 @@ class RandomActions:
         """Actions of the next decision, one row for each episode."""
         if not self._drawn:
             space = self._space
+            each: list[numpy.ndarray]
             if hasattr(space, "n"):
                 each = [g.integers(space.n, size=DRAWN_AT_ONCE) for g in self._generators]
             else:
