@@ -160,6 +160,38 @@ class ConstantPolicy(Policy):
         return numpy.tile(numpy.asarray(self.action, dtype=float), (len(observation), 1)), None
 
 
+DRAWN_AT_ONCE = 32
+"""Decisions for which random actions are drawn together."""
+
+
+class RandomActions:
+    """Actions of episodes side by side, each drawn by a generator of its own, for several decisions at once.
+
+    The numbers are those of one draw after another.
+
+    Args:
+        generators: one for each episode.
+        space: of one action.
+    """
+
+    def __init__(self, generators: Sequence[numpy.random.Generator], space: Any) -> None:
+        self._generators, self._space = generators, space
+        self._drawn: list[numpy.ndarray] = []
+
+    def next(self) -> numpy.ndarray:
+        """Actions of the next decision, one row for each episode."""
+        if not self._drawn:
+            space = self._space
+            each: list[numpy.ndarray]
+            if hasattr(space, "n"):
+                each = [g.integers(space.n, size=DRAWN_AT_ONCE) for g in self._generators]
+            else:
+                shape = (DRAWN_AT_ONCE, *space.shape)
+                each = [g.uniform(space.low, space.high, shape) for g in self._generators]
+            self._drawn = list(numpy.stack(each, axis=1))[::-1]
+        return self._drawn.pop()
+
+
 class RandomPolicy(Policy):
     """Uniform actions; the floor that any policy should beat."""
 
@@ -169,17 +201,15 @@ class RandomPolicy(Policy):
         super().__init__(task)
         self.control = task.control  # type: ignore[misc]  # it suits every control
 
-    def begin(self, seeds: Sequence[int]) -> list[numpy.random.Generator]:
+    def begin(self, seeds: Sequence[int]) -> RandomActions:
         """Give every episode a generator of its own, of the policy's seed and the episode's."""
-        return [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
+        generators = [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
+        return RandomActions(generators, self.task.action_space)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Draw from the action space, each row from its generator."""
-        generators = self.begin(range(len(observation))) if state is None else state
-        space: Any = self.task.action_space
-        if hasattr(space, "n"):
-            return numpy.array([generator.integers(space.n) for generator in generators]), generators
-        return numpy.stack([generator.uniform(space.low, space.high) for generator in generators]), generators
+        actions = self.begin(range(len(observation))) if state is None else state
+        return actions.next(), actions
 
 
 class Estimator(Protocol):

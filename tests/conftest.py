@@ -4,12 +4,15 @@ A test that asks for ``env_id`` runs once for every environment; one that asks f
 every control of every environment. A new environment is covered without an edit.
 """
 
+import functools
+import gc
 import importlib
 
 import gymnasium as gym
 import hypothesis
 import numpy as np
 import pytest
+from filtergym.envs import compiled
 from filtergym.envs.catalogue import catalogue, make_task
 
 from filtergym.__main__ import main
@@ -18,8 +21,17 @@ from filtergym.__main__ import main
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("repeatable")
 
+# Test after test goes through every control of every environment: more than a process usually remembers.
+compiled._remembered = functools.lru_cache(32)(compiled._traced)
+
 DECISIONS = 5
 """Length of the short episodes, in decisions."""
+
+
+def pytest_collection_finish(session):
+    """Spare the garbage collector what stays to the end, libraries and tests; it would look through it many times."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_generate_tests(metafunc):

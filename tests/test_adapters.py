@@ -135,7 +135,8 @@ def test_kalman_filters_are_ours(scenario):
 
 @pytest.mark.parametrize("scenario", ["random", "missed-detections"])
 def test_kalman_filter_of_stone_soup_is_ours(scenario):
-    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman, scenario=scenario)
+    scans = {"scenario": scenario, "scan_jitter": (0.0, 0.0)}
+    compare(example("stone_soup_kalman").Kalman, OurContinuousKalman, **scans)
 
 
 def test_kalman_filter_of_stone_soup_is_ours_at_irregular_times():

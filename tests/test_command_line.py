@@ -4,6 +4,7 @@ import importlib.metadata
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +14,19 @@ from filtergym.commands.terminal import progress_bar
 ENV = "filtergym/ManeuveringTarget-v0"
 
 
-def run(*arguments, cwd):
+@pytest.fixture
+def run(command, monkeypatch, tmp_path):
+    """Run the command line in an empty folder, as if a terminal had."""
+
+    def ran(*arguments):
+        monkeypatch.chdir(tmp_path)
+        code, shown, errors = command(*arguments)
+        return SimpleNamespace(returncode=code, stdout=shown, stderr=errors)
+
+    return ran
+
+
+def in_a_process_of_its_own(*arguments, cwd):
     return subprocess.run(
         [sys.executable, "-m", "filtergym", *arguments], capture_output=True, text=True, cwd=cwd, check=False
     )
@@ -43,7 +56,7 @@ def test_progress_bar_says_nothing_where_nobody_looks(capsys):
 
 
 def test_list_names_everything(tmp_path):
-    result = run("list", cwd=tmp_path)
+    result = in_a_process_of_its_own("list", cwd=tmp_path)
     assert result.returncode == 0
     for word in (ENV, "evidence", "descent", "adaptive-rearm", "imm-tuned", "bptt"):
         assert word in result.stdout
@@ -52,31 +65,30 @@ def test_list_names_everything(tmp_path):
         assert word in result.stdout
 
 
-def test_list_of_one_environment(tmp_path):
-    result = run("list", "UavAutopilot", cwd=tmp_path)
+def test_list_of_one_environment(run):
+    result = run("list", "UavAutopilot")
     assert result.stdout.startswith("filtergym/UavAutopilot-v0\n")
     assert ENV not in result.stdout
 
 
-def test_animate_draws_every_policy(tmp_path):
+def test_animate_draws_every_policy(tmp_path, run):
     pytest.importorskip("PIL")
     result = run(
         "animate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--policy", "ppo", "--every", "50",
-        "--out", "new", cwd=tmp_path,
+        "--out", "new",
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     made = sorted(path.name for path in (tmp_path / "new").iterdir())
     assert made == ["ManeuveringTarget-v0-imm.gif", "ManeuveringTarget-v0-ppo.gif"]
-    result = run("animate", ENV, "--policy", "known-turn", cwd=tmp_path)
+    result = run("animate", ENV, "--policy", "known-turn")
     assert result.returncode == 2
     assert "it does not act" in result.stderr
 
 
-def test_evaluate_writes_tidy_records_and_figures(tmp_path):
+def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     result = run(
         "evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--policy", "adaptive", "--episodes", "20",
         "--seed", "1", "--out", "out", "--json", "new/records.json", "--set", "transition=[[0.8,0.2],[0.1,0.9]]",
-        cwd=tmp_path,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     records = json.loads((tmp_path / "new" / "records.json").read_text())
@@ -92,20 +104,16 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path):
     }  # fmt: skip
 
 
-def test_a_flight_from_a_file(tmp_path):
+def test_a_flight_from_a_file(tmp_path, run):
     rows = "\n".join(f"{t},{20000 + 100 * t},{5000 + t}" for t in range(0, 200, 4))
     (tmp_path / "flight.csv").write_text(f"time,x,y\n{rows}\n")
-    result = run(
-        "evaluate", ENV, "--scenario", "flight.csv", "--policy", "imm", "--episodes", "5", cwd=tmp_path
-    )
+    result = run("evaluate", ENV, "--scenario", "flight.csv", "--policy", "imm", "--episodes", "5")
     assert result.returncode == 0, result.stderr
     assert "flight" in result.stdout
 
 
-def test_a_table_says_what_its_references_know(tmp_path):
-    result = run(
-        "evaluate", ENV, "--policy", "imm", "--policy", "known-turn", "--episodes", "4", cwd=tmp_path
-    )
+def test_a_table_says_what_its_references_know(run):
+    result = run("evaluate", ENV, "--policy", "imm", "--policy", "known-turn", "--episodes", "4")
     assert "known-turn knows the scans of every manoeuvre and the size of its acceleration." in result.stdout
 
 
@@ -132,14 +140,21 @@ def test_a_table_says_what_its_references_know(tmp_path):
         (("comparison", "missing.json"), "cannot read the records of a benchmark"),
     ],
 )
-def test_a_mistake_gets_one_clear_sentence(tmp_path, arguments, expected):
-    result = run(*arguments, cwd=tmp_path)
+def test_a_mistake_gets_one_clear_sentence(tmp_path, run, arguments, expected):
+    result = run(*arguments)
     assert result.returncode == 2
     assert result.stderr.startswith("Error: ")
     assert expected in result.stderr
     assert result.stderr.strip().count("\n") == 0
     left = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert not left
+
+
+def test_a_mistake_ends_the_process(tmp_path):
+    result = in_a_process_of_its_own("evaluate", ENV, "--scenario", "papr", cwd=tmp_path)
+    assert result.returncode == 2
+    assert result.stderr.startswith("Error: ")
+    assert result.stderr.strip().count("\n") == 0
 
 
 def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
@@ -201,7 +216,7 @@ def mean_cost(records, name):
     return next(r.value for r in records if (r.policy, r.metric, r.window) == (name, "cost", "all"))
 
 
-def test_comparison_shows_what_the_records_say(tmp_path):
+def test_comparison_shows_what_the_records_say(tmp_path, run):
     from filtergym import evaluate, tidy_records
     from filtergym.reports import comparison
     from filtergym.reports.records import write_records
@@ -230,6 +245,6 @@ def test_comparison_shows_what_the_records_say(tmp_path):
     page.write_text(
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
     )
-    assert run("comparison", "benchmark.json", "--into", "page.md", cwd=tmp_path).returncode == 0
+    assert run("comparison", "benchmark.json", "--into", "page.md").returncode == 0
     assert "`ppo` (learned)" in page.read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000

@@ -9,7 +9,7 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.names import own_names
 from filtergym.envs.catalogue import make_task
-from filtergym.evaluation.competitors import RandomPolicy
+from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
 
 from filtergym import evaluate
 from filtergym.names import competitor
@@ -53,6 +53,20 @@ def test_random_actions_are_every_episodes_own(monkeypatch):
     observation = np.zeros((17, len(policy.task.fields)))
     actions, _ = policy.predict(observation, policy.begin(everyone["episode_seed"].values.tolist()))
     assert len(np.unique(actions)) == 17
+
+
+@pytest.mark.parametrize("control", ["weights", "mode"])
+def test_random_actions_are_one_draw_after_another(control):
+    policy = RandomPolicy(make_task(ID, control))
+    space, memory = policy.task.action_space, policy.begin([3, 5])
+    generators = [np.random.default_rng([policy.seed, seed]) for seed in (3, 5)]
+    for _ in range(2 * DRAWN_AT_ONCE + 1):
+        found, memory = policy.predict(np.zeros((2, len(policy.task.fields))), memory)
+        if control == "mode":
+            expected = [generator.integers(space.n) for generator in generators]
+        else:
+            expected = [generator.uniform(space.low, space.high) for generator in generators]
+        np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "recurrent-ppo"])

@@ -144,15 +144,17 @@ def test_ins_aligned_by_the_log_follows_the_circle(tmp_path, pyins, monkeypatch)
     monkeypatch.setattr(drive, "ALIGNMENT", 20.0)
     path = Circle(52.0)
     path.write(tmp_path, rate_bias=(0.004, -0.003, 0.002), force_bias=(0.05, -0.03, 0.04))
-    fixes = drive.read_fixes(tmp_path / drive.FIXES)
-    recorded = drive.recordings(drive.read_inertial(tmp_path / drive.INERTIAL), fixes, seed=3)
+    fixes, inertial = drive.read_fixes(tmp_path / drive.FIXES), drive.read_inertial(tmp_path / drive.INERTIAL)
+    aligned = drive.aligned(inertial, fixes)  # once: it takes seconds
+    monkeypatch.setattr(drive, "aligned", lambda *_: aligned)
+    recorded = drive.recordings(inertial, fixes, seed=3)
     assert recorded["recording"].values.tolist() == ["29 s"]
     assert drive.errors(recorded).shape == (2, 81)
     assert abs(drive.errors(recorded)).max() < 1.0
     truth = np.stack([path.east, path.north], axis=1)[10 * 118 : 10 * 199 : 10]
     origin = recorded["truth"].values[0, 0] - truth[0]
     np.testing.assert_allclose(recorded["truth"].values[0] - origin, truth, atol=0.05)
-    again = drive.recordings(drive.read_inertial(tmp_path / drive.INERTIAL), fixes, seed=3)
+    again = drive.recordings(inertial, fixes, seed=3)
     np.testing.assert_array_equal(again["fix"], recorded["fix"])
 
 

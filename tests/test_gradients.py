@@ -114,15 +114,16 @@ def random_policy(env, dtype):
 @pytest.mark.parametrize(
     ("name", "control", "keywords", "tolerance"),
     [
-        ("ManeuveringTarget", "gain", {}, 1e-9),
-        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, 1e-9),
-        ("ManeuveringTarget", "kalman-net", {}, 1e-9),
-        ("LooselyCoupledNavigation", "kalman-net", {}, 1e-9),
-        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 1e-9),
-        ("UavAutopilot", "gain", {}, 1e-9),
-        ("RadarEsmTracking", "evidence", {}, 1e-9),
-        # Its positions are small differences of 2.5e7 m, and every decision is ten measurements.
-        ("TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, 1e-9),
+        ("ManeuveringTarget", "gain", {}, 1e-11),
+        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, 1e-11),
+        ("ManeuveringTarget", "kalman-net", {}, 1e-11),
+        ("LooselyCoupledNavigation", "kalman-net", {}, 1e-11),
+        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 1e-11),
+        ("UavAutopilot", "gain", {}, 1e-11),
+        ("RadarEsmTracking", "evidence", {}, 1e-11),
+        # Its positions are small differences of 2.5e7 m, every decision is ten measurements, and the estimate steers
+        # the tracking loops.
+        ("TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, 1e-10),
     ],
 )
 @pytest.mark.parametrize("largest", [None, 0.01])
@@ -145,15 +146,15 @@ def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, toler
     for env in envs:
         env.reset(seed=0)
     costs = [
-        descend_episodes(envs[0], policy, 3, descend, largest),
+        descend_episodes(envs[0], policy, 3, descend, largest=largest),
         Unrolled(envs[1], policy, 3, largest=largest).descend_episodes(descend),
     ]
-    assert costs[1] == pytest.approx(costs[0], rel=1e-11)
+    assert costs[1] == pytest.approx(costs[0], rel=tolerance)
     windows = len(found) // 2
     assert windows == -(-envs[0].last_decision // 3)
     for theirs, ours in zip(found[:windows], found[windows:], strict=True):
         assert theirs.abs().max() > 0.0
-        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=tolerance * float(theirs.abs().max()))
+        torch.testing.assert_close(ours, theirs, rtol=0.0, atol=1e-9 * float(theirs.abs().max()))
 
 
 def test_actions_that_are_no_numbers_are_refused():

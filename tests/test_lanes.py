@@ -18,7 +18,8 @@ def naive_rows(seed, noise, rows):
 
 def test_long_episodes_take_one_row_after_another(monkeypatch):
     horizon = LONGEST_BLOCK + 10
-    task = make_task(ID, "gain", horizon=horizon)
+    scans = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
+    task = make_task(ID, "gain", horizon=horizon, **scans)
     assert task.noise.row_uniforms == 0
     taken = []
     measure = task.measure

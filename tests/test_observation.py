@@ -102,13 +102,14 @@ def test_unknown_names_and_names_said_twice():
 
 
 def test_innovation_in_metres_is_the_measured_minus_the_predicted_position():
-    task = make_task("filtergym/ManeuveringTarget-v0", "gain", "random")
+    task = make_task("filtergym/ManeuveringTarget-v0", "gain", "missed-detections")
     rng = np.random.default_rng(5)
     episode = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
     for _ in range(20):
-        episode = task.measure(episode, rng.normal(size=(2, 8)))
+        episode = task.measure(episode, np.concatenate([rng.normal(size=(2, 8)), rng.random((2, 8))]))
         read = task.reader("innovation_in_metres")(task.observe(episode).T)
-        expected = (episode.measurement.position - episode.bank.predicted).T
+        seen = episode.measurement.available > 0.0
+        expected = np.where(seen, episode.measurement.position - episode.bank.predicted, 0.0).T
         # The share 1 - R/S that it is read from cancels digits when S is little larger than R.
         np.testing.assert_allclose(read, expected, rtol=1e-12, atol=1e-9)
         episode = task.act(episode, np.zeros((1, 8)))

@@ -17,6 +17,7 @@ LOOSE = "filtergym/LooselyCoupledNavigation-v0"
 ESM = "filtergym/RadarEsmTracking-v0"
 TIGHT = "filtergym/TightlyCoupledNavigation-v0"
 UAV = "filtergym/UavAutopilot-v0"
+ON_TIME = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
 NEEDED = {"numpy": "numpy", "compiled": "llvmlite", "torch": "torch"}
 
 
@@ -63,7 +64,8 @@ def test_context_does_not_change_the_episode(env_id, short):
 def test_maneuvers_are_flown_when_the_context_says():
     found = 0
     for seed in range(4):
-        contexts, states = rollout(ID, 99, seed, control="gain")
+        # On time: of a scan that comes early the velocity is that between two scans.
+        contexts, states = rollout(ID, 99, seed, control="gain", **ON_TIME)
         now = [c["maneuvering"] for c in contexts]
         first, last = contexts[0]["maneuver_first"], contexts[0]["maneuver_last"]
         scans = np.arange(1, 101)[:, None]

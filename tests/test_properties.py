@@ -216,7 +216,9 @@ def test_extreme_weights_leave_the_environments_finite(env_id, control, data, se
         assert np.isfinite(observation).all()
         observation, reward, _, truncated, info = env.step(data.draw(bank_actions(env.action_space)))
         assert np.isfinite(reward)
-        assert all(np.isfinite(values).all() for values in info.values())
+        # Nothing is said of an innovation where a scan misses the target.
+        missed = {"nis", "log_likelihood"} if info.get("nis_degrees") == 0.0 else set()
+        assert {name for name, values in info.items() if not np.isfinite(values).all()} == missed
         if "mode_probability" in info:
             # Weights come in float32, whose rounding remains.
             assert info["mode_probability"].sum() == pytest.approx(1.0, abs=3e-7)

@@ -113,7 +113,7 @@ def test_one_sensor_alone():
 
 
 def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_its_repair():
-    dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 4000)
+    dataset = evaluate(ID, ["quasi-optimal", "joint-type"], "fixed-type", 1500)
     records = {(r.policy, r.metric, r.component): r for r in tidy_records(dataset)}
     assert records["quasi-optimal", "sure_and_wrong", ""].low > 0.1
     assert records["joint-type", "sure_and_wrong", ""].high < 0.02
@@ -127,7 +127,7 @@ def test_fixed_type_is_the_defect_of_the_printed_rule_and_the_joint_posterior_it
 @pytest.mark.parametrize("target", range(3))
 def test_non_adaptive_and_ideal_have_their_exact_errors(target):
     dataset = evaluate(
-        ID, ["non-adaptive", "ideal", "known-class-bound"], "paper", 3000, true_class=f"S{target}"
+        ID, ["non-adaptive", "ideal", "known-class-bound"], "paper", 1500, true_class=f"S{target}"
     )
     p = make_task(ID, scenario="paper").parameters
     for name, channel in (("non-adaptive", 2), ("ideal", target)):

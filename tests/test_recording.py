@@ -37,7 +37,7 @@ OPEN = {
     TARGET: {"horizon": 24},
     LOOSE: {"horizon": 40, "axes": 2},
     ESM: {"horizon": 24},
-    TIGHT: {"horizon": 12, "decision_interval": 3},
+    TIGHT: {"scenario": "rates-lost", "horizon": 12, "decision_interval": 3},
 }
 DOCS = Path(__file__).parent.parent / "docs"
 BACKENDS = ["numpy", *(["compiled"] if AVAILABLE else [])]
@@ -226,6 +226,12 @@ def test_without_truth_evaluation_tells_of_innovations(recordings):
         dataset["nis"].sel(policy="imm").values,
         dataset["log_likelihood"].sel(policy="imm").values,
     )
+    said = recordings[TARGET].measurements
+    seen = said["available"][:, : nis.shape[-1]] > 0.0
+    assert not seen.all()
+    for values in (nis, likelihood):
+        np.testing.assert_array_equal(np.isfinite(values), seen)
+    nis, likelihood = nis[seen], likelihood[seen]
     assert found["imm", "anis"].value == pytest.approx(nis.mean() / 2.0)
     low, high = chi_square_band(np.array([2.0]))
     assert found["imm", "nis_inside"].value == pytest.approx(((nis >= low) & (nis <= high)).mean())
@@ -264,6 +270,10 @@ def test_log_likelihood_is_the_density_of_what_was_predicted(control):
     else:
         each = np.exp(log_density(bank.innovation, bank.innovation_covariance)[0])
         expected = np.log((np.exp(bank.log_predicted) * each).sum(axis=0))
+    missed = lanes.state.measurement.available == 0.0
+    assert missed.any()
+    assert not missed.all()
+    expected[missed] = np.nan
     np.testing.assert_allclose(said["log_likelihood"], expected, rtol=1e-9)
 
 
@@ -457,10 +467,11 @@ def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, t
         assert np.isfinite(evaluate(env, _names(env)[:1], scenario=read)["cost"].values).all()
         if env == TARGET:
             said = recordings[env].measurements
-            velocity = (said["position"][:, 1] - said["position"][:, 0]) / 6.0
+            assert (said["interval"][:, 1] != 6.0).any()  # scans that come early
+            velocity = (said["position"][:, 1] - said["position"][:, 0]) / said["interval"][:, [1]]
             np.testing.assert_allclose(read.initial["mean"], np.hstack([said["position"][:, 1], velocity]))
             np.testing.assert_array_equal(read.truth, recordings[env].truth[:, 2:])
-            np.testing.assert_allclose(read.seconds[:, 0], 6.0)
+            np.testing.assert_allclose(read.seconds[:, 0], said["interval"][:, 2])
         if env == LOOSE:
             np.testing.assert_allclose(read.initial["mean"], recordings[env].initial["mean"], atol=1e-12)
     data = recordings[TIGHT].dataset.drop_vars(["initial_mean", "initial_covariance"])
@@ -697,7 +708,10 @@ NOT_FINITE = "position is not finite at measurement 3; what is missing has the v
         (lambda d: d.assign(height=d["scan"]), "has height, which is nothing that"),
         (lambda d: d.isel(position_axis0=[0]), "position has the shape (1,)"),
         (lambda d: d.drop_vars("seconds"), "lacks the variable seconds"),
-        (lambda d: d.assign(seconds=-d["seconds"]), "seconds must increase, and measurement 2 has -12 s"),
+        (
+            lambda d: d.assign(seconds=-6.0 * d["scan"]),
+            "seconds must increase, and measurement 2 has -12 s",
+        ),
         (lambda d: d.assign(seconds=0.0 * d["seconds"] + np.nan), "it holds no measurements"),
         (lambda d: d.assign(position=d["position"].where(d["scan"] != 3.0)), NOT_FINITE),
         (lambda d: d.assign(length=d["length"] + 5), "length must be from 1 to its 25 measurements, got 29"),

@@ -132,37 +132,42 @@ def test_evaluation_with_baselines(turns):
     assert ("adaptive", "policy", "score", "", "all") in own
 
 
-def test_the_command_line_lists_and_evaluates_it(package):
-    listed = run("list", ID, cwd=package)
-    assert listed.returncode == 0, listed.stderr
-    assert listed.stdout.startswith(ID)
-    assert "nobody's" in listed.stdout
+def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
+    monkeypatch.chdir(package)
+    code, listed, errors = command("list", ID)
+    assert code == 0, errors
+    assert listed.startswith(ID)
+    assert "nobody's" in listed
+    code, _, errors = command("benchmark", "--environment", ID, "--out", "results")
+    assert code == 0, errors
+    code, _, errors = command("room", ID)
+    assert code == 2
+    assert "has no paper's algorithm to compare with" in errors
+
+
+def test_the_command_line_finds_it_in_the_folder_where_it_is_started(package):
     out = run(
         "evaluate", ID, "--policy", "turns_package:Middle", "--policy", "random", "--episodes", "4", "--out", "out",
         "--set", "horizon=20", cwd=package,
     )  # fmt: skip
     assert out.returncode == 0, out.stderr
     assert len(json.loads((package / "out" / "records.json").read_text())) > 0
-    result = run("benchmark", "--environment", ID, "--out", "results", cwd=package)
-    assert result.returncode == 0, result.stderr
-    refused = run("room", ID, cwd=package)
-    assert refused.returncode == 2
-    assert "has no paper's algorithm to compare with" in refused.stderr
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
-def test_training_with_default_hyperparameters(package, algorithm):
+def test_training_with_default_hyperparameters(package, algorithm, command, monkeypatch):
     pytest.importorskip("stable_baselines3")
+    monkeypatch.chdir(package)
     steps = ("--steps", "2000", "--envs", "4", "--validate-every", "100000")
-    result = run("train", ID, "--algo", algorithm, *steps, "--out", "run", cwd=package)
-    assert result.returncode == 0, result.stderr
+    code, _, errors = command("train", ID, "--algo", algorithm, *steps, "--out", "run")
+    assert code == 0, errors
     record = json.loads((package / "run" / "run.json").read_text())
     assert record["environment"] == ID
     assert list(record["validation"][-1]) == ["steps", "cost"]
-    result = run("export", "run", "--trust", cwd=package)  # its record names the module to import
-    assert result.returncode == 0, result.stderr
-    result = run("evaluate", ID, "--policy", "run/agent.safetensors", "--episodes", "3", cwd=package)
-    assert result.returncode == 0, result.stderr
+    code, _, errors = command("export", "run", "--trust")  # its record names the module to import
+    assert code == 0, errors
+    code, _, errors = command("evaluate", ID, "--policy", "run/agent.safetensors", "--episodes", "3")
+    assert code == 0, errors
 
 
 def test_registering_again_changes_nothing(turns):

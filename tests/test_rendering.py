@@ -51,10 +51,10 @@ def test_matplotlib_is_imported_only_for_a_render_mode():
 @pytest.mark.parametrize("control", CONTROLS)
 @pytest.mark.usefixtures("any_picture")
 def test_frames_are_images_that_change(control):
-    env = gymnasium.make(ID, control=control, render_mode="rgb_array", horizon=4)
+    env = gymnasium.make(ID, control=control, render_mode="rgb_array", horizon=2)
     env.reset(seed=3)
     frames = [env.render()]
-    for _ in range(4):
+    for _ in range(2):
         env.step(env.action_space.sample())
         frames.append(env.render())
     assert {f.shape for f in frames} == {(608, 960, 3)}
@@ -75,8 +75,9 @@ def test_reused_figure_shows_what_a_new_one_shows(control):
     reused.render()
     reused.action_space.seed(1)
     reused.reset(seed=1)
-    for _ in range(60):
-        reused.render()
+    for step in range(60):
+        if step % 6 == 0:
+            reused.render()
         reused.step(reused.action_space.sample())
     numpy.testing.assert_array_equal(reused.render(), drawn_once.render())
 
@@ -101,10 +102,11 @@ def test_axes_stay_where_they_are_and_hold_the_track():
         return [tuple(axes.get_position().bounds) for axes in panels], picture.track.viewLim.extents.tolist()
 
     first = places()
-    for _ in range(100):
+    for scan in range(1, 101):
         env.step(env.action_space.sample())
-        env.render()
-        assert places() == first
+        if scan % 5 == 0:
+            env.render()
+            assert places() == first
     left, bottom, right, top = picture.track.viewLim.extents
     x, y = env.picture.history["true_x"], env.picture.history["true_y"]
     assert left < min(x)

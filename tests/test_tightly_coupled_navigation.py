@@ -4,6 +4,7 @@ import math
 
 import numpy
 import pytest
+from filtergym.envs.backend import task_on
 from filtergym.envs.task import Episode
 from filtergym.envs.tightly_coupled_navigation.parameters import (
     SINGER,
@@ -509,7 +510,7 @@ def within(values, reference, error, allowance=0.0):
 
 def test_reference_table_of_the_adaptive_filter():
     """Increment course, 24 runs: RMS errors of three legs, NIS, probabilities and adaptation times."""
-    N, task = 24, make("paper")
+    N, task = 24, task_on("auto", TightlyCoupledNavigation.id, "evidence", "paper")
     windows = SCENARIOS["paper"].windows
     squares = {leg: numpy.zeros((3, N)) for leg in ("leg1", "leg2", "leg3")}
     nis = dict.fromkeys(squares, 0.0)

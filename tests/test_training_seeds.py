@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -131,14 +129,8 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     assert scored[5:] == ["agent", "agent", "imm"]
 
 
-def seeds_command(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-m", "filtergym", "seeds", *map(str, arguments)],
-        capture_output=True, text=True, cwd=cwd, check=False,
-    )  # fmt: skip
-
-
-def test_command_fills_the_page(folders, tmp_path):
+def test_command_fills_the_page(folders, tmp_path, command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     page = tmp_path / "page.md"
     page.write_text(
         "a\n<!-- seeds ManeuveringTarget-v0: begin -->\nold\n<!-- seeds ManeuveringTarget-v0: end -->\nb"
@@ -156,9 +148,9 @@ def test_command_fills_the_page(folders, tmp_path):
         "--curves",
         "curves.png",
     )
-    result = seeds_command(*arguments, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "bptt seed 1" in result.stdout
+    code, shown, errors = command("seeds", *arguments)
+    assert code == 0, errors
+    assert "bptt seed 1" in shown
     text = page.read_text()
     assert (text[:2], text[-2:], "old" in text) == ("a\n", "\nb", False)
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
@@ -169,11 +161,13 @@ def test_command_fills_the_page(folders, tmp_path):
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 
 
-def test_what_cannot_be_compared(folders, tmp_path):
+def test_what_cannot_be_compared(folders, tmp_path, command, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
     def fails(expected, *arguments):
-        result = seeds_command(*arguments, cwd=tmp_path)
-        assert (result.returncode, result.stderr.count("\n")) == (2, 1), result.stderr
-        assert expected in result.stderr
+        code, _, errors = command("seeds", *arguments)
+        assert (code, errors.count("\n")) == (2, 1), errors
+        assert expected in errors
 
     fails("is a bound, which has no cost", folders[0], "--policy", "known-input-bound")
     (tmp_path / "page.md").write_text("no markers")

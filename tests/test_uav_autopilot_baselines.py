@@ -29,11 +29,12 @@ from filtergym import evaluate, tidy_records
 ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])
 NAMES = list(baselines_of(ID).benchmark)
+EPISODES = 100
 
 
 @cache
 def run(
-    plant: str, scenario: str, episodes: int = 150, names: tuple[str, ...] = tuple(NAMES)
+    plant: str, scenario: str, episodes: int = EPISODES, names: tuple[str, ...] = tuple(NAMES)
 ) -> xarray.Dataset:
     return evaluate(ID, names, scenario, episodes, plant=plant)
 
@@ -122,7 +123,7 @@ def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
 
 
 def innovations_of_matched(
-    plant: str, scenario: str, episodes: int = 150
+    plant: str, scenario: str, episodes: int = EPISODES
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """NIS per available reading, and the innovation over its sigma of the output's sensor, ``(episodes, time)``."""
     task: Any = make_task(ID, "gain", scenario, plant=plant)
@@ -214,7 +215,7 @@ def test_a_bound_does_not_depend_on_the_control_and_nobody_beats_it(plant: str) 
         squares = (dataset["error"].sel(policy=name) ** 2).mean("time")
         low = squares.mean("episode") - 4.0 * squares.std("episode") / math.sqrt(squares.sizes["episode"])
         assert (low < bound * 1.0001).all() or (squares.mean("episode") > bound).all()
-        assert (squares.mean("episode") + 4.0 * squares.std("episode") / 12.0 > bound).all()
+        assert (squares.mean("episode") + 4.0 * squares.std("episode") / math.sqrt(EPISODES) > bound).all()
 
 
 @BOTH
@@ -394,7 +395,7 @@ def test_whiteness_by_hand() -> None:
 def test_node_four_is_white_for_the_paper_filter_alone() -> None:
     r = [x for x in tidy_records(run("U", "paper-noise")) if x.metric == "innovation_autocorrelation"]
     found = {(x.policy, x.window): x.value for x in r}
-    limit = 4.0 / math.sqrt(150 * 350)
+    limit = 4.0 / math.sqrt(EPISODES * 350)
     assert abs(found["kalman", "steady"] or 1.0) < limit
     assert abs(found["over-smoothed", "steady"] or 0.0) > 10 * limit
 

@@ -11,6 +11,8 @@ from gymnasium.vector import AutoresetMode
 import filtergym  # noqa: F401  (registers the environments)
 
 MODES = list(AutoresetMode)
+COMPANY = [(3, mode) for mode in MODES] + list(zip((1, 8, 13), MODES, strict=True))
+"""Few in every mode; and alone, as many as fill up a batch, and more."""
 STEPS = 13
 """Two episodes of five decisions and a part, with the steps that NEXT_STEP spends on resets."""
 
@@ -53,8 +55,7 @@ def assert_same_info(one, other):
             np.testing.assert_array_equal(one[name][lane], values[lane], err_msg=name)
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("count", [1, 3, 8, 13])
+@pytest.mark.parametrize(("count", "mode"), COMPANY)
 def test_equals_a_vector_of_single_environments(env_id, control, mode, count, short, random_actions):
     keywords = {"control": control, "detailed_info": True, **short}
     ours, theirs = native(env_id, count, mode, **keywords), synchronous(env_id, count, mode, **keywords)
