@@ -117,7 +117,10 @@ def test_shipped_then_config_then_settings_then_options(text, tmp_path):
     assert run.hyperparameters["gamma"] == 0.9
     assert run.hyperparameters["gae_lambda"] == shipped["gae_lambda"]
     assert run.hyperparameters["policy_kwargs"] == {**shipped["policy_kwargs"], "net_arch": [16]}
-    assert run.hyperparameters["env_kwargs"] == {**shipped["env_kwargs"], "range_sigma": 70.0}
+    assert {**run.hyperparameters["env_kwargs"], "control": run.control} == {
+        **shipped["env_kwargs"],
+        "range_sigma": 70.0,
+    }
     overrides, keywords = (
         {"gamma": 0.8, "n_envs": 6},
         {"range_sigma": 60.0, "reward": "cost", "control": "mode"},
