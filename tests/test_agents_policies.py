@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
-from filtergym.envs.catalogue import make_task
+from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.evaluation.competitors import ConstantPolicy
 
 from filtergym import evaluate
@@ -19,6 +19,7 @@ ID = "filtergym/ManeuveringTarget-v0"
 SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
 
 OPTIMAL = {
+    "ManeuveringTarget-v0": ("paper", "known-turn", {}, slice(None)),
     "UavAutopilot-v0": ("paper-noise", "kalman", {}, slice(200, 550)),
     "RadarEsmTracking-v0": ("paper", "quasi-optimal", {"association_error": 1e-12}, slice(None)),
     "LooselyCoupledNavigation-v0": ("paper", "matched", {}, slice(None)),
@@ -65,13 +66,12 @@ def test_shipped_agent_does_not_beat_what_is_optimal(file):
 
 
 def test_there_are_shipped_agents():
-    """Policies of the other environments are withdrawn: they were trained for an earlier interface."""
-    assert [f"{file.parent.name}/{file.stem}" for file in SHIPPED] == [
-        "LooselyCoupledNavigation-v0/kalman-net",
-        "ManeuveringTarget-v0/bptt",
-        "ManeuveringTarget-v0/kalman-net",
-        "ManeuveringTarget-v0/ppo",
+    """Policies of every environment, estimators where there is a filter for them."""
+    policies = [f"{id.partition('/')[2]}/{name}" for id in catalogue() for name in ("bptt", "ppo")]
+    estimators = [
+        f"{id.partition('/')[2]}/{name}" for id, cls in catalogue().items() for name in cls.trained_banks
     ]
+    assert [f"{file.parent.name}/{file.stem}" for file in SHIPPED] == sorted(policies + estimators)
 
 
 @pytest.fixture
