@@ -241,10 +241,21 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
         100.0 * r.value for r in records if (r.policy, r.metric) == ("ppo", "relative_cost_difference")
     ]
     assert float(cost.rows[0][3].partition("<br>")[0]) == pytest.approx(difference, rel=5e-3)
+    *best, reference = comparison.summary(found).rows
+    assert {tuple(row[:3]) for row in best} == {
+        ("ManeuveringTarget", "`ppo`", "learned policy"),
+        ("ManeuveringTarget", f"`{classical[0]}`", "classical"),
+    }
+    assert reference[:3] == ["ManeuveringTarget", "`known-turn`", "reference"]
+    [worst] = comparison.harm(found).rows
+    assert worst[:3] == ["ManeuveringTarget", "`ppo`", "`random`"]
+    assert worst[3] == cost.rows[0][3].replace("<br>", " ")
     page = tmp_path / "page.md"
     page.write_text(
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
+        "<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
     )
     assert run("comparison", "benchmark.json", "--into", "page.md").returncode == 0
     assert "`ppo` (learned)" in page.read_text()
+    assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000

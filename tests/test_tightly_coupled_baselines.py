@@ -255,7 +255,12 @@ def test_robust_is_between_the_paper_and_hubers_update():
     others["gain"].control = "gain"
     error = evaluate(ID, others, episodes=8, horizon=100, backend="numpy")["error"]
     # Exact but where a threshold of 1e9 deviations, or the covariance of what is steered, comes in.
-    for one, other in (("paper", "zero"), ("zero", "negative"), ("robust", "ranges and rates"), ("noisy", "gain")):
+    for one, other in (
+        ("paper", "zero"),
+        ("zero", "negative"),
+        ("robust", "ranges and rates"),
+        ("noisy", "gain"),
+    ):
         numpy.testing.assert_allclose(error.sel(policy=one), error.sel(policy=other), rtol=0.0, atol=1e-9)
     assert abs(error.sel(policy="robust") - error.sel(policy="paper")).max() > 1e-3
 

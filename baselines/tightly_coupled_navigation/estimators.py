@@ -10,6 +10,7 @@ from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, Hypothe
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
 
+
 class HuberBank(HypothesisBank):
     """The paper's bank with thresholds of the robust update.
 

@@ -223,9 +223,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, task, combined = self.xp, self.task, state.predicted.combined
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
-        update = self._updated(
-            state, measurement, task.sensor_variance, self.thresholds(state, measurement)
-        )
+        update = self._updated(state, measurement, task.sensor_variance, self.thresholds(state, measurement))
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
         accelerometers = measurement.readings[task.sensors[2].readings]

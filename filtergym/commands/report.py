@@ -12,7 +12,7 @@ from ..evaluation.figures import save
 from ..evaluation.files import whole_files, writable_file, writable_folder
 from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
-from ..reports.pages import check_markers, insert_between_markers
+from ..reports.pages import check_markers, insert_between_markers, markers_of
 from ..reports.records import write_records
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table, results_table
@@ -32,6 +32,7 @@ def comparison_page(
     """
     found = comparison.read_benchmark(records)
     markers = {id: f"comparison {short_name(id)}" for id in found}
+    overview = "comparison of all"
     if into is not None:
         check_markers(into, markers.values())
     compared = {id: comparison.compare_environment(own) for id, own in found.items()}
@@ -45,10 +46,16 @@ def comparison_page(
                 texts[markers[id]] = comparison.comparison_markdown(
                     compared[id], own, f"images/{picture}", command
                 )
+        on_page = set(markers_of(into))
+        # Tables over all environments only from records of all that the page shows.
+        if overview in on_page and on_page <= {overview, *texts}:
+            texts[overview] = comparison.overview_markdown(found)
         insert_between_markers(into, texts)
     for each in compared.values():
         for grid in each.grids:
             console.print(grid_table(grid))
+    for grid in (comparison.summary(found), comparison.harm(found)):
+        console.print(grid_table(grid))
 
 
 def room(

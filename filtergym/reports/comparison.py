@@ -1,23 +1,25 @@
 """The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.reproduction import Grid, markdown_table
-from ..envs.catalogue import task_class
+from ..envs.catalogue import short_name, task_class
 from ..evaluation.competitors import RANKED
 from ..evaluation.figures import draw_differences
 from ..evaluation.metrics import Record
 from .ranking import ranking, ranking_sentence
 from .records import read_records
-from .tables import INCONSISTENT, against_paper, consistency, with_interval
+from .tables import INCONSISTENT, against_paper, consistency, score_text, with_interval
 
 STRONGEST = 4
 """Classical competitors that the page shows."""
 DIFFERENCE = "relative_cost_difference"
+HARM = 0.02
+"""Relative difference to the paper's algorithm beyond which, with its whole interval, an agent does harm."""
 
 
 class Comparison(NamedTuple):
@@ -59,6 +61,75 @@ def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
     present = {record.policy for record in records}
     wanted = dict.fromkeys((*classical[:STRONGEST], *shipped_agents(id), *tuned, known.score_bound))
     return [name for name in wanted if name in present]
+
+
+def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
+    """Records of one scenario over all times, as the tables look for them."""
+    return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
+
+
+def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
+    """Best of every origin on the training distribution of each environment, and the reference.
+
+    Args:
+        found: records by environment.
+    """
+    rows = []
+    for id, every in found.items():
+        known, learned = baselines_of(id), shipped_agents(id)
+        records = [record for record in every if record.scenario == task_class(id).default_scenario]
+        values, kinds = _by_name(records), {record.policy: record.kind for record in records}
+        places = [place.name for place in ranking(records)] if records else []
+        best: dict[str, str] = {}
+        for name in places:
+            origin = f"learned {kinds[name]}" if name in learned else "classical"
+            best.setdefault(origin, name)
+        if known.score_bound in kinds:
+            best["reference"] = known.score_bound
+        for origin, name in best.items():
+            rows.append(
+                [
+                    short_name(id).removesuffix("-v0"),
+                    f"`{name}`",
+                    origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
+                    with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
+                    *against_paper(values, name),
+                    consistency(values.get((name, "anees", "state", "all"))),
+                    score_text(values.get((name, "score", "", "all"))),
+                ]
+            )
+    header = ["environment", "name", "origin", "cost against the paper's, %", "median, %", "wins, %", "ANEES"]
+    return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
+
+
+def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
+    """The scenario in which each learned agent stands worst against the paper's algorithm.
+
+    Args:
+        found: records by environment.
+    """
+    rows = []
+    for id, records in found.items():
+        for name in shipped_agents(id):
+            own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
+            if not own:
+                continue
+            worst = max(own, key=lambda record: record.value or 0.0)
+            beside = _by_name([record for record in records if record.scenario == worst.scenario])
+            rows.append(
+                [
+                    short_name(id).removesuffix("-v0"),
+                    f"`{name}`",
+                    f"`{worst.scenario}`",
+                    with_interval(worst, 100.0, negligible=0.005),
+                    *against_paper(beside, name),
+                    consistency(beside.get((name, "anees", "state", "all"))),
+                    f"{sum((record.low or 0.0) > HARM for record in own)} of {len(own)}",
+                ]
+            )
+    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "median, %"]
+    last = f"scenarios more than {100.0 * HARM:g} % above the paper"
+    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
 
 
 def compare_environment(records: Sequence[Record]) -> Comparison:
@@ -167,6 +238,14 @@ def _two_lines(record: Record | None, scale: float) -> str:
     negligible = 0.005 if scale == 100.0 else 0.0
     shown = with_interval(record, scale, negligible=negligible)
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
+
+
+def overview_markdown(found: Mapping[str, Sequence[Record]]) -> str:
+    """Both tables over all environments."""
+    lines: list[str] = []
+    for grid in (summary(found), harm(found)):
+        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
+    return "\n".join(lines[:-1])
 
 
 def comparison_markdown(comparison: Comparison, records: Sequence[Record], picture: str, command: str) -> str:

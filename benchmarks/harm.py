@@ -1,0 +1,66 @@
+"""What shipped agents may cost: the worst scenario of each, and the tracks that it loses and the paper's algorithm keeps.
+
+Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 2000 --policy bptt --policy gated:bptt
+
+A track counts as lost where an episode costs ten times what it costs the paper's algorithm, and more than all but one
+in a hundred of the paper's episodes in that scenario.
+"""
+
+import argparse
+
+import numpy
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.catalogue import paper_of
+from filtergym.envs.catalogue import short_name, task_class
+from filtergym.evaluation.bootstrap import Bootstrap
+
+import filtergym
+
+LOST = 10.0
+"""Cost over the paper's from which on a track is lost."""
+
+
+def costs(id: str, names: list[str], scenario: str, episodes: int, split: str) -> numpy.ndarray:
+    """Mean cost of every episode, ``(policies, episodes)``."""
+    data = filtergym.evaluate(id, names, scenario, episodes, split=split)
+    return data["cost"].mean("time").values
+
+
+def rows(id: str, agents: list[str], episodes: int, split: str) -> list[str]:
+    """A row for each agent."""
+    worst: dict[str, tuple[list[float], str]] = {}
+    lost, flown = dict.fromkeys(agents, 0), 0
+    scenarios = task_class(id).scenarios
+    for scenario in scenarios:
+        paper, *others = costs(id, [paper_of(id), *agents], scenario, episodes, split)
+        bootstrap = Bootstrap(episodes)
+        beyond = numpy.quantile(paper, 0.99)
+        for name, cost in zip(agents, others, strict=True):
+            ratio = [
+                float(x) for x in bootstrap.interval(bootstrap.means(cost) / bootstrap.means(paper) - 1.0)
+            ]
+            if name not in worst or ratio[0] > worst[name][0][0]:
+                worst[name] = ratio, scenario
+            lost[name] += int(((cost > LOST * paper) & (cost > beyond)).sum())
+        flown += episodes
+    return [
+        f"| {short_name(id).removesuffix('-v0')} | `{name}` | `{worst[name][1]}` | "
+        + "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in worst[name][0]))
+        + f" | {lost[name]} of {flown} |"
+        for name in agents
+    ]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("environment", nargs="+")
+    parser.add_argument("--policy", action="append", help="default: all shipped agents")
+    parser.add_argument("--episodes", type=int, default=2000)
+    parser.add_argument("--split", default="test")
+    asked = parser.parse_args()
+    print(
+        "| environment | agent | worst scenario | cost against the paper's there, % | tracks lost |\n|---|---|---|---|---|"
+    )
+    for id in asked.environment:
+        for line in rows(id, asked.policy or list(shipped_agents(id)), asked.episodes, asked.split):
+            print(line, flush=True)
