@@ -1,4 +1,4 @@
-"""What shipped agents may cost: the worst scenario of each, and the tracks that it loses and the paper's algorithm keeps.
+"""What shipped agents may cost: the worst scenario of each, and the tracks that it loses and the paper keeps.
 
 Example: python benchmarks/harm.py filtergym/UavAutopilot-v0 --episodes 2000 --policy bptt --policy gated:bptt
 
@@ -59,7 +59,9 @@ if __name__ == "__main__":
     parser.add_argument("--split", default="test")
     asked = parser.parse_args()
     print(
-        "| environment | agent | worst scenario | cost against the paper's there, % | tracks lost |\n|---|---|---|---|---|"
+        "| environment | agent | worst scenario | cost against the paper's there, % | tracks lost |\n"
+        + "|---" * 5
+        + "|"
     )
     for id in asked.environment:
         for line in rows(id, asked.policy or list(shipped_agents(id)), asked.episodes, asked.split):

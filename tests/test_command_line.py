@@ -253,7 +253,7 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
     page = tmp_path / "page.md"
     page.write_text(
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
-        "<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
+        "\n<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
     )
     assert run("comparison", "benchmark.json", "--into", "page.md").returncode == 0
     assert "`ppo` (learned)" in page.read_text()

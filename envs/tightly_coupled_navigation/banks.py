@@ -383,8 +383,8 @@ class NoiseBank(HypothesisBank):
 class RobustBank(NoiseBank):
     """Control ``robust``: noise as under ``gain``, and what to do with a reading that repeats itself or is an outlier.
 
-    What a reading is shows only with the measurement, between two decisions; so the action says beforehand what is to be
-    done then.
+    What a reading is shows only with the measurement, between two decisions; so the action says beforehand what is to
+    be done then.
     """
 
     @property
