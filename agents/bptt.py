@@ -15,7 +15,7 @@ import functools
 import io
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import gymnasium
@@ -44,22 +44,47 @@ from .training_run import (
 from .unrolled import Unrolled
 
 
+NEAREST = 0.9
+"""How far towards the edge of the box the first actions may be, where its middle is 0: nearer there is no gradient."""
+
+
 class RecurrentPolicy(torch.nn.Module):
-    """Observation, normalised -> GRU -> tanh -> box of the actions."""
+    """Observation, normalised -> GRU -> tanh -> box of the actions.
+
+    Args:
+        observations: fields of the observation.
+        space: of the actions.
+        hidden_size: of the memory.
+        first_action: about what is answered before anything is learned; default: the middle of the box.
+
+    Raises:
+        ValueError: if that is no action.
+    """
 
     low: torch.Tensor
     high: torch.Tensor
     mean: torch.Tensor
     scale: torch.Tensor
 
-    def __init__(self, observations: int, space: gymnasium.spaces.Box, hidden_size: int) -> None:
+    def __init__(
+        self,
+        observations: int,
+        space: gymnasium.spaces.Box,
+        hidden_size: int,
+        first_action: Sequence[float] | None = None,
+    ) -> None:
         super().__init__()
+        middle, half = 0.5 * (space.high + space.low), 0.5 * (space.high - space.low)
+        first = middle if first_action is None else numpy.asarray(first_action, dtype=float)
+        if first.shape != space.shape or not space.contains(first.astype(space.dtype)):
+            raise ValueError(f"first_action must be an action of {space}, got {first_action!r}")
+        inside = numpy.clip((first - middle) / half, -NEAREST, NEAREST)
         self.gru = torch.nn.GRUCell(observations, hidden_size)
         self.head = torch.nn.Linear(hidden_size, space.shape[0])
         with torch.no_grad():
-            # Begin near the middle of the box, with a gradient.
+            # Begin away from the edge of the box, with a gradient.
             self.head.weight.mul_(0.1)
-            self.head.bias.zero_()
+            self.head.bias.copy_(torch.as_tensor(numpy.arctanh(inside)))
         self.register_buffer("low", torch.as_tensor(space.low))
         self.register_buffer("high", torch.as_tensor(space.high))
         self.register_buffer("mean", torch.zeros(observations))
@@ -243,7 +268,9 @@ def train_bptt(
     env = _environment(run)
     run.backend = env.backend
     env.reset(seed=episode_seeds("train", run.seed, run.envs))
-    policy = RecurrentPolicy(len(env.task.fields), space, values["hidden_size"])
+    policy = RecurrentPolicy(
+        len(env.task.fields), space, values["hidden_size"], values.get("first_action")
+    )
     learning_rate = schedule("learning_rate", values["learning_rate"])
     optimiser = torch.optim.Adam(policy.parameters(), lr=learning_rate(1.0))
     steps_done = 0

@@ -163,7 +163,7 @@ def check_hyperparameters(algorithm: str, values: Mapping[str, Any], shipped: Ma
     """
     known = {"n_envs", "n_timesteps", *shipped}
     if algorithm in THROUGH_THE_FILTER:
-        known |= {"max_action_grad"}
+        known |= {"first_action", "max_action_grad"}
     else:
         from .sb3_training import ALGORITHMS
 

@@ -585,3 +585,17 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     assert cells["cost vs paper, %"][0] == with_interval(difference, 100.0, negligible=0.005)
     median = records["mine", "median_cost_ratio"].value
     assert cells["median, %"][0] == f"{100.0 * (median - 1.0):+.1f}"
+
+
+def test_a_run_begins_at_the_first_action():
+    space = gymnasium.spaces.Box(np.array([-1.0, 0.0], np.float32), np.array([1.0, 4.0], np.float32))
+    for asked, answered in ((None, [0.0, 2.0]), ([0.5, 1.0], [0.5, 1.0]), ([1.0, 0.0], [0.9, 0.2])):
+        torch.manual_seed(0)
+        policy = RecurrentPolicy(3, space, 8, asked)
+        with torch.no_grad():
+            policy.head.weight.zero_()
+            action, _ = policy(torch.randn(5, 3), torch.zeros(5, 8))
+        np.testing.assert_allclose(action, np.tile(answered, (5, 1)), atol=1e-6)
+    for wrong in ([0.0], [0.0, 5.0]):
+        with pytest.raises(ValueError, match="first_action must be an action of Box"):
+            RecurrentPolicy(3, space, 8, wrong)
