@@ -173,9 +173,10 @@ def new_run(
         check_hyperparameters(algorithm, values, shipped)
     of_environment = merged(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
-    control = control or named["control"]
-    if residual_to and control is None:
+    if residual_to and control is None and "control" not in own_keywords:
+        # Before the file that is shipped, which knows nothing of that policy.
         control = getattr(own_competitor(cls.id, residual_to), "control", None)
+    control = control or named["control"]
     controls = controls_of(cls, algorithm)
     if control is not None and control not in controls:
         raise nearest("control", control, controls)
