@@ -43,7 +43,6 @@ from .training_run import (
 )
 from .unrolled import Unrolled
 
-
 NEAREST = 0.9
 """How far towards the edge of the box the first actions may be, where its middle is 0: nearer there is no gradient."""
 
@@ -268,9 +267,7 @@ def train_bptt(
     env = _environment(run)
     run.backend = env.backend
     env.reset(seed=episode_seeds("train", run.seed, run.envs))
-    policy = RecurrentPolicy(
-        len(env.task.fields), space, values["hidden_size"], values.get("first_action")
-    )
+    policy = RecurrentPolicy(len(env.task.fields), space, values["hidden_size"], values.get("first_action"))
     learning_rate = schedule("learning_rate", values["learning_rate"])
     optimiser = torch.optim.Adam(policy.parameters(), lr=learning_rate(1.0))
     steps_done = 0

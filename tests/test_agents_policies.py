@@ -66,7 +66,7 @@ def test_shipped_agent_does_not_beat_what_is_optimal(file):
 
 
 def test_there_are_shipped_agents():
-    """Policies of every environment (but PPO's where it was not trained), estimators where there is a filter for them."""
+    """Policies of every environment, estimators where there is a filter for them; PPO only where it was trained."""
     policies = [f"{id.partition('/')[2]}/{name}" for id in catalogue() for name in ("bptt", "ppo")]
     policies.remove("TightlyCoupledNavigation-v0/ppo")
     estimators = [

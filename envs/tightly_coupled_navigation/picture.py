@@ -80,7 +80,7 @@ class TightlyCoupledNavigationPicture(Picture):
         }
         values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
         if task.control in NOISE_CONTROLS:
-            values |= {f"gain.{i}": bank.last_action[i, lane] for i in range(len(task.bank.actions))}
+            values |= {f"gain.{i}": action[lane] for i, action in enumerate(bank.last_action)}
         return {name: float(value) for name, value in values.items()}
 
     def begin(self, state: Episode) -> None:
@@ -114,7 +114,8 @@ class TightlyCoupledNavigationPicture(Picture):
         weights = {name: f"weight.{i}" for i, name in enumerate(names)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
         if self.task.control in NOISE_CONTROLS:
-            gains = {name.replace("_", " "): f"gain.{i}" for i, name in enumerate(self.task.bank.actions)}
+            steering: Any = self.task.bank
+            gains = {name.replace("_", " "): f"gain.{i}" for i, name in enumerate(steering.actions)}
             steered.append(
                 Strip(
                     "action",
