@@ -110,21 +110,18 @@ class TightlyCoupledNavigationPicture(Picture):
 
     def strips(self) -> Sequence[Strip]:
         """What is steered, innovations, errors."""
-        names = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
-        weights = {name: f"weight.{i}" for i, name in enumerate(names)}
+        hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
+        weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
         if self.task.control in NOISE_CONTROLS:
             steering: Any = self.task.bank
-            gains = {name.replace("_", " "): f"gain.{i}" for i, name in enumerate(steering.actions)}
-            steered.append(
-                Strip(
-                    "action",
-                    gains,
-                    (-1.05, 1.05),
-                    guides=(0.0,),
-                    steps=True,
-                )
-            )
+            names = [name.removeprefix("accelerometers_").replace("_", " ") for name in steering.actions]
+            gains = {name: f"gain.{i}" for i, name in enumerate(names)}
+            groups = len(self.task.sensors)
+            for title, part in (("action", names[:groups]), ("readings", names[groups:])):
+                if part:
+                    own = {name: gains[name] for name in part}
+                    steered.append(Strip(title, own, (-1.05, 1.05), guides=(0.0,), steps=True))
         return [
             *steered,
             Strip(
