@@ -95,6 +95,16 @@ def test_the_numbers_follow_from_the_episodes(folders):
     assert (difference.unit, difference.episodes) == ("m", 30)
 
 
+def test_a_learned_estimator_is_scored_beside_policies(folders):
+    shipped = PRETRAINED / "ManeuveringTarget-v0" / "kalman-net"
+    shutil.copyfile(shipped.with_suffix(".safetensors"), folders[0] / "best" / "agent.safetensors")
+    shutil.copyfile(shipped.with_suffix(".json"), folders[0] / "run.json")
+    runs = load_runs(folders)
+    means = episode_means(runs, ["kalman-net"], "random", 10, 0, "validation")
+    [member] = [member for member in runs if member.run.algorithm == "kalman-net"]
+    assert (means.cost[member.name] == means.cost["kalman-net"]).all()
+
+
 def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     scored, whole = [], training_seeds.evaluate
 

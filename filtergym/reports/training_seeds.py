@@ -205,9 +205,11 @@ def episode_means(
         ValueError: for unknown names, and for bounds, which have no cost.
     """
     id = runs[0].run.environment
-    policies: dict[str, tuple[Any, str | None]] = {
-        member.name: (competitor(id, str(member.agent), trust=trust), member.run.control) for member in runs
-    }
+    policies: dict[str, tuple[Any, str | None]] = {}
+    for member in runs:
+        maker = competitor(id, str(member.agent), trust=trust)
+        # A learned estimator has a filter of its own, and steers nothing.
+        policies[member.name] = maker, member.run.control if kind_of(maker) == "policy" else None
     for name in dict.fromkeys([paper_of(id), *opponents]):
         policies[name] = competitor(id, name, trust=trust), None
         if kind_of(policies[name][0]) == "bound":
@@ -223,7 +225,7 @@ def episode_means(
         kept = None if waiting is None else _kept_file(waiting, key, agents.get(name))
         found = None if kept is None else _read_means(kept)
         if found is None:
-            known_as = name if control is None else "agent"
+            known_as = "agent" if name in agents else name
             dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
             data = dataset.isel(policy=0)
             first, last = dataset.attrs["windows"]["all"]
