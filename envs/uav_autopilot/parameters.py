@@ -144,9 +144,8 @@ class UavAutopilotParameters(TaskParameters):
 
     gain_decades: float = parameter(0.5, above=0.0, at_most=8.0)
     """Decades by which an action of one scales the process noise. Ours: the filter's poles stay inside the
-    circle for every positive scale, so the value is what is useful: about what ``random`` draws, and no more,
-    because an agent that explores over decades learns to shun them. The limit is half the digits of a
-    number."""
+    circle for every positive scale, so the value is what is useful, and no more, because an agent that explores
+    over decades learns to shun them. The limit is half the digits of a number."""
     process_decades: float = parameter(1.5, above=0.0, at_most=8.0)
     """Decades by which an action of one scales the process noise under control ``noise``. Ours: what levels from 0.2 to
     5 are worth, and a little more."""
