@@ -363,8 +363,8 @@ class Task(ABC):
     cost_description: ClassVar[str]
     """What the cost is and its unit, in words."""
     reward_unit: float = 1.0
-    """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost tracks
-    rule that mean, something between them and the median."""
+    """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
+    tracks rule that mean, something between them and the median."""
     reward: ClassVar[str] = "cost"
     """Kind of reward that agents get unless another one is asked for, see :mod:`.reward`."""
     paper_policy: PaperPolicy
