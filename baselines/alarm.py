@@ -88,6 +88,14 @@ class Alarm:
         self.task = task
         self.decisions = max(task.horizon // task.decision_interval, 1)
 
+    def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
+        """Measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's start, one.
+
+        Args:
+            before: the last observation; NaN where an episode begins.
+        """
+        return numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Log-likelihood ratios of something wrong to nothing wrong, a column for each kind, ``(N, kinds)``.
 

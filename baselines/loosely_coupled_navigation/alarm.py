@@ -27,8 +27,8 @@ class FusionAlarm(Alarm):
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh the innovations of each axis."""
         innovation, available = self.innovation(observation)[:, -self.axes :], self.available(observation)
-        # Shown is the mean over a decision's measurements of the compressed value; before the first there is one.
-        measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+        # Shown is the mean over a decision's measurements of the compressed value.
+        measurements = self.measurements(before)
         count = numpy.maximum(available * measurements, 1.0)
         mean = signed_logarithm(innovation, numpy) * measurements / numpy.sqrt(count * COMPRESSED)
         normalised = numpy.where(measurements > 1, mean, innovation)

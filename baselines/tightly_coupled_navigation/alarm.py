@@ -25,8 +25,8 @@ class SensorAlarm(Alarm):
         count = len(observation)
         here = [read(observation).sum(axis=1) for read in self.available]
         here += [numpy.full(count, float(readings)) for readings in self.others]
-        # Shown is the mean over the readings and measurements of a decision; before the first there is one measurement.
-        measurements = numpy.where(numpy.isnan(before[:, :1]), 1, self.task.decision_interval)
+        # Shown is the mean over the readings and measurements of a decision.
+        measurements = self.measurements(before)
         degrees = measurements * numpy.stack(here, axis=1)
         mean = self.nis(observation).reshape(count, -1, len(HYPOTHESES)).min(axis=2)
         stuck = self.repeat(observation)[:, 0] > 0.0

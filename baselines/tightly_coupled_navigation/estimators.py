@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from ...envs.observation import Array
 from ...envs.task import Initial
@@ -76,14 +75,6 @@ class Huber:
         return filters.mean, filters.covariance, filters
 
 
-class Checked(NamedTuple):
-    """Memory of the check."""
-
-    filters: Filters
-    accelerometers: Array
-    """Last readings, ``(3, N)``, m/s^2; NaN before the first."""
-
-
 class HuberStuckCheck:
     """Huber's update of ranges and rates, and accelerometers that repeat their last reading are left out at once.
 
@@ -105,18 +96,15 @@ class HuberStuckCheck:
         self.task = task
         self.huber = Huber(task, {"pseudoranges": EFFICIENT, "rates": rates}, manoeuvre)
 
-    def start(self, initial: Initial, N: int) -> Checked:
+    def start(self, initial: Initial, N: int) -> Filters:
         """Start every filter where everyone starts."""
-        return Checked(self.huber.start(initial, N), math.nan * initial.mean[:3])
+        return self.huber.start(initial, N)
 
-    def update(self, measurement: Measurement, memory: Checked) -> tuple[Array, Array, Checked]:
+    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters]:
         """One cycle of the bank without what repeats itself."""
         xp, forces = self.task.xp, self.task.sensors[2].readings
-        available, readings = measurement.available, measurement.readings[forces]
-        fresh = xp.any(readings != memory.accelerometers, axis=0)
+        available = measurement.available
+        fresh = xp.any(measurement.readings[forces] != memory.accelerometers, axis=0)
         kept = available[forces] * xp.astype(fresh, available.dtype)
         available = xp.concat([available[: forces.start], kept, available[forces.stop :]])
-        mean, covariance, filters = self.huber.update(
-            measurement._replace(available=available), memory.filters
-        )
-        return mean, covariance, Checked(filters, readings)
+        return self.huber.update(measurement._replace(available=available), memory)

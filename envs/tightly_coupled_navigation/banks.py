@@ -404,15 +404,12 @@ class RobustBank(NoiseBank):
 
     def _thresholds(self, exponent: Array) -> Sequence[Array]:
         """Huber's for an action of 1, none for 0 or less."""
-        xp, task = self.xp, self.task
-        groups = len(task.sensors)
+        sensors = self.task.sensors
+        strength = self.xp.clip(exponent[len(sensors) + 1 :], LEAST_STRENGTH, None)
         none = math.inf + 0.0 * exponent[0]
-        each = [none] * groups
-        for i in (0, 1):
-            strength = xp.clip(exponent[groups + 1 + i], LEAST_STRENGTH, None)
-            each[i] = EFFICIENT / strength
+        each = [EFFICIENT / strength[0], EFFICIENT / strength[1], *[none] * (len(sensors) - 2)]
         return [
             threshold
-            for sensor, threshold in zip(task.sensors, each, strict=True)
+            for sensor, threshold in zip(sensors, each, strict=True)
             for _ in range(sensor.readings.start, sensor.readings.stop)
         ]

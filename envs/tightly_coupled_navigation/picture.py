@@ -116,11 +116,10 @@ class TightlyCoupledNavigationPicture(Picture):
         if self.task.control in NOISE_CONTROLS:
             steering: Any = self.task.bank
             names = [name.removeprefix("accelerometers_").replace("_", " ") for name in steering.actions]
-            gains = {name: f"gain.{i}" for i, name in enumerate(names)}
             groups = len(self.task.sensors)
-            for title, part in (("action", names[:groups]), ("readings", names[groups:])):
+            for title, part in (("action", range(groups)), ("readings", range(groups, len(names)))):
                 if part:
-                    own = {name: gains[name] for name in part}
+                    own = {names[i]: f"gain.{i}" for i in part}
                     steered.append(Strip(title, own, (-1.05, 1.05), guides=(0.0,), steps=True))
         return [
             *steered,

@@ -58,9 +58,10 @@ class TightlyCoupledNavigation(Task):
     A flat `Box`; see `observation_fields` for each component, unit and scale. For every hypothesis the
     normalised innovation squared by sensor group (now, and as a short average; given the groups before it in
     the order of the action `gain`), the log-likelihood relative to the largest, the predicted
-    log-probability; the accelerometers, and whether they repeat themselves; the innovations of pseudoranges and rates at
-    the combined prediction; availability of every satellite; the time; the last action. Innovations and likelihoods, which a wrong
-    hypothesis makes as large as it likes, are shown as ``y / (1 + |y| / 8)`` of ``y = sign(x) log(1 + |x|)``, so below 8.
+    log-probability; the accelerometers, and whether they repeat themselves; the innovations of pseudoranges
+    and rates at the combined prediction; availability of every satellite; the time; the last action.
+    Innovations and likelihoods, which a wrong hypothesis makes as large as it likes, are shown as
+    ``y / (1 + |y| / 8)`` of ``y = sign(x) log(1 + |x|)``, so below 8.
 
     ## Rewards
 

@@ -68,6 +68,16 @@ def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
     return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
 
 
+def _cells(name: str, records: Sequence[Record]) -> list[str]:
+    """Cost against the paper's algorithm, median, wins, and ANEES of a competitor in one scenario."""
+    values = _by_name(records)
+    return [
+        with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
+        *against_paper(values, name),
+        consistency(values.get((name, "anees", "state", "all"))),
+    ]
+
+
 def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
     """Best of every origin on the training distribution of each environment, and the reference.
 
@@ -92,9 +102,7 @@ def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
                     short_name(id).removesuffix("-v0"),
                     f"`{name}`",
                     origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
-                    with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
-                    *against_paper(values, name),
-                    consistency(values.get((name, "anees", "state", "all"))),
+                    *_cells(name, records),
                     score_text(values.get((name, "score", "", "all"))),
                 ]
             )
@@ -115,15 +123,13 @@ def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
             if not own:
                 continue
             worst = max(own, key=lambda record: record.value or 0.0)
-            beside = _by_name([record for record in records if record.scenario == worst.scenario])
+            beside = [record for record in records if record.scenario == worst.scenario]
             rows.append(
                 [
                     short_name(id).removesuffix("-v0"),
                     f"`{name}`",
                     f"`{worst.scenario}`",
-                    with_interval(worst, 100.0, negligible=0.005),
-                    *against_paper(beside, name),
-                    consistency(beside.get((name, "anees", "state", "all"))),
+                    *_cells(name, beside),
                     f"{sum((record.low or 0.0) > HARM for record in own)} of {len(own)}",
                 ]
             )
