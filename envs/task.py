@@ -171,6 +171,13 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """True values of the task's components, ``(C, N)``."""
 
+    def seen(self, measurement: Measurement) -> Array | None:
+        """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
+
+        NaN where they say nothing; None, as here, where what is measured is no component at all.
+        """
+        return None
+
     def error_cost(self, error: Array) -> Array:
         """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
         written, and recordings of the task can be judged.
@@ -627,9 +634,13 @@ class Task(ABC):
 
     def track(self, episode: Episode) -> dict[str, Array]:
         """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
-        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
+        ``(C, C, N)``, what is ``seen`` of the components ``(C, N)`` (where anything is), and every array of the
+        measurement, named ``measurement_NAME``.
         """
         said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        seen = self.world.seen(episode.measurement)
+        if seen is not None:
+            said["seen"] = seen
         true = {"truth": self.world.state(episode.truth)} if self.has_truth else {}
         return {
             **true,

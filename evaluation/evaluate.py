@@ -271,7 +271,7 @@ def _further_dimensions(key: str, count: int) -> list[str]:
         return []
     if key == "covariance":
         return ["component", "other_component"]
-    if key in ("error", "mean_square", "truth", "estimate"):
+    if key in ("error", "mean_square", "truth", "estimate", "seen"):
         return ["component"]
     if key.startswith("measurement_"):
         return [f"{key}_axis{i}" for i in range(count + 1)]

@@ -205,6 +205,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         """Position, ``(A, N)``."""
         return truth.reference
 
+    def seen(self, measurement: Measurement) -> Array:
+        """The receiver's position."""
+        return self.xp.where(measurement.available > 0.0, measurement.fix, measurement.fix * math.nan)
+
     def error_cost(self, error: Array) -> Array:
         """Squared error of position, summed over the axes, over the nominal variance of a measurement."""
         return ordered_sum(error * error) / self.parameters.receiver_variance

@@ -392,6 +392,13 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
+    def seen(self, measurement: Measurement) -> Array:
+        """The measured position; nothing of the velocity."""
+        nothing = measurement.position * math.nan
+        return self.xp.concat(
+            [self.xp.where(measurement.available > 0.0, measurement.position, nothing), nothing]
+        )
+
     def error_cost(self, error: Array) -> Array:
         """Squared position error over the squared range sigma."""
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)

@@ -1,5 +1,6 @@
 """The target of RadarEsmTracking, the radar that measures it and the ESM station that listens to it."""
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
@@ -246,6 +247,10 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
+
+    def seen(self, measurement: Measurement) -> Array:
+        """Range and range rate; nothing of the acceleration."""
+        return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
     def error_cost(self, error: Array) -> Array:
         """Mean of the three squared errors over their scales."""

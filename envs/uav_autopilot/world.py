@@ -1,5 +1,6 @@
 """The aircraft of UavAutopilot, what disturbs it, and its sensors; equations (8) and (9)."""
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -242,6 +243,18 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """State of the plant, ``(n, N)``."""
         return truth.state
+
+    def seen(self, measurement: Measurement) -> Array:
+        """Every coordinate that has a sensor."""
+        sensors = list(self.task.sensors)
+        nothing = measurement.command * math.nan
+        rows = [nothing] * len(self.task.components)
+        for i, component in enumerate(self.task.components):
+            if component.name in sensors:
+                sensor = sensors.index(component.name)
+                there = measurement.available[sensor] > 0.0
+                rows[i] = self.xp.where(there, measurement.reading[sensor], nothing)
+        return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:
         """Weighted squares of deviation from the command's equilibrium and of the control, ``(N,)``."""
