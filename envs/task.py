@@ -455,6 +455,25 @@ class Task(ABC):
         world.begin(draws, self.xp.concat([0.0 * average] * world.initial_normals))
         return NoiseLayout(draws.used, world.initial_normals, world.normals, world.row_uniforms)
 
+    @property
+    def interval(self) -> float | None:
+        """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
+        the start of the track; None where they come at times of their own, or nobody says.
+
+        It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
+        """
+        seconds: float | None = self._sampling_interval()
+        if seconds is not None and self.recording is not None:
+            times = seconds * numpy.arange(1, self.recording.seconds.shape[1] + 1)
+            late = numpy.abs(self.recording.seconds - times)
+            # NaN beyond the end of a shorter episode. Times in a file are rounded.
+            return seconds if numpy.nanmax(late, initial=0.0) <= 1e-6 * seconds + 1e-9 * times[-1] else None
+        return seconds
+
+    def _sampling_interval(self) -> float | None:
+        """What the parameters say of the time between measurements, s; None where it differs."""
+        return getattr(self.parameters, "sampling_interval", None)
+
     def picture(self) -> Any:
         """Return the :class:`~.rendering.Picture` that draws an episode of this task; None for the general one."""
         return None

@@ -18,6 +18,7 @@ from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .competitors import RANKED, Kind, check_competitor, kind_of, made
+from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
 
@@ -154,10 +155,14 @@ def evaluate(
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
         truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
-        ``mode_probability``), and ``mean_square`` of bounds. Units and windows stand in the attributes. Of a set of
-        flights the coordinates ``flight`` and ``length`` say which each episode flies and its measurements; what lies
-        beyond is NaN. The attribute ``notes`` tells what was left out. Of a recording likewise, where ``flight`` names
-        the episode of the recording; without truth there are neither ``error``, ``cost``, ``charge`` nor ``nees``.
+        ``mode_probability``), and ``mean_square`` of bounds. Coordinates: ``unit`` and ``group`` of every component,
+        ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
+        number), ``window_first`` and ``window_last`` of every window, and ``elapsed``, seconds since the start of the
+        track, where measurements come regularly. Of a set of flights ``flight`` and ``length`` say which each episode
+        flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
+        recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
+        ``error``, ``cost``, ``charge`` nor ``nees``. ``to_netcdf`` saves it; :mod:`.evaluation.dataset` reads windows,
+        groups and keywords out of it.
 
     Raises:
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
@@ -222,9 +227,9 @@ def evaluate(
     return dataset.assign_attrs(
         paper=paper,
         reference=reference,
-        notes=list(chosen.notes),
-        recorded=chosen.recording is not None,
-        truth=first.has_truth,
+        notes="\n".join(chosen.notes),
+        recorded=int(chosen.recording is not None),
+        truth=int(first.has_truth),
     )
 
 
@@ -291,6 +296,7 @@ def _dataset(
 ) -> xarray.Dataset:
     task = next(iter(tasks.values()))
     names = list(per_policy)
+    components = [c.name for c in task.components]
     times = numpy.arange(1, task.horizon + 1)
     variables: dict[str, Any] = {}
     for key in sorted({key for series in per_policy.values() for key in series}):
@@ -309,26 +315,30 @@ def _dataset(
             "kind": ("policy", [kinds[n] for n in names]),
             "control": ("policy", [controls[n] for n in names]),
             "episode": numpy.arange(len(seeds)),
-            "episode_seed": ("episode", numpy.array(seeds, dtype=numpy.uint64)),
+            "episode_seed": ("episode", [str(seed) for seed in seeds]),
             "time": times,
-            "component": [c.name for c in task.components],
+            "component": components,
             "unit": ("component", [c.unit for c in task.components]),
+            "group": ("component", group_of_each(components, task.groups)),
         },
         attrs={
             "environment": task.id,
             "scenario": scenario.name,
-            "keywords": dict(keywords),
+            "keywords": keywords_as_text(keywords),
             "split": split,
-            "seed": seed,
-            "windows": {
-                name: (first, min(last, task.horizon))
-                for name, (first, last) in {**scenario.windows, "all": (1, task.horizon)}.items()
-                if first <= task.horizon
-            },
-            "groups": dict(task.groups),
+            "seed": whole_number(seed),
             "cost": task.cost_description,
         },
     )
+    if task.interval is not None:
+        elapsed = ("time", task.interval * times, {"units": "s", "long_name": "since the start of the track"})
+        dataset = dataset.assign_coords(elapsed=elapsed)
+    windows = {
+        name: (first, min(last, task.horizon))
+        for name, (first, last) in {**scenario.windows, "all": (1, task.horizon)}.items()
+        if first <= task.horizon
+    }
+    dataset = with_windows(dataset, windows)
     if "mode_probability" in dataset:
         dataset = dataset.assign_coords(mode=list(task.modes))
     return dataset

@@ -7,6 +7,7 @@ from typing import Any
 import numpy
 import xarray
 
+from .dataset import groups_of, windows_of
 from .files import whole_file
 from .metrics import (
     bootstrap_of,
@@ -72,7 +73,7 @@ def _logarithmic(axis: Any) -> None:
 def _shade_windows(axis: Any, dataset: xarray.Dataset) -> None:
     """Name the scenario's windows along the top, except those that span everything."""
     length = dataset.sizes["time"]
-    for i, (name, (first, last)) in enumerate(dataset.attrs["windows"].items()):
+    for i, (name, (first, last)) in enumerate(windows_of(dataset).items()):
         if last - first + 1 < 0.85 * length:
             axis.axvspan(first - 0.5, last + 0.5, color="0.93" if i % 2 else "0.96", zorder=0, lw=0)
             axis.text(
@@ -91,14 +92,14 @@ def draw_error_over_time(dataset: xarray.Dataset) -> Any:
     """RMSE over time of every group of components (or component), with 95 % bands over episodes."""
     bootstrap = bootstrap_of(dataset, resamples=200)
     units = reported_components(dataset)
-    shown = list(dataset.attrs["groups"]) or list(units)[:3]
+    shown = list(groups_of(dataset)) or list(units)[:3]
     figure, axes = _axes(len(shown))
     names = dataset["policy"].values.tolist()
     for axis, component in zip(axes, shown, strict=True):
         _shade_windows(axis, dataset)
         for name, style in styles(names).items():
             run = dataset.sel(policy=name)
-            rmse = numpy.sqrt(bootstrap.means(squared_errors(run, component, dataset.attrs["groups"])))
+            rmse = numpy.sqrt(bootstrap.means(squared_errors(run, component, groups_of(dataset))))
             _draw_with_band(axis, dataset, rmse, name, style)
         axis.set_yscale("log")
         _logarithmic(axis.yaxis)
@@ -156,7 +157,7 @@ def draw_consistency(dataset: xarray.Dataset) -> Any:
 def draw_error_distribution(dataset: xarray.Dataset) -> Any:
     """Share of measurements with an error above a given size, every group (or component)."""
     units = reported_components(dataset)
-    shown = list(dataset.attrs["groups"]) or list(units)[:3]
+    shown = list(groups_of(dataset)) or list(units)[:3]
     figure, axes = _axes(len(shown))
     names = [
         n for n in dataset["policy"].values.tolist() if str(dataset["kind"].sel(policy=n).values) != "bound"
@@ -164,7 +165,7 @@ def draw_error_distribution(dataset: xarray.Dataset) -> Any:
     for axis, component in zip(axes, shown, strict=True):
         for name, style in styles(names).items():
             error = numpy.sort(
-                numpy.sqrt(squared_errors(dataset.sel(policy=name), component, dataset.attrs["groups"])),
+                numpy.sqrt(squared_errors(dataset.sel(policy=name), component, groups_of(dataset))),
                 axis=None,
             )
             error = error[

@@ -14,6 +14,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate
 from .competitors import RANKED
+from .dataset import groups_of, seed_of, windows_of, with_windows
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -61,7 +62,7 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
 def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
     """Components and groups of components, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
-    return units | {name: units[parts[0]] for name, parts in dataset.attrs["groups"].items()}
+    return units | {name: units[parts[0]] for name, parts in groups_of(dataset).items()}
 
 
 def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
@@ -110,7 +111,7 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
 
 def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
     run = dataset.sel(policy=name)
-    groups, windows = dataset.attrs["groups"], dataset.attrs["windows"]
+    groups, windows = groups_of(dataset), windows_of(dataset)
     is_bound = str(run["kind"].values) == "bound"
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
     judged = dataset.attrs.get("truth", True)
@@ -271,8 +272,8 @@ def flight_records(dataset: xarray.Dataset) -> list[Record]:
     for flight in sorted(set(dataset["flight"].values.tolist())):
         part = dataset.isel(episode=numpy.flatnonzero(dataset["flight"].values == flight))
         part = part.isel(time=slice(int(part["length"].max())))
-        windows = {name: (first, part.sizes["time"]) for name, (first, _) in part.attrs["windows"].items()}
-        part = part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}", windows=windows)
+        windows = {name: (first, part.sizes["time"]) for name, (first, _) in windows_of(part).items()}
+        part = with_windows(part.assign_attrs(scenario=f"{dataset.attrs['scenario']}: {flight}"), windows)
         records += [r for r in tidy_records(part) if r.metric in PER_FLIGHT]
     return records
 
@@ -330,7 +331,7 @@ def tidy_records(
                     finite(m.estimate.high),
                     m.unit,
                     dataset.sizes["episode"],
-                    attrs["seed"],
+                    seed_of(dataset),
                     attrs["split"],
                 )
             )

@@ -51,7 +51,9 @@ def test_random_actions_are_every_episodes_own(monkeypatch):
     assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
     policy = RandomPolicy(make_task(ID, "gain"))
     observation = np.zeros((17, len(policy.task.fields)))
-    actions, _ = policy.predict(observation, policy.begin(everyone["episode_seed"].values.tolist()))
+    actions, _ = policy.predict(
+        observation, policy.begin([int(seed) for seed in everyone["episode_seed"].values])
+    )
     assert len(np.unique(actions)) == 17
 
 

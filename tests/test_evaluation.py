@@ -11,6 +11,7 @@ from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.tuning import mean_cost, merged_table, stored_values, tune
 from filtergym.evaluation.competitors import Policy
+from filtergym.evaluation.dataset import windows_of
 from filtergym.evaluation.seeds import episode_seeds
 
 import filtergym
@@ -31,7 +32,7 @@ def test_dataset_has_named_axes_and_units(dataset):
     assert dataset["mode_probability"].dims == ("policy", "episode", "time", "mode")
     assert dataset.sizes["time"] == 100
     assert dict(zip(dataset.component.values, dataset.unit.values, strict=True))["velocity_x"] == "m/s"
-    assert dataset.attrs["windows"]["turn"] == (50, 55)
+    assert windows_of(dataset)["turn"] == (50, 55)
 
 
 def test_an_episode_can_be_replayed_in_the_environment(dataset):
@@ -79,9 +80,9 @@ def test_records_follow_from_the_dataset(dataset):
 
 
 def test_window_all_is_the_whole_episode_however_long():
-    windows = evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=120).attrs["windows"]
+    windows = windows_of(evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=120))
     assert (windows["all"], windows["post"]) == ((1, 120), (70, 100))
-    windows = evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=60).attrs["windows"]
+    windows = windows_of(evaluate(ENV, ["imm"], scenario="paper", episodes=2, horizon=60))
     assert (windows["all"], windows["recovery"]) == ((1, 60), (56, 60))
 
 

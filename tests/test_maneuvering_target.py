@@ -8,6 +8,7 @@ import pytest
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.trajectory import Trajectory
+from filtergym.evaluation.dataset import windows_of
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from scipy.stats import multivariate_normal
@@ -246,7 +247,7 @@ def paper():
     """Every row of the table on 5000 common episodes: errors in x, and what else the tests read."""
     names = [*MONTE_CARLO_ROWS, *EXACT_ROWS, "known-input-bound"]
     result = evaluate(ID, names, "paper", episodes=RUNS, seed=0)
-    assert {name: tuple(window) for name, window in result.attrs["windows"].items()} == WINDOWS
+    assert windows_of(result) == WINDOWS
     return result
 
 

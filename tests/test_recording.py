@@ -20,6 +20,7 @@ from filtergym.envs.maneuvering_target.recorded import recorded as plot_measurem
 from filtergym.envs.recorded_tables import Columns
 from filtergym.envs.recording import measured_once
 from filtergym.envs.task import named_arrays
+from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.estimates import write_estimates
 from filtergym.evaluation.metrics import chi_square_band
 from filtergym.evaluation.seeds import episode_seeds
@@ -550,7 +551,7 @@ def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
             "d: left out: sampling_interval is 6.0, and of a 5.0",
         )
     dataset = evaluate(TARGET, ["imm"], scenario=read)
-    assert dataset.attrs["notes"] == list(read.notes)
+    assert notes_of(dataset) == list(read.notes)
     assert np.isfinite(dataset["nis"].values[0]).sum(axis=1).tolist() == [3, 2]
     with pytest.raises(
         ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time is the same"

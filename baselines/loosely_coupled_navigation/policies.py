@@ -16,6 +16,7 @@ from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.task import Task
 from ...evaluation.bootstrap import Bootstrap
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
+from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, mean_of_present
 from ...filters import loosely_coupled as ins_gnss
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
@@ -312,7 +313,7 @@ def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
         return []
     cls = task_class(run.attrs["environment"])
     scenario = cls.scenarios.get(run.attrs["scenario"])
-    parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **run.attrs["keywords"]})
+    parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **keywords_of(run)})
     size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
     limit = RECOVERED * math.sqrt(parameters.receiver_variance * parameters.axes)
     held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))

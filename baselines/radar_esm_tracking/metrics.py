@@ -7,6 +7,7 @@ import numpy
 import xarray
 
 from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.dataset import windows_of
 from ...evaluation.metrics import Measure, squared_errors
 
 SURE = 0.9
@@ -81,7 +82,7 @@ def _missing(run: xarray.Dataset, name: str) -> bool:
 
 
 def _slices(run: xarray.Dataset) -> dict[str, slice]:
-    return {name: slice(first - 1, last) for name, (first, last) in run.attrs["windows"].items()}
+    return {name: slice(first - 1, last) for name, (first, last) in windows_of(run).items()}
 
 
 def _groups(true_class: numpy.ndarray) -> dict[str, numpy.ndarray]:

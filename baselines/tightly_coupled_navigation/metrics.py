@@ -9,6 +9,7 @@ import xarray
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.dataset import groups_of
 from ...evaluation.metrics import Measure, squared_errors
 
 LASTING = 10
@@ -113,7 +114,7 @@ def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
 def _errors(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
     true_mode = run["true_mode"].values.astype(int)
     for component, unit in (("position", "m"), ("velocity", "m/s")):
-        squares = squared_errors(run, component, run.attrs["groups"])
+        squares = squared_errors(run, component, groups_of(run))
         for i, name in enumerate(HYPOTHESES):
             there = true_mode == i
             if there.any():

@@ -9,6 +9,7 @@ import numpy
 from ...envs.catalogue import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
+from ...evaluation.dataset import keywords_of, windows_of
 from ...evaluation.metrics import Measure
 from .theory import stationary
 
@@ -31,13 +32,13 @@ def metrics(run: Any, bootstrap: Bootstrap) -> list[Measure]:
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return []
     attrs = run.attrs
-    task = make_task(attrs["environment"], "gain", attrs["scenario"], **attrs["keywords"])
+    task = make_task(attrs["environment"], "gain", attrs["scenario"], **keywords_of(run))
     assert isinstance(task, UavAutopilot)
     name = str(run["policy"].values)
     unit, control_unit = task.components[task.output].unit, {"P": "m/s^2", "U": "deg"}[task.parameters.plant]
     output, control = run["output"].values, run["control_signal"].values
     tracking = output - run["command"].values
-    windows = {w: slice(first - 1, last) for w, (first, last) in attrs["windows"].items()}
+    windows = {w: slice(first - 1, last) for w, (first, last) in windows_of(run).items()}
     tracking_variance, control_variance = _variances(tracking, bootstrap), _variances(control, bootstrap)
     theory = stationary(task, name)
     # References estimate outside the task and tell of no innovation.

@@ -155,6 +155,10 @@ class ManeuveringTarget(Task):
         """Start from the first two plots, equation (24)."""
         return started(measurements, seconds)
 
+    def _sampling_interval(self) -> float | None:
+        """Return the time between scans, s; None where some miss the target, or come early."""
+        return self.parameters.sampling_interval if self.regular else None
+
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE

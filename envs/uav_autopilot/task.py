@@ -146,6 +146,10 @@ class UavAutopilot(Task):
         """What a cost of one is in units of the weighted squares, for comparison with theory."""
         self._L = self.constant(self.design.feedback)
 
+    def _sampling_interval(self) -> float:
+        """Return what was left to the plant too, s."""
+        return float(self.parameters.value("sampling_interval"))
+
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE

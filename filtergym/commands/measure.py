@@ -11,6 +11,7 @@ from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.dataset import notes_of
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
@@ -192,7 +193,7 @@ def evaluate_policies(
     if of_flights:
         console.print(flights_table(dataset, of_flights, records))
     console.print(results_table(records) if judged else recorded_table(records))
-    for note in dataset.attrs["notes"]:
+    for note in notes_of(dataset):
         console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
         console.print(f"figures and records in {out}" if judged else f"records in {out}")

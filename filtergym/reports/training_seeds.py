@@ -21,6 +21,7 @@ from ..baselines.tuning import tuned_names
 from ..envs.catalogue import task_class
 from ..evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from ..evaluation.competitors import kind_of
+from ..evaluation.dataset import groups_of, windows_of
 from ..evaluation.figures import draw_learning_curves
 from ..evaluation.files import whole_file
 from ..evaluation.metrics import reported_components, score, squared_errors
@@ -228,11 +229,11 @@ def episode_means(
             known_as = "agent" if name in agents else name
             dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
             data = dataset.isel(policy=0)
-            first, last = dataset.attrs["windows"]["all"]
+            first, last = windows_of(dataset)["all"]
             known = reported_components(dataset)
             errors = {}
             for component in shown_components(list(known)):
-                values = squared_errors(data, component, dataset.attrs["groups"])[:, first - 1 : last]
+                values = squared_errors(data, component, groups_of(dataset))[:, first - 1 : last]
                 errors[component] = values.mean(axis=1)
             found = data["cost"].values.mean(axis=1), errors, known
             if kept is not None:

@@ -1,0 +1,95 @@
+"""What an evaluation's dataset says beside its numbers, in a form that every file format can hold.
+
+NetCDF knows neither dictionaries nor lists nor booleans among attributes, and its classic format, which SciPy writes
+and R and MATLAB open, neither unsigned nor 64-bit integers. So windows and groups stand in coordinates, and what
+remains in words: see the functions of this module for what they mean.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy
+import xarray
+
+MOST_WHOLE = 2**31 - 1
+"""Largest whole number of an attribute in NetCDF's classic format."""
+
+
+def windows_of(dataset: xarray.Dataset) -> dict[str, tuple[int, int]]:
+    """Windows by name: first and last measurement of each, both included, from 1 on.
+
+    Args:
+        dataset: from an evaluation, as it was or read from a file.
+    """
+    ends = (dataset[name].values.tolist() for name in ("window", "window_first", "window_last"))
+    return {name: (int(first), int(last)) for name, first, last in zip(*ends, strict=True)}
+
+
+def with_windows(dataset: xarray.Dataset, windows: Mapping[str, tuple[int, int]]) -> xarray.Dataset:
+    """Return a dataset with these windows, in place of those that it has."""
+    first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
+    return dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore").assign_coords(
+        window=list(windows), window_first=("window", first), window_last=("window", last)
+    )
+
+
+def groups_of(dataset: xarray.Dataset) -> dict[str, tuple[str, ...]]:
+    """Components of every group, such as ``position``, in the order of the components."""
+    found: dict[str, list[str]] = {}
+    for name, group in zip(
+        dataset["component"].values.tolist(), dataset["group"].values.tolist(), strict=True
+    ):
+        if group:
+            found.setdefault(group, []).append(name)
+    return {group: tuple(names) for group, names in found.items()}
+
+
+def group_of_each(components: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
+    """Group that each component belongs to; empty where it belongs to none.
+
+    Raises:
+        ValueError: if one belongs to several.
+    """
+    found = []
+    for component in components:
+        mine = [group for group, parts in groups.items() if component in parts]
+        if len(mine) > 1:
+            raise ValueError(f"component {component!r} belongs to several groups: {', '.join(mine)}")
+        found.append(mine[0] if mine else "")
+    return found
+
+
+def keywords_of(dataset: xarray.Dataset) -> dict[str, Any]:
+    """Parameters of the task that the evaluation was asked for; sequences are lists, as JSON has them.
+
+    Other objects, of a task of one's own, are text, as Python's ``repr`` shows them.
+    """
+    found: dict[str, Any] = json.loads(dataset.attrs["keywords"])
+    return found
+
+
+def keywords_as_text(keywords: Mapping[str, Any]) -> str:
+    """Return parameters as a JSON object; what JSON does not know is told as Python's ``repr`` shows it."""
+    return json.dumps(keywords, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, numpy.ndarray | numpy.generic):
+        return value.tolist()
+    return repr(value)
+
+
+def whole_number(value: int) -> int | str:
+    """Return a whole number for an attribute: in words if NetCDF's classic format has no room for it."""
+    return value if abs(value) <= MOST_WHOLE else str(value)
+
+
+def seed_of(dataset: xarray.Dataset) -> int:
+    """Return the number of the experiment."""
+    return int(dataset.attrs["seed"])
+
+
+def notes_of(dataset: xarray.Dataset) -> list[str]:
+    """What is to be told of the scenario, a line each."""
+    return str(dataset.attrs["notes"]).splitlines()

@@ -1,0 +1,141 @@
+"""An evaluation saved as NetCDF and read again: the same numbers, windows, groups, keywords and records."""
+
+import dataclasses
+import importlib.util
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+import xarray
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.dataset import (
+    group_of_each,
+    groups_of,
+    keywords_as_text,
+    keywords_of,
+    notes_of,
+    seed_of,
+    windows_of,
+)
+
+import filtergym
+from filtergym import evaluate, record, tidy_records
+
+TARGET = "filtergym/ManeuveringTarget-v0"
+CASES = {
+    TARGET: {"scenario": "paper"},
+    "filtergym/UavAutopilot-v0": {"scenario": "paper-noise", "horizon": 60},
+    "filtergym/RadarEsmTracking-v0": {},
+    "filtergym/LooselyCoupledNavigation-v0": {"duration": 0.5},
+    "filtergym/TightlyCoupledNavigation-v0": {"horizon": 20},
+}
+ENGINES = [
+    "scipy",
+    pytest.param(
+        "h5netcdf",
+        marks=pytest.mark.skipif(
+            not all(map(importlib.util.find_spec, ("h5netcdf", "h5py"))),
+            reason="h5netcdf needs h5py to write",
+        ),
+    ),
+]
+
+
+def saved_and_read(dataset, path, engine="scipy"):
+    dataset.to_netcdf(path, engine=engine)
+    with xarray.open_dataset(path, engine=engine) as read:
+        return read.load()
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("env", CASES)
+def test_what_is_saved_is_what_is_read(env, engine, tmp_path):
+    """Values, names and attributes; NetCDF's classic format only narrows whole numbers to 32 bits."""
+    keywords, known = CASES[env], baselines_of(env)
+    names = [*list(known.names)[:2], *list(known.references)[:1], *list(known.bounds)[:1]]
+    dataset = evaluate(env, names, episodes=3, seed=4, **keywords)
+    read = saved_and_read(dataset, tmp_path / "x.nc", engine)
+    xarray.testing.assert_identical(read, dataset)
+    assert (windows_of(read), groups_of(read)) == (windows_of(dataset), groups_of(dataset))
+    own = {name: value for name, value in keywords.items() if name != "scenario"}
+    assert keywords_of(read) == keywords_of(dataset) == own
+    before, after = tidy_records(dataset), tidy_records(read)
+    assert after == before
+    # As text too: a NumPy number would equal a Python one, and JSON refuses it.
+    assert json.dumps(after) == json.dumps(before)
+
+
+def without_truth(recording):
+    return dataclasses.replace(recording, truth=None)
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_recordings_and_shorter_flights(blind, tmp_path):
+    recording = record(TARGET, "paper", 2)
+    lengths = recording.lengths.copy()
+    lengths[1] -= 30
+    seconds = np.where(np.arange(recording.seconds.shape[1]) <= lengths[:, None], recording.seconds, np.nan)
+    recording = dataclasses.replace(
+        recording, lengths=lengths, seconds=seconds, names=("früh", "spät"), notes=("one", "two, \u00b5")
+    )
+    recording = without_truth(recording) if blind else recording
+    dataset = evaluate(TARGET, ["imm"], recording)
+    read = saved_and_read(dataset, tmp_path / "x.nc")
+    xarray.testing.assert_identical(read, dataset)
+    assert read["flight"].values.tolist() == ["früh", "spät"]
+    assert read["length"].values.tolist() == lengths.tolist()
+    assert notes_of(read)[-2:] == ["one", "two, \u00b5"]
+    assert (read.attrs["recorded"], read.attrs["truth"]) == (1, 0 if blind else 1)
+    assert tidy_records(read) == tidy_records(dataset)
+    # It comes from the simulation, where scans are regular.
+    np.testing.assert_allclose(dataset["elapsed"], dataset["time"] * 6.0)
+
+
+def test_tracks_and_a_seed_of_any_size(tmp_path):
+    dataset = evaluate(TARGET, ["imm"], "paper", 2, seed=2**40 + 1, horizon=5)
+    assert seed_of(saved_and_read(dataset, tmp_path / "x.nc")) == 2**40 + 1
+    assert {r.seed for r in tidy_records(dataset)} == {2**40 + 1}
+    replayed = evaluate(TARGET, ["zero"], "paper", 2, seed=0, horizon=5)
+    seeds = [int(seed) for seed in saved_and_read(replayed, tmp_path / "y.nc")["episode_seed"].values]
+    assert max(seeds) > 2**53  # which no double holds
+    env = gymnasium.make(TARGET, scenario="paper", horizon=5, detailed_info=True)
+    policy = filtergym.make_policy(env, "zero")
+    observation, _ = env.reset(seed=seeds[1])
+    *_, info = env.step(policy.predict(observation, policy.begin(seeds[1:]))[0])
+    np.testing.assert_allclose(info["error"], replayed["error"].values[0, 1, 0], rtol=0, atol=1e-9)
+
+
+def test_seconds_where_measurements_come_regularly():
+    task = make_task("filtergym/UavAutopilot-v0", None, "paper-noise")
+    assert task.parameters.sampling_interval is None  # left to the plant
+    dataset = evaluate(task.id, ["kalman"], "paper-noise", 2, horizon=8)
+    np.testing.assert_allclose(dataset["elapsed"], task.interval * np.arange(1, 9))
+    assert dataset["elapsed"].attrs["units"] == "s"
+    assert evaluate(task.id, ["kalman"], "paper-noise", 2, horizon=8, sampling_interval=0.1).elapsed[
+        0
+    ] == pytest.approx(0.1)
+    # Scans that miss the target leave gaps; the number of a plot then says nothing about its time.
+    missing = {"horizon": 8, "detection_probability": (0.5, 0.9)}
+    assert "elapsed" not in evaluate(TARGET, ["imm"], "paper", 2, **missing).coords
+
+
+def test_a_recording_with_times_of_its_own_has_no_common_ones():
+    recording = record(TARGET, episodes=2, horizon=20, detection_probability=(0.5, 0.9))
+    dataset = evaluate(TARGET, ["imm"], recording)
+    assert "elapsed" not in dataset.coords
+    assert "seconds" in dataset
+
+
+def test_keywords_that_json_does_not_know_are_told():
+    given = {"gain": np.float64(0.5), "gains": np.array([[1, 2]]), "pair": (1.0, 2.0), "odd": slice(3)}
+    text = keywords_as_text(given)
+    read = keywords_of(xarray.Dataset(attrs={"keywords": text}))
+    assert read == {"gain": 0.5, "gains": [[1, 2]], "pair": [1.0, 2.0], "odd": "slice(None, 3, None)"}
+
+
+def test_a_component_of_two_groups_is_refused():
+    assert group_of_each(["a", "b", "c"], {"g": ("a", "c")}) == ["g", "", "g"]
+    with pytest.raises(ValueError, match="'a' belongs to several groups: g, h"):
+        group_of_each(["a", "b"], {"g": ("a",), "h": ("b", "a")})
