@@ -79,12 +79,12 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.core: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report]"
 	touch $@
 
 $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt "torch==2.13.0"
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,agents,search,dev]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fast,report,agents,search,dev]"
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made

@@ -21,6 +21,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "evaluate": measure.evaluate_policies,
     "record": measure.record_scenario,
     "benchmark": measure.benchmark,
+    "report": report.make,
     "comparison": report.comparison_page,
     "tune": improve.tune_policy,
     "room": report.room,

@@ -15,13 +15,15 @@ from ..evaluation.dataset import notes_of
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
-from ..evaluation.metrics import Record, flight_records
+from ..evaluation.metrics import flight_records
 from ..evaluation.recording import record
 from ..names import competitor, evaluate, tidy_records
-from ..reports.benchmark import Cell, run_benchmark
+from ..reports.benchmark import RESULTS, Cell, run_benchmark
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
-from ..reports.tables import flights_table, recorded_table, results_table
+from ..reports.results import Result, settings_of
+from ..reports.tables import flights_table, recorded_table
+from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
     Environment,
@@ -192,7 +194,10 @@ def evaluate_policies(
                 save(figure, waiting / f"{name}.png")
     if of_flights:
         console.print(flights_table(dataset, of_flights, records))
-    console.print(results_table(records) if judged else recorded_table(records))
+    if judged:
+        print_results(records)
+    else:
+        console.print(recorded_table(records))
     for note in notes_of(dataset):
         console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
@@ -246,30 +251,49 @@ def benchmark(
     full: Annotated[
         bool, typer.Option("--full", help="Every scenario and policy, and ten times the episodes.")
     ] = False,
-    out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
+    out: Annotated[Path, typer.Option(help="Folder for results, report and figures.")] = Path("results"),
     seed: Experiment = 0,
     environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
+    details: Annotated[
+        bool, typer.Option("--details", help="Print the table of every environment and scenario.")
+    ] = False,
     backend: Backend = "auto",
     threads: Threads = 1,
 ) -> None:
-    """Run every environment with its policies; quick by default, resumes after an interruption.
+    """Run every environment with its competitors; quick by default, resumes after an interruption.
 
     Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
     """
+    words = ["--full"] * full + [f"--environment {name}" for name in environment or ()]
+    command = " ".join(["filtergym benchmark", *words, f"--seed {seed} --split {split}"])
     with progress_bar() as bar:
 
         def started(cell: Cell, total: int) -> Any:
             line = bar.add_task(f"{short_name(cell.environment)} {cell.scenario}", total=total)
             return lambda done: bar.update(line, advance=done)
 
-        def finished(records: list[Record]) -> None:
-            console.print(results_table(records))
+        def finished(result: Result) -> None:
+            if details:
+                print_results(result.records)
 
-        run_benchmark(out, full, seed, environment or (), split, started, finished, backend, threads)
-    console.print(f"records in {out / 'benchmark.json'}, figures beside it")
+        results = run_benchmark(
+            out,
+            full,
+            seed,
+            environment or (),
+            split,
+            started,
+            finished,
+            backend=backend,
+            threads=threads,
+            command=command,
+        )
+    print_verdict(results)
+    console.print(f"results in {out / RESULTS}", soft_wrap=True)
+    make_report(results, settings_of(command), out / REPORT)
 
 
 def animate(

@@ -14,13 +14,33 @@ from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
 from ..reports.pages import check_markers, insert_between_markers, markers_of
 from ..reports.records import write_records
+from ..reports.results import read_all_results
 from ..reports.room import MARKER, measure_room, room_markdown
-from ..reports.tables import claims_table, grid_table, results_table
+from ..reports.tables import claims_table, grid_table
+from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import Environment, Episodes, Experiment, Split, Trust, console, progress_bar
 
 
+def make(
+    results: Annotated[
+        list[Path], typer.Argument(help="Files of results, or folders that hold one; several make one report.")
+    ],
+    out: Annotated[Path, typer.Option(help="HTML file.")] = Path(REPORT),
+) -> None:
+    """Make one self-contained page of results, to open offline and to send: tables, figures, a track to look at.
+
+    What the files say is shown and never executed, so that one may open what somebody else has sent.
+
+    Example: filtergym report results --out report.html
+    """
+    writable_file(out)
+    found, settings = read_all_results(results)
+    print_verdict(found)
+    make_report(found, settings, out)
+
+
 def comparison_page(
-    records: Annotated[Path, typer.Argument(help="benchmark.json of a full benchmark.")],
+    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
     into: Annotated[
         Path | None,
         typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
@@ -28,7 +48,7 @@ def comparison_page(
 ) -> None:
     """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
 
-    Example: filtergym comparison results/benchmark.json --into docs/comparison.md
+    Example: filtergym comparison results/results.json --into docs/comparison.md
     """
     found = comparison.read_benchmark(records)
     markers = {id: f"comparison {short_name(id)}" for id in found}
@@ -77,7 +97,7 @@ def room(
     if into is not None:
         command = f"filtergym room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
         insert_between_markers(into, {MARKER: room_markdown(records, command)})
-    console.print(results_table(records))
+    print_results(records)
 
 
 def page(

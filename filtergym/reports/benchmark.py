@@ -1,27 +1,43 @@
-"""The main job: every environment with its policies.
+"""The main job: every environment with its competitors.
 
-Quick: the telling policies in the paper's scenario and the training distribution. Full: everything there is to
-compare, in all scenarios, tuned and learned policies among them.
+Quick: the telling ones in the paper's scenario and the training distribution. Full: everything there is to
+compare, in all scenarios.
 """
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import xarray
+
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
-from ..evaluation.figures import evaluation_figures, save
+from ..evaluation.curves import curves_of
+from ..evaluation.dataset import groups_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..names import evaluate, tidy_records
-from .records import read_records, write_records
+from .results import (
+    MOST_TIMES,
+    Result,
+    drawn_components,
+    read_results,
+    settings_of,
+    shown_competitors,
+    spread,
+    track_of,
+    write_results,
+)
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
 FULL_SECONDS = 5.0
 """Time per policy and cell that the full benchmark, of ten times as many measurements, does not go beyond."""
+FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
+"""Of fewer the intervals are too narrow; where episodes are long, the quick benchmark takes no more."""
+RESULTS = "results.json"
 
 
 class Cell(NamedTuple):
@@ -49,17 +65,19 @@ def _horizon(id: str, scenario: str) -> int:
 
 
 def benchmark_policies(id: str, full: bool) -> tuple[str, ...]:
-    """Names that a cell compares.
+    """Names that a cell compares, the paper's algorithm first.
 
-    Full: paper, every other policy and estimator as it is, those that were tuned, shipped agents, references, bounds.
+    Quick: the telling ones, tuned where they can be; shipped agents. Full: every policy and estimator as it is, those
+    that were tuned, shipped agents, references, bounds.
     """
     known = baselines_of(id)
-    if not full:
-        return known.benchmark or known.names
-    tuned = tuned_names(id)
-    everything = (known.score_paper, *known.policies, *known.estimators, *tuned, *shipped_agents(id))
-    names = dict.fromkeys((*everything, *known.references, *known.bounds))
-    return tuple(name for name in names if name)
+    tuned, learned = tuned_names(id), shipped_agents(id)
+    if full:
+        everything = (*known.policies, *known.estimators, *tuned, *learned, *known.references, *known.bounds)
+    else:
+        telling = known.benchmark or known.names
+        everything = (*(name for name in telling if f"{name}-tuned" not in tuned), *tuned, *learned)
+    return tuple(name for name in dict.fromkeys((known.score_paper, *everything)) if name)
 
 
 def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> list[Cell]:
@@ -76,11 +94,11 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
             if split != "test" and not scenario.training:
                 continue
             horizon = _horizon(id, name)
-            measurements = MEASUREMENTS
+            measurements, fewest = MEASUREMENTS, FEWEST_EPISODES
             if full:
                 affordable = int(FULL_SECONDS / baselines_of(id).measurement_seconds)
-                measurements = min(10 * MEASUREMENTS, affordable)
-            episodes = max(20, min(5000 if full else 500, measurements // horizon))
+                measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
+            episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
             wanted.append(Cell(cls.id, name, episodes, benchmark_policies(id, full)))
     return wanted
 
@@ -89,30 +107,70 @@ def run_cell(
     cell: Cell,
     seed: int,
     split: str,
-    folder: Path,
     progress: Callable[[int], None],
     backend: str = "auto",
     threads: int = 1,
-) -> list[Record]:
-    """Evaluate one cell, save its figures, and return its records."""
-    known = baselines_of(cell.environment)
+) -> tuple[Result, xarray.Dataset]:
+    """Evaluate one cell; return its result and all its curves."""
+    options: dict[str, Any] = {"seed": seed, "split": split, "backend": backend}
     dataset = evaluate(
         cell.environment,
         cell.policies,
         cell.scenario,
         cell.episodes,
-        seed,
-        split,
         progress=progress,
-        backend=backend,
         threads=threads,
+        **options,
     )
-    # Not all of the full benchmark's policies: nobody can tell twenty lines apart.
-    clear = {*(known.benchmark or known.names), *shipped_agents(cell.environment)}
-    shown = [name for name in cell.policies if name in clear]
-    for name, figure in evaluation_figures(dataset.sel(policy=shown)):
-        save(figure, folder / f"{cell.name}.{name}.png")
-    return tidy_records(dataset)
+    return result_of(dataset, shipped_agents(cell.environment), **options)
+
+
+def result_of(
+    dataset: xarray.Dataset, learned: Sequence[str], competitors: Any = None, **options: Any
+) -> tuple[Result, xarray.Dataset]:
+    """Turn an evaluation into what a file of results holds of it.
+
+    Args:
+        dataset: from an evaluation.
+        learned: names of those of its competitors that were learned.
+        competitors: what its names stand for, where they say more than the environment knows; see
+            :func:`~.names.evaluate`.
+        **options: of the evaluation, for the episode whose track is drawn: scenario, seed and others. Without any
+            there is none.
+
+    Returns:
+        The result, with curves of what is shown, and the curves of everything.
+    """
+    id, scenario = dataset.attrs["environment"], dataset.attrs["scenario"]
+    cls, known = task_class(id), baselines_of(id)
+    paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
+    records, curves = tidy_records(dataset), curves_of(dataset)
+    names = dataset["policy"].values.tolist()
+    shown = shown_competitors(records, paper, reference, [name for name in learned if name in names])
+    track = None
+    if options:
+        components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
+        chosen = shown if competitors is None else {name: competitors[name] for name in shown}
+        options.setdefault("scenario", scenario)
+        track = track_of(evaluate(id, chosen, episodes=1, tracks=True, **options), components, plane)
+    told = {**known.references, **known.bounds}
+    named = cls.scenarios.get(scenario)
+    result = Result(
+        id,
+        scenario,
+        named.description if named else "",
+        scenario == cls.default_scenario,
+        bool(named and named.training),
+        paper if paper in names else "",
+        reference if reference in names else "",
+        [name for name in names if name in learned],
+        {name: told[name].knows for name in names if name in told},
+        dataset.attrs["notes"].splitlines(),
+        records,
+        curves.sel(policy=shown).isel(time=spread(curves.sizes["time"], MOST_TIMES)),
+        track,
+    )
+    return result, curves
 
 
 def run_benchmark(
@@ -122,45 +180,64 @@ def run_benchmark(
     environments: Sequence[str] = (),
     split: str = "test",
     started: Callable[[Cell, int], Callable[[int], None]] = lambda cell, total: lambda done: None,
-    finished: Callable[[list[Record]], None] = lambda records: None,
+    finished: Callable[[Result], None] = lambda result: None,
+    drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None,
     backend: str = "auto",
     threads: int = 1,
-) -> list[Record]:
+    command: str = "filtergym benchmark",
+) -> list[Result]:
     """Run every cell, resuming at the first missing one after an interruption.
 
     Args:
-        folder: where ``benchmark.json`` and the figures go; cells wait in ``unfinished/`` until all are done.
+        folder: where ``results.json`` goes; cells wait in ``unfinished/`` until all are done.
         full: all scenarios and policies, and more episodes.
         seed: number of the experiment.
         environments: ids; default: all.
         split: "test", or another one for development.
         started: called with a cell and its number of measurements; returns what is told of progress.
-        finished: called with the records of each cell.
+        finished: called with the result of each cell.
+        drawn: called with each cell that was run now, and its curves.
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
+        command: that runs this, kept in the results.
 
     Returns:
-        All records.
+        All results.
     """
     wanted = cells(full, environments, split)
+    settings = settings_of(command)
     unfinished = writable_folder(folder / "unfinished")
     waiting = [unfinished / f"{cell.name}.{cell.episodes}.{split}{seed}.json" for cell in wanted]
-    writable_file(folder / "benchmark.json")
-    records: list[Record] = []
+    writable_file(folder / RESULTS)
+    results: list[Result] = []
     for cell, path in zip(wanted, waiting, strict=True):
         tick = started(cell, cell.measurements)
-        done = read_records(path) if path.exists() else []
-        if {record.policy for record in done} == set(cell.policies):
-            tick(cell.measurements)
+        found = _waiting_result(path, cell)
+        if found is None:
+            found, curves = run_cell(cell, seed, split, tick, backend, threads)
+            drawn(cell, curves)
+            write_results(path, [found], settings)
         else:
-            done = run_cell(cell, seed, split, folder, tick, backend, threads)
-            write_records(path, done)
-        finished(done)
-        records += done
-    write_records(folder / "benchmark.json", records)
+            tick(cell.measurements)
+        finished(found)
+        results.append(found)
+    write_results(folder / RESULTS, results, settings)
     # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
     for path in waiting:
         path.unlink(missing_ok=True)
     if not any(unfinished.iterdir()):
         unfinished.rmdir()
-    return records
+    return results
+
+
+def _waiting_result(path: Path, cell: Cell) -> Result | None:
+    """Return the result of a cell that an interrupted run has left."""
+    if not path.exists():
+        return None
+    [result], _ = read_results(path)
+    return result if {record.policy for record in result.records} == set(cell.policies) else None
+
+
+def all_records(results: Sequence[Result]) -> list[Record]:
+    """Return the records of all results."""
+    return [record for result in results for record in result.records]

@@ -12,7 +12,8 @@ from ..evaluation.competitors import RANKED
 from ..evaluation.figures import draw_differences
 from ..evaluation.metrics import Record
 from .ranking import ranking, ranking_sentence
-from .records import read_records
+from .records import check_known
+from .results import read_all_results
 from .tables import INCONSISTENT, against_paper, consistency, score_text, with_interval
 
 STRONGEST = 4
@@ -30,17 +31,19 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def read_benchmark(path: Path) -> dict[str, list[Record]]:
-    """Read the records of a benchmark, by environment.
+def read_benchmark(paths: Sequence[Path]) -> dict[str, list[Record]]:
+    """Read the records of benchmarks, by environment.
 
     Raises:
-        ValueError: if the file is not one, or holds nothing.
+        ValueError: if a file is none, is of something else, or they hold nothing.
     """
     found: dict[str, list[Record]] = {}
-    for record in read_records(path):
-        found.setdefault(record.environment, []).append(record)
+    for result in read_all_results(paths)[0]:
+        for record in result.records:
+            check_known(record)
+        found.setdefault(result.environment, []).extend(result.records)
     if not found:
-        raise ValueError(f"{path} holds no records: make them by filtergym benchmark --full")
+        raise ValueError(f"{paths[0]} holds no records: make them by filtergym benchmark --full")
     return found
 
 

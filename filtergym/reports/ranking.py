@@ -7,10 +7,16 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
+from .results import Result
 from .tables import with_interval
 
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
+HARM = 0.02
+"""Relative difference to the paper's algorithm beyond which, with its whole interval, a competitor does harm."""
+ORIGINS = ("paper", "classical", "estimator", "learned", "reference")
+"""Of which a summary names the best: the paper's algorithm; policies that steer an environment's filters, classical or
+learned; filters of their own, likewise; who knows the truth."""
 
 
 class Place(NamedTuple):
@@ -24,9 +30,14 @@ class Place(NamedTuple):
     """Relative difference of its cost to the best one's."""
 
 
-def ranking(records: Sequence[Record]) -> list[Place]:
-    """Competitors of one environment and scenario that are ranked, lowest mean cost first."""
-    learned = shipped_agents(records[0].environment)
+def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> list[Place]:
+    """Competitors of one environment and scenario that are ranked, lowest mean cost first.
+
+    Args:
+        records: of the scenario.
+        learned: names of those that were learned; default: the environment's shipped agents.
+    """
+    learned = shipped_agents(records[0].environment) if learned is None else learned
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
     places = []
     for name, kind in dict.fromkeys((r.policy, r.kind) for r in records if r.kind in RANKED):
@@ -37,21 +48,34 @@ def ranking(records: Sequence[Record]) -> list[Place]:
     return sorted(places, key=lambda place: place.cost)
 
 
-def ranking_sentence(records: Sequence[Record]) -> str:
-    """Say who is best, by how much, and how the strongest of another origin stands to it."""
-    first, paper = records[0], baselines_of(records[0].environment).score_paper
+def ranking_sentence(
+    records: Sequence[Record], learned: Sequence[str] | None = None, paper: str | None = None
+) -> str:
+    """Say who is best, by how much, and how the strongest of another origin stands to it.
+
+    Args:
+        records: of the scenario.
+        learned: as of :func:`ranking`.
+        paper: name of the paper's algorithm; default: the environment's.
+    """
+    first = records[0]
+    paper = baselines_of(first.environment).score_paper if paper is None else paper
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    best, *others = ranking(records)
+    places = ranking(records, learned)
+    if not places:
+        return f"On `{first.scenario}` nothing is ranked."
+    best, *others = places
     difference = found.get((best.name, "relative_cost_difference"))
     sentence = f"On `{first.scenario}` `{best.name}` ({best.role}) costs least"
     if best.name != paper and difference is not None and (difference.high or 0.0) > -NEGLIGIBLE:
         sentence += f", but not significantly less than `{paper}`"
     elif best.name != paper and difference is not None and difference.value is not None:
-        median, wins = found[best.name, "median_cost_ratio"].value, found[best.name, "win_rate"].value
         sentence += f": {with_interval(difference, 100.0)} % against `{paper}`"
-        if median is not None and wins is not None:
+        median, wins = (found.get((best.name, metric)) for metric in ("median_cost_ratio", "win_rate"))
+        if median is not None and wins is not None and median.value is not None and wins.value is not None:
             sentence += (
-                f", {100.0 * (median - 1.0):+.1f} % in the median, lower in {100.0 * wins:.0f} % of episodes"
+                f", {100.0 * (median.value - 1.0):+.1f} % in the median, "
+                f"lower in {100.0 * wins.value:.0f} % of episodes"
             )
     was_learned = best.role == "learned"
     rival = next((place for place in others if (place.role == "learned") != was_learned), None)
@@ -64,3 +88,88 @@ def ranking_sentence(records: Sequence[Record]) -> str:
         if rival.behind.low is not None and rival.behind.low <= 0.0:
             sentence += ", which is no significant difference"
     return sentence + "."
+
+
+def origin(result: Result, name: str, kind: str) -> str:
+    """Return where a competitor comes from: one of ``ORIGINS``, or "bound"."""
+    if name == result.paper:
+        return "paper"
+    if name in result.learned:
+        return "learned"
+    return "classical" if kind == "policy" else kind
+
+
+def best_of_origins(result: Result) -> list[tuple[str, str]]:
+    """Return origin and name of the best of every origin: the ranked by their cost, then the reference."""
+    kinds = {record.policy: record.kind for record in result.records}
+    best: dict[str, str] = {}
+    for place in ranking(result.records, result.learned):
+        best.setdefault(origin(result, place.name, kinds[place.name]), place.name)
+    if result.reference:
+        best["reference"] = result.reference
+    return list(best.items())
+
+
+def verdict(results: Sequence[Result]) -> list[str]:
+    """Say in sentences what results come to: who is best on the training distributions, who harms, who is honest.
+
+    Args:
+        results: of one or several environments.
+    """
+    sentences = []
+    usual = [result for result in results if result.default] or list(results)
+    judged = [result for result in usual if ranking(result.records, result.learned)]
+    won: dict[str, list[str]] = {}
+    for result in judged:
+        first, *others = ranking(result.records, result.learned)
+        was_learned = first.role == "learned"
+        rival = next((place for place in others if (place.role == "learned") != was_learned), None)
+        if not result.learned or rival is None:
+            outcome = "no learned agent took part"
+        elif rival.behind is not None and (rival.behind.low or 0.0) <= 0.0:
+            outcome = "nobody is significantly best"
+        else:
+            outcome = "a learned agent costs least" if was_learned else "a classical competitor costs least"
+        won.setdefault(outcome, []).append(f"{result.short} (`{first.name}`)")
+    where = "on the training distribution" if any(result.default for result in judged) else ""
+    for outcome, names in won.items():
+        sentences.append(f"{outcome[0].upper()}{outcome[1:]} {where} of {', '.join(names)}.".replace("  ", " "))
+    harmful = [harm for result in results for harm in _harms(result)]
+    agents = {(result.environment, name) for result in results for name in result.learned}
+    if agents:
+        cells = sum(len(result.learned) for result in results)
+        sentences.append(
+            f"Learned agents cost more than {100.0 * HARM:g} % above the paper's algorithm in {len(harmful)} of {cells} "
+            "cases (agents times scenarios)" + (f"; worst: {max(harmful)[1]}." if harmful else ".")
+        )
+    off = [
+        f"`{name}` in {result.short} ({_nees(result, name):.2g})"
+        for result in judged
+        for name in [ranking(result.records, result.learned)[0].name]
+        if not 0.5 <= (_nees(result, name) or 1.0) <= 2.0
+    ]
+    if judged:
+        sentences.append(
+            "The errors of every winner are as large as its covariance says, to a factor of two in the mean NEES."
+            if not off
+            else f"Best, but with a covariance off by more than a factor of two in the mean NEES: {', '.join(off)}."
+        )
+    return sentences
+
+
+def _nees(result: Result, name: str) -> float | None:
+    for record in result.records:
+        if (record.policy, record.metric, record.component, record.window) == (name, "anees", "state", "all"):
+            return record.value
+    return None
+
+
+def _harms(result: Result) -> list[tuple[float, str]]:
+    """Learned agents that cost significantly more than the paper's algorithm: how much, and in words."""
+    return [
+        (r.value or 0.0, f"`{r.policy}` in {result.short} `{r.scenario}`, {with_interval(r, 100.0)} %")
+        for r in result.records
+        if r.policy in result.learned
+        and (r.metric, r.window) == ("relative_cost_difference", "all")
+        and (r.low or 0.0) > HARM
+    ]

@@ -1,9 +1,12 @@
 """Tables of results for the terminal."""
 
+import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from ..baselines.catalogue import baselines_of
@@ -91,41 +94,48 @@ def ranked(records: Sequence[Any]) -> list[tuple[str, str, str]]:
     return sorted(found, key=place)
 
 
-def results_table(records: Sequence[Any]) -> Table:
-    """Compare competitors, lowest cost first: errors over the whole run, cost against the paper's, consistency, score.
+def results_tables(records: Sequence[Any], width: int) -> list[Table]:
+    """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
 
     Args:
         records: tidy records of one environment and scenario.
+        width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
+            own, so that no number is cut.
     """
     first = records[0]
     shown = main_components(records)
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
-    table = Table(
-        title=f"{first.environment}, scenario {first.scenario} "
-        f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)",
-        title_justify="left",
-    )
-    table.add_column("policy", no_wrap=True)
-    table.add_column("control")
-    for component in shown:
-        table.add_column(f"RMSE {component.replace('_', ' ')}, {units[component]}", justify="right")
-    for title in ("cost vs paper, %", "median, %", "wins, %", "ANEES", "score"):
-        table.add_column(title, justify="right")
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
-    names = ranked(records)
-    section = "ranked"
-    for name, kind, control in names:
-        if kind not in RANKED and kind != section:
-            table.add_section()
-            section = kind
-        row = [name, control if kind == "policy" else f"({kind})"]
-        row += [with_interval(found.get((name, "rmse", component, "all"))) for component in shown]
-        row.append(
-            with_interval(found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005)
+    errors: dict[str, Callable[[str], str]] = {
+        f"RMSE {component.replace('_', ' ')}, {units[component]}": lambda name, component=component: (
+            with_interval(found.get((name, "rmse", component, "all")))
         )
-        row += [*against_paper(found, name), consistency(found.get((name, "anees", "state", "all")))]
-        row.append(score_text(found.get((name, "score", "", "all"))).partition(" [")[0])
-        table.add_row(*row)
+        for component in shown
+    }
+
+    def difference(name: str) -> str:
+        record = found.get((name, "relative_cost_difference", "", "all"))
+        return with_interval(record, 100.0, negligible=0.005)
+
+    costs: dict[str, Callable[[str], str]] = {
+        "cost vs paper, %": difference,
+        "median, %": lambda name: against_paper(found, name)[0],
+        "wins, %": lambda name: against_paper(found, name)[1],
+        "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
+        "score": lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0],
+    }
+    names = ranked(records)
+    title = (
+        f"{first.environment}, scenario {first.scenario} "
+        f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
+    )
+    # As many columns beside each other as fit.
+    tables = [_of_competitors(names, {**costs, **errors}, True)]
+    for control, parts in ((True, [costs, errors]), (False, [costs, errors]), (False, [costs, *_single(errors)])):
+        if all(_widest(table) <= width for table in tables):
+            break
+        tables = [_of_competitors(names, part, control and i == 0) for i, part in enumerate(parts)]
+    tables[0].title = title
     known = baselines_of(first.environment)
     told = {**known.references, **known.bounds}
     notes = [
@@ -135,9 +145,40 @@ def results_table(records: Sequence[Any]) -> Table:
         "significantly better.",
     ]
     notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
-    table.caption = "\n".join(notes)
-    table.caption_justify = "left"
+    tables[-1].caption = "\n".join(notes)
+    return tables
+
+
+def _single(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [{title: column} for title, column in columns.items()]
+
+
+def _of_competitors(
+    names: Sequence[tuple[str, str, str]], columns: Mapping[str, Callable[[str], str]], control: bool
+) -> Table:
+    """Return a table of what each competitor has in each column; references and bounds in sections of their own."""
+    table = Table(title_justify="left", caption_justify="left")
+    table.add_column("policy", overflow="fold")
+    if control:
+        table.add_column("control")
+    for title in columns:
+        table.add_column(title, justify="right")
+    section = "ranked"
+    for name, kind, steered in names:
+        if kind not in RANKED and kind != section:
+            table.add_section()
+            section = kind
+        told = steered if kind == "policy" else f"({kind})"
+        table.add_row(name, *([told] if control else []), *(column(name) for column in columns.values()))
     return table
+
+
+def _widest(table: Table) -> int:
+    """Columns that a table takes where nothing is folded."""
+    return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
+
+
+_MEASURING = Console(width=10_000, file=io.StringIO())
 
 
 def recorded_table(records: Sequence[Any]) -> Table:

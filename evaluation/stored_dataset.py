@@ -1,0 +1,72 @@
+"""Small datasets as JSON: curves and tracks, for whoever has neither NetCDF nor Python."""
+
+import reprlib
+from typing import Any
+
+import numpy
+import xarray
+
+from .stored import fits
+
+PARTS = ("coords", "variables", "attrs")
+
+
+def dataset_as_json(dataset: xarray.Dataset, digits: int) -> dict[str, Any]:
+    """Return a dataset of numbers and words as what JSON can say: as many significant digits, null for NaN."""
+
+    def said(values: numpy.ndarray) -> Any:
+        if values.dtype.kind != "f":
+            return values.tolist()
+        words = numpy.char.mod(f"%.{digits}g", values.ravel()).tolist()
+        numbers = [float(word) if word[-1] not in "nf" else None for word in words]
+        return {"shape": list(values.shape), "numbers": numbers}
+
+    def part(variables: Any) -> dict[str, Any]:
+        return {str(name): [list(v.dims), said(v.values)] for name, v in variables.items()}
+
+    return {
+        "coords": part(dataset.coords),
+        "variables": part(dataset.data_vars),
+        "attrs": {
+            str(name): value.item() if hasattr(value, "item") else value
+            for name, value in dataset.attrs.items()
+        },
+    }
+
+
+def dataset_from_json(stored: Any) -> xarray.Dataset:
+    """Return the dataset that :func:`dataset_as_json` has described.
+
+    Raises:
+        ValueError: if it is none: its parts do not fit together, or hold anything but numbers and words.
+    """
+    if not isinstance(stored, dict) or not all(isinstance(stored.get(part), dict) for part in PARTS):
+        raise ValueError(f"expected {', '.join(PARTS)} of a dataset, got {reprlib.repr(stored)}")
+
+    def read(name: str, entry: Any) -> tuple[list[str], numpy.ndarray]:
+        if not (isinstance(entry, list) and len(entry) == 2 and fits(entry[0], list[str])):
+            raise ValueError(f"{name!r} needs dimensions and values")
+        values = entry[1]
+        if isinstance(values, dict):
+            shape, numbers = values.get("shape"), values.get("numbers")
+            if (
+                not fits(shape, list[int])
+                or not fits(numbers, list[float | None])
+                or min(shape, default=0) < 0
+            ):
+                raise ValueError(f"{name!r} needs a shape and its numbers")
+            array = numpy.array(numbers, dtype=float).reshape(shape)
+        elif fits(values, list[str]) or fits(values, list[int]) or isinstance(values, str | int):
+            array = numpy.array(values)
+        else:
+            raise ValueError(f"{name!r} must hold numbers or words")
+        if array.ndim != len(entry[0]):
+            raise ValueError(f"{name!r} has {array.ndim} dimensions, and names {len(entry[0])}")
+        return entry[0], array
+
+    coords, variables = (
+        {name: read(name, entry) for name, entry in stored[part].items()} for part in PARTS[:2]
+    )
+    if not fits(stored["attrs"], dict[str, str | int | float]):
+        raise ValueError("attributes must be words or numbers")
+    return xarray.Dataset(variables, coords, stored["attrs"])

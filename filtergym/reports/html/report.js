@@ -1,0 +1,360 @@
+"use strict";
+// Figures are drawn when they are opened, from data packed in the page. Whatever the data name is text: `plain` keeps
+// Plotly from reading marks in it.
+(() => {
+  const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]; // Okabe and Ito
+  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  const words = (text) => plain(text).replace(/_/g, " ");
+  const root = document.documentElement;
+  const css = (name) => getComputedStyle(root).getPropertyValue(name).trim();
+
+  async function unpacked(script) {
+    const bytes = Uint8Array.from(atob(script.textContent.trim()), (c) => c.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Response(stream).json();
+  }
+
+  // --- a dataset: variables with names of their dimensions, numbers in row-major order
+
+  class Data {
+    constructor(stored) {
+      this.parts = new Map([...Object.entries(stored.coords), ...Object.entries(stored.variables)]);
+      this.attrs = new Map(Object.entries(stored.attrs));
+    }
+    has(name) { return this.parts.has(name); }
+    words(name) { const values = this.parts.get(name)[1]; return (Array.isArray(values) ? values : values.numbers).map(String); }
+    numbers(name) { const values = this.parts.get(name)[1]; return Array.isArray(values) ? values : values.numbers; }
+    // The last dimension of a variable at the given indices of those before.
+    row(name, ...indices) {
+      const { shape, numbers } = this.parts.get(name)[1];
+      const start = indices.reduce((at, index, i) => at * shape[i] + index, 0);
+      const length = shape.slice(indices.length).reduce((product, n) => product * n, 1);
+      return numbers.slice(start * length, (start + 1) * length);
+    }
+    get time() { return this.has("elapsed") ? this.numbers("elapsed") : this.numbers("time"); }
+    get clock() { return this.has("elapsed") ? "time, s" : "measurement"; }
+  }
+  const something = (values) => values.some((x) => x !== null);
+
+  // --- how lines look: kinds always alike, one colour for a name in all figures of an environment
+
+  function look(line) {
+    const style = { color: css("--soft"), width: 1, dash: "solid" };
+    if (line.origin === "paper") Object.assign(style, { color: css("--fg"), width: 2 });
+    else if (line.origin === "reference") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dash" });
+    else if (line.origin === "bound") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dot" });
+    else if (line.colour !== null && line.colour < COLOURS.length) Object.assign(style, { color: COLOURS[line.colour], width: line.origin === "learned" ? 2.6 : 1.6 });
+    return style;
+  }
+  const isGrey = (line) => !["paper", "reference", "bound"].includes(line.origin) && !(line.colour < COLOURS.length);
+  const faint = (colour) => {
+    const [r, g, b] = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
+    return `rgba(${r},${g},${b},0.16)`;
+  };
+
+  function layout(changes) {
+    const axis = { gridcolor: css("--line"), zerolinecolor: css("--soft"), linecolor: css("--line"), automargin: true };
+    const narrow = window.innerWidth < 640;
+    const { xaxis, yaxis, ...others } = changes;
+    return {
+      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+      font: { family: "system-ui, sans-serif", size: narrow ? 11 : 12, color: css("--fg") },
+      margin: { l: narrow ? 45 : 60, r: 10, t: 10, b: 45 }, height: narrow ? 380 : 400,
+      hoverlabel: { namelength: -1 },
+      legend: { orientation: "h", y: -0.22, yanchor: "top", itemclick: "toggleothers", itemdoubleclick: "toggle", groupclick: "togglegroup" },
+      xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...others,
+    };
+  }
+  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
+
+  // --- lines with bands; those that are the same are drawn once, with both names
+
+  function together(lines, of) {
+    const kept = new Map();
+    for (const line of lines) {
+      const values = of(line);
+      if (!values || !something(values.mid)) continue;
+      const key = JSON.stringify(values.mid);
+      if (kept.has(key)) kept.get(key).names.push(line.name);
+      else kept.set(key, { line, values, names: [line.name] });
+    }
+    return [...kept.values()];
+  }
+
+  function traces(lines, x, of, hover) {
+    const drawn = [];
+    // Grey ones first: they lie below.
+    for (const { line, values, names } of together(lines, of).sort((a, b) => isGrey(b.line) - isGrey(a.line))) {
+      const style = look(line), name = names.map(plain).join(" = "), group = plain(line.name);
+      if (values.low && !isGrey(line)) {
+        const fill = faint(style.color.length === 7 ? style.color : "#888888");
+        const edge = { x, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false, legendgroup: group };
+        drawn.push({ ...edge, y: values.low }, { ...edge, y: values.high, fill: "tonexty", fillcolor: fill });
+      }
+      drawn.push({ x, y: values.mid, mode: "lines", name, legendgroup: group, line: style, customdata: hover, opacity: isGrey(line) ? 0.6 : 1,
+        hovertemplate: hover ? "%{y:.4g} at measurement %{customdata}<extra>" + name + "</extra>" : "%{y:.4g}, %{x:.4g}<extra>" + name + "</extra>" });
+    }
+    return drawn;
+  }
+
+  // --- what each figure offers: choices, each a function that returns traces and layout
+
+  function overTime(cell, variable, indices, title, changes = {}) {
+    const { curves, lines } = cell;
+    const names = curves.words("policy");
+    const of = (line) => {
+      const at = [names.indexOf(line.name), ...indices];
+      const row = (ending) => curves.has(variable + ending) && curves.row(variable + ending, ...at);
+      return { mid: row(""), low: row("_low"), high: row("_high") };
+    };
+    const shapes = [];
+    if (curves.has("window")) {
+      const time = curves.numbers("time"), clock = curves.time;
+      const at = (number) => clock[Math.max(0, time.findIndex((t) => t >= number))];
+      const all = time[time.length - 1];
+      const [first, last] = [curves.numbers("window_first"), curves.numbers("window_last")];
+      curves.words("window").forEach((name, i) => {
+        if (last[i] - first[i] + 1 < 0.85 * all) shapes.push({ type: "rect", xref: "x", yref: "paper", x0: at(first[i]), x1: at(last[i]), y0: 0, y1: 1, line: { width: 0 }, fillcolor: css("--soft"), opacity: i % 2 ? 0.1 : 0.06, layer: "below", label: { text: words(name), textposition: "top center", font: { size: 10, color: css("--soft") } } });
+      });
+    }
+    return [traces(lines, curves.time, of, curves.numbers("time")), layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: title }, ...changes }, shapes })];
+  }
+
+  const logarithmic = { type: "log", exponentformat: "none", minorloglabels: "none", dtick: "D2" };
+
+  const FIGURES = {
+    ranking: (cell) => [["cost", () => dotted([["", "", cell.ranking]], null, cell.paper)]],
+    rmse: ({ curves, ...cell }) => curves.words("quantity").map((name, i) => [words(name), () =>
+      overTime({ curves, ...cell }, "rmse", [i], `RMSE of ${words(name)}, ${plain(curves.words("unit")[i])}`, logarithmic)]),
+    exceeded: ({ curves, lines }) => curves.words("quantity").map((name, i) => [words(name), () => {
+      const names = curves.words("policy"), share = curves.numbers("share");
+      const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null);
+      for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}<extra>" + trace.name + "</extra>"];
+      return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
+    }]),
+    consistency: (cell) => ["anees", "anis"].filter((name) => cell.curves.has(name)).map((name) => [name.slice(1).toUpperCase(), () => {
+      const { curves } = cell;
+      const names = curves.words("policy");
+      const drawn = traces(cell.lines, curves.time, (line) => ({ mid: curves.row(name, names.indexOf(line.name)) }), curves.numbers("time"));
+      const edge = { x: curves.time, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false };
+      const band = curves.has(name + "_low") ? [{ ...edge, y: curves.numbers(name + "_low") }, { ...edge, y: curves.numbers(name + "_high"), fill: "tonexty", fillcolor: "rgba(128,128,128,0.35)", name: "95 % of a consistent one", showlegend: true }] : [];
+      return [[...band, ...drawn], layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: `mean ${name.slice(1).toUpperCase()} over its dimension` }, ...logarithmic }, shapes: [{ type: "line", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 1, line: { color: css("--fg"), width: 1 } }] })];
+    }]),
+    steering: (cell) => {
+      const { curves } = cell, found = [];
+      if (curves.has("true_class_probability")) found.push(["weight of the true class", () => overTime(cell, "true_class_probability", [], "weight of the true class", { range: [-0.02, 1.02] })]);
+      for (const [variable, names, title] of [["gain", "gain_name", "gain"], ["action", "action_name", "action"], ["mode_probability", "mode", "probability"]]) {
+        if (!curves.has(variable)) continue;
+        curves.words(names).forEach((name, i) => found.push([`${title}: ${words(name)}`, () => overTime(cell, variable, [i], `${title}: ${words(name)}`, variable === "mode_probability" ? { range: [-0.02, 1.02] } : {})]));
+      }
+      return found;
+    },
+  };
+
+  function dotted(rows, lines, paper) {
+    // One row: a line for each competitor; several: a line for each scenario, competitors beside each other.
+    const single = lines === null;
+    const entries = single ? rows[0][2].map(([name, origin]) => ({ name, origin, colour: null })) : lines;
+    const drawn = entries.map((line, i) => {
+      const x = [], y = [], low = [], high = [], text = [];
+      rows.forEach(([scenario, role, found], row) => {
+        const entry = found.find(([name]) => name === line.name);
+        if (!entry) return;
+        const [, , value, from, to] = entry;
+        x.push(value); low.push(Math.max(value - from, 0)); high.push(Math.max(to - value, 0));
+        y.push(single ? plain(line.name) : row + 0.8 * ((i + 0.5) / entries.length - 0.5));
+        text.push(`${value.toFixed(1)} [${from.toFixed(1)}, ${to.toFixed(1)}] %${single ? "" : ", " + plain(scenario)}`);
+      });
+      const style = look(single && line.origin !== "paper" && line.origin !== "reference" ? { ...line, colour: line.origin === "learned" ? 0 : line.origin === "estimator" ? 2 : 1 } : line);
+      return { x, y, text, mode: "markers", name: plain(line.name), showlegend: !single, hovertemplate: "%{text}<extra>" + plain(line.name) + "</extra>",
+        marker: { color: style.color, size: single ? 8 : 7, symbol: { learned: "diamond", reference: "square-open", estimator: "triangle-up" }[line.origin] || "circle" },
+        error_x: { type: "data", symmetric: false, array: high, arrayminus: low, color: style.color, thickness: 1.2, width: 0 } };
+    });
+    // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
+    const values = drawn.flatMap((trace) => trace.x);
+    const range = [Math.max(-100, Math.min(...values, 0) * 1.15 - 3), Math.min(200, Math.max(...values, 5) * 1.1 + 3)];
+    const beyond = values.filter((x) => x > range[1]).length;
+    const narrow = window.innerWidth < 640;
+    const yaxis = single
+      ? { automargin: true, categoryorder: "array", categoryarray: entries.map((line) => plain(line.name)).reverse(), tickfont: { size: narrow ? 9 : 11 }, dtick: 1 }
+      : { tickvals: rows.map((_, i) => i), ticktext: rows.map(([scenario, role]) => `${plain(scenario)}<br><i>${plain(role)}</i>`), range: [rows.length - 0.5, -0.5], zeroline: false, tickfont: { size: narrow ? 9 : 11 } };
+    const shapes = single ? [] : rows.flatMap((_, i) => i % 2 ? [] : [{ type: "rect", xref: "paper", x0: 0, x1: 1, y0: i - 0.5, y1: i + 0.5, fillcolor: css("--soft"), opacity: 0.07, line: { width: 0 }, layer: "below" }]);
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? ` (${beyond} beyond the right edge)` : "");
+    const height = single ? Math.max(260, 70 + 19 * entries.length) : 140 + rows.length * Math.max(44, 11 * entries.length);
+    const legend = single ? {} : { legend: { ...layout({}).legend, y: 1.02, yanchor: "bottom" } };
+    return [drawn, layout({ xaxis: { title: { text: title }, range, zeroline: true, zerolinewidth: 2 }, yaxis, shapes, height, ...legend })];
+  }
+
+  // --- a track with a slider
+
+  function ellipse(x, y, xx, xy, yy) {
+    const mean = (xx + yy) / 2, root2 = Math.hypot((xx - yy) / 2, xy), angle = 0.5 * Math.atan2(2 * xy, xx - yy);
+    const [a, b] = [2 * Math.sqrt(Math.max(mean + root2, 0)), 2 * Math.sqrt(Math.max(mean - root2, 0))];
+    const points = Array.from({ length: 41 }, (_, i) => [a * Math.cos(i * Math.PI / 20), b * Math.sin(i * Math.PI / 20)]);
+    const [c, s] = [Math.cos(angle), Math.sin(angle)];
+    return { x: points.map(([u, v]) => x + c * u - s * v), y: points.map(([u, v]) => y + s * u + c * v) };
+  }
+  const minus = (a, b) => a.map((x, i) => (x === null || b[i] === null ? null : x - b[i]));
+  const upTo = (values, n) => values.slice(0, n + 1);
+  function extent(rows, share = 0.05) {
+    const all = rows.flat().filter((x) => x !== null);
+    const [low, high] = all.reduce(([l, h], x) => [Math.min(l, x), Math.max(h, x)], [Infinity, -Infinity]);
+    const margin = (high - low || 1) * share;
+    return [low - margin, high + margin];
+  }
+
+  function drawTrack(figure, cell) {
+    const { track, lines } = cell;
+    const names = track.words("policy"), components = track.words("component"), units = track.words("unit");
+    const plane = Number(track.attrs.get("plane")) === 1, time = track.time;
+    const shown = lines.filter((line) => names.includes(line.name) && !isGrey(line));
+    const box = figure.querySelector(".plot");
+    const panels = box.appendChild(Object.assign(document.createElement("div"), { className: "panels" }));
+    const [left, right] = [0, 1].map(() => panels.appendChild(document.createElement("div")));
+    const slider = Object.assign(document.createElement("input"), { type: "range", min: 0, max: time.length - 1, value: Math.floor(time.length / 2), step: 1 });
+    slider.setAttribute("aria-label", "time");
+    const output = document.createElement("output");
+    const bar = box.appendChild(Object.assign(document.createElement("div"), { className: "slider" }));
+    bar.append(slider, output);
+    let component = 0;
+    if (!plane && components.length > 1) addChoices(figure, components.map(words), (i) => { component = i; draw(); });
+    const state = (line, i) => track.row("estimate", names.indexOf(line.name), i);
+    const truth = (line, i) => track.has("truth") ? track.row("truth", names.indexOf(line.name), i) : state(line, i).map(() => null);
+    const seen = (i) => track.has("seen") ? track.row("seen", 0, i) : [];
+    const covariance = (line, i, j) => track.row("covariance", names.indexOf(line.name), i, j);
+    const marks = { color: css("--soft"), size: 5, symbol: "cross-thin-open" };
+
+    function drawPlane(n) {
+      const first = shown[0], [tx, ty] = [truth(first, 0), truth(first, 1)], [sx, sy] = [seen(0), seen(1)];
+      const path = (x, y, more) => ({ x, y, mode: "lines", ...more });
+      const overview = [
+        path(tx, ty, { name: "truth", line: { color: css("--soft"), width: 5 }, opacity: 0.45 }),
+        { x: upTo(sx, n), y: upTo(sy, n), mode: "markers", name: "measured", marker: marks },
+        ...shown.map((line) => path(upTo(state(line, 0), n), upTo(state(line, 1), n), { name: plain(line.name), line: look(line) })),
+      ];
+      const title = (i) => ({ title: { text: `${words(components[i])}, ${plain(units[i])}` } });
+      const rangeX = extent([tx, ...shown.map((line) => state(line, 0))]), rangeY = extent([ty, ...shown.map((line) => state(line, 1))]);
+      Plotly.react(left, overview, layout({ xaxis: { ...title(0), range: rangeX }, yaxis: { ...title(1), range: rangeY, scaleanchor: "x", constrain: "domain" }, uirevision: "track" }), config);
+      // A close-up around the truth: what errors and ellipses are like now.
+      const close = [{ x: [0], y: [0], mode: "markers", name: "truth", marker: { color: css("--fg"), size: 9, symbol: "x-thin-open" }, showlegend: false }];
+      if (sx.length && sx[n] !== null && tx[n] !== null) close.push({ x: [sx[n] - tx[n]], y: [sy[n] - ty[n]], mode: "markers", name: "measured", marker: { ...marks, size: 10 }, showlegend: false });
+      let reach = 0;
+      for (const line of shown) {
+        const [x, y] = [minus(state(line, 0), truth(line, 0)), minus(state(line, 1), truth(line, 1))];
+        if (x[n] === null) continue;
+        const P = [[0, 0], [0, 1], [1, 1]].map(([i, j]) => covariance(line, i, j));
+        const around = ellipse(x[n], y[n], P[0][n], P[1][n], P[2][n]), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
+        const errors = x.map((u, i) => Math.hypot(u, y[i])).filter(Number.isFinite).sort((a, b) => a - b);
+        reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.sqrt(Math.max(P[0][n], P[2][n])) / 1.5);
+        close.push(path(x.slice(Math.max(0, n - 12), n + 1), y.slice(Math.max(0, n - 12), n + 1), { line: { ...style, width: 1 }, opacity: 0.5, hoverinfo: "skip", ...group }),
+          path(around.x, around.y, { line: style, hoverinfo: "skip", ...group }),
+          { x: [x[n]], y: [y[n]], mode: "markers", marker: { color: style.color, size: 8 }, ...group });
+      }
+      const range = [-1.3 * reach || -1, 1.3 * reach || 1];
+      Plotly.react(right, close, layout({ xaxis: { title: { text: `error of ${words(components[0])}, ${plain(units[0])}` }, range, constrain: "domain" }, yaxis: { title: { text: `error of ${words(components[1])}, ${plain(units[1])}` }, range, scaleanchor: "x", constrain: "domain" } }), config);
+    }
+
+    function drawLine(n) {
+      const i = component, closed = shown.some((line) => JSON.stringify(truth(line, i)) !== JSON.stringify(truth(shown[0], i)));
+      const values = [], errors = [];
+      if (!closed && something(truth(shown[0], i))) values.push({ x: time, y: truth(shown[0], i), mode: "lines", name: "truth", line: { color: css("--soft"), width: 5 }, opacity: 0.45 });
+      if (!closed && seen(i).length && something(seen(i))) values.push({ x: upTo(time, n), y: upTo(seen(i), n), mode: "markers", name: "measured", marker: marks });
+      for (const line of shown) {
+        const style = look(line), group = { legendgroup: plain(line.name), name: plain(line.name) };
+        values.push({ x: upTo(time, n), y: upTo(state(line, i), n), mode: "lines", line: style, ...group });
+        const error = minus(state(line, i), truth(line, i)), sigma = covariance(line, i, i).map((v) => (v === null ? null : 2 * Math.sqrt(Math.max(v, 0))));
+        if (!something(error)) continue;
+        const edge = { x: upTo(time, n), mode: "lines", line: { width: 0.7, color: style.color, dash: "dot" }, hoverinfo: "skip", showlegend: false, ...group };
+        errors.push({ ...edge, y: upTo(sigma, n) }, { ...edge, y: upTo(sigma.map((v) => v === null ? null : -v), n) }, { x: upTo(time, n), y: upTo(error, n), mode: "lines", line: style, ...group, showlegend: false });
+      }
+      const unit = plain(units[i]), axis = { title: { text: track.clock }, range: extent([time], 0.02) };
+      const everything = shown.map((line) => state(line, i));
+      Plotly.react(left, values, layout({ xaxis: axis, yaxis: { title: { text: `${words(components[i])}, ${unit}` }, range: extent([...everything, seen(i)]) } }), config);
+      const sizes = shown.flatMap((line) => minus(state(line, i), truth(line, i))).filter((x) => x !== null).map(Math.abs).sort((a, b) => a - b);
+      const reach = 1.2 * (sizes[Math.floor(0.98 * (sizes.length - 1))] || 1);
+      Plotly.react(right, errors, layout({ xaxis: axis, yaxis: { title: { text: `error of ${words(components[i])}, ${unit}; dotted: two sigma` }, range: [-reach, reach] } }), config);
+    }
+
+    function draw() {
+      const n = Number(slider.value);
+      output.textContent = `${track.has("elapsed") ? `${time[n]} s, ` : ""}measurement ${track.numbers("time")[n]}`;
+      (plane ? drawPlane : drawLine)(n);
+    }
+    let asked = false;
+    slider.addEventListener("input", () => { if (!asked) { asked = true; requestAnimationFrame(() => { asked = false; draw(); }); } });
+    draw();
+    return draw;
+  }
+
+  // --- pages: choices, drawing, themes, sorting
+
+  function addChoices(figure, names, chosen) {
+    const box = figure.querySelector(".choices"), select = document.createElement("select");
+    select.setAttribute("aria-label", "what is shown");
+    names.forEach((name, i) => select.append(new Option(name.replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&"), i)));
+    select.addEventListener("change", () => chosen(Number(select.value)));
+    box.append(select);
+  }
+
+  const redraw = [];
+  function drawFigure(figure, cell) {
+    const kind = figure.dataset.kind, box = figure.querySelector(".plot");
+    if (kind === "track") return redraw.push(drawTrack(figure, cell));
+    const choices = kind === "dots" ? [["", () => dotted(cell.scenarios, cell.lines, cell.paper)]] : FIGURES[kind](cell);
+    let current = 0;
+    const draw = () => { const [drawn, laid] = choices[current][1](); return Plotly.react(box, drawn, laid, config); };
+    if (choices.length > 1) addChoices(figure, choices.map(([name]) => name), (i) => { current = i; draw(); });
+    if (choices.length) { draw(); redraw.push(draw); }
+  }
+
+  async function open(details) {
+    if (details.dataset.drawn) return;
+    details.dataset.drawn = "begun";
+    const cell = await unpacked(details.querySelector(":scope > script.data"));
+    cell.curves = cell.curves && new Data(cell.curves);
+    cell.track = cell.track && new Data(cell.track);
+    for (const figure of details.querySelectorAll("figure")) {
+      try { drawFigure(figure, cell); } catch (error) { figure.querySelector(".plot").textContent = `This figure cannot be drawn: ${error.message}`; console.error(error); }
+    }
+    details.dataset.drawn = "done";
+  }
+  for (const details of document.querySelectorAll("details.cell")) details.addEventListener("toggle", () => details.open && open(details));
+  const wide = new IntersectionObserver((seen) => seen.filter((entry) => entry.isIntersecting).forEach(async ({ target }) => {
+    wide.unobserve(target);
+    drawFigure(target, await unpacked(target.querySelector("script.data")));
+    target.dataset.drawn = "done";
+  }), { rootMargin: "300px" });
+  for (const figure of document.querySelectorAll("figure[data-kind=dots]")) wide.observe(figure);
+  const start = document.querySelector("details[data-start]");
+  if (start) start.open = true;
+  const linked = location.hash && document.getElementById(location.hash.slice(1));
+  if (linked && linked.matches("details.cell")) linked.open = true;
+
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const again = () => redraw.forEach((draw) => draw());
+  dark.addEventListener("change", again);
+  document.getElementById("theme").addEventListener("click", () => {
+    const now = root.dataset.theme || (dark.matches ? "dark" : "light");
+    root.dataset.theme = now === "dark" ? "light" : "dark";
+    again();
+  });
+
+  for (const table of document.querySelectorAll("table.sortable")) {
+    table.tHead.addEventListener("click", (event) => {
+      const head = event.target.closest("th");
+      if (!head) return;
+      const descending = head.getAttribute("aria-sort") === "ascending", column = head.cellIndex;
+      for (const other of head.parentNode.cells) other.removeAttribute("aria-sort");
+      head.setAttribute("aria-sort", descending ? "descending" : "ascending");
+      const number = head.classList.contains("number");
+      const value = (row) => row.cells[column].dataset.sort;
+      const order = (a, b) => {
+        const [u, v] = [value(a), value(b)];
+        if (u === undefined || v === undefined) return (u === undefined) - (v === undefined); // what is missing stands last
+        const less = number && !Number.isNaN(Number(u)) && !Number.isNaN(Number(v)) ? Number(u) - Number(v) : u.localeCompare(v);
+        return descending ? -less : less;
+      };
+      table.tBodies[0].append(...[...table.tBodies[0].rows].sort(order));
+    });
+  }
+})();

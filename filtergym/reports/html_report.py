@@ -1,0 +1,291 @@
+"""One self-contained page from a file of results: it opens offline, and executes nothing of what the file says.
+
+Whatever stands in the file is text: the template escapes it, the figures' data are packed, and the page's content
+security policy runs two scripts only, the page's own and Plotly's, by their hashes.
+"""
+
+import base64
+import gzip
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import markupsafe
+from plotly.offline import get_plotlyjs
+
+from ..evaluation.competitors import RANKED
+from ..evaluation.metrics import Record
+from ..evaluation.stored_dataset import dataset_as_json
+from .headline import consistency_word, headline
+from .ranking import origin, ranking_sentence, verdict
+from .results import CURVE_DIGITS, TRACK_DIGITS, Result, Settings
+from .tables import against_paper, main_components, ranked, score_text, with_interval
+
+HTML = Path(__file__).parent / "html"
+
+
+class Entry(NamedTuple):
+    """One cell of a table."""
+
+    text: str
+    sorted_by: float | str | None = None
+    """None: stands last, whatever the order."""
+
+
+def report_html(results: Sequence[Result], settings: Settings) -> str:
+    """Return the page.
+
+    Args:
+        results: of any environments and scenarios.
+        settings: how they were made.
+
+    Raises:
+        ValueError: if there are none.
+    """
+    if not results:
+        raise ValueError("there are no results to report")
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(HTML), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters["marked"] = _marked
+    script, plotly = (HTML / "report.js").read_text(encoding="utf-8"), get_plotlyjs()
+    groups: dict[str, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result.environment, []).append(result)
+    environments = [
+        {
+            "id": id,
+            "anchor": f"e{number}",
+            "dots": _packed(_dots(group)) if len(group) > 1 else None,
+            "paper": group[0].paper,
+            "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
+        }
+        for number, (id, group) in enumerate(groups.items())
+    ]
+    return environment.get_template("report.html.jinja").render(
+        verdict=verdict(results),
+        headline=headline(results),
+        environments=environments,
+        settings=settings,
+        first=results[0].records[0],
+        style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),  # noqa: S704
+        script=markupsafe.Markup(script),
+        plotly=markupsafe.Markup(plotly),
+        hashes=[_hash(plotly), _hash(script)],
+    )
+
+
+def _hash(script: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _packed(values: Any) -> str:
+    """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
+    text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
+
+
+def _marked(text: str) -> markupsafe.Markup:
+    """Words between backticks as code, everything escaped."""
+    parts = re.split(r"`([^`]*)`", text)
+    pieces = [
+        markupsafe.Markup("<code>{}</code>").format(part) if i % 2 else markupsafe.escape(part)
+        for i, part in enumerate(parts)
+    ]
+    return markupsafe.Markup("").join(pieces)
+
+
+def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any]:
+    """What the template shows of an environment in a scenario."""
+    first = result.records[0]
+    header, rows = _table(result)
+    return {
+        "anchor": anchor,
+        "result": result,
+        "episodes": first.episodes,
+        "split": first.split,
+        "seed": first.seed,
+        "sentence": ranking_sentence(result.records, result.learned, result.paper),
+        "header": header,
+        "rows": rows,
+        "figures": _figures(result),
+        "data": _packed(
+            {
+                "lines": _lines(result, group),
+                "paper": result.paper,
+                "ranking": _differences(result),
+                "curves": None if result.curves is None else dataset_as_json(result.curves, CURVE_DIGITS),
+                "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS),
+            }
+        ),
+    }
+
+
+def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
+    """Header and rows of every competitor, lowest cost first; references and bounds last."""
+    records = result.records
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    shown = main_components(records)
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+
+    def number(name: str, metric: str, component: str, scale: float = 1.0) -> Entry:
+        record = found.get((name, metric, component, "all"))
+        text = with_interval(record, scale, negligible=0.005 if scale == 100.0 else 0.0)
+        return Entry(text, None if record is None else record.value)
+
+    header = ["competitor", "origin", "control", f"cost against {result.paper or 'paper'}, %", "median, %", "wins, %"]
+    header += ["ANEES", "covariance", "score", *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown)]
+    rows = []
+    for name, kind, control in ranked(records):
+        median, wins = against_paper(found, name)
+        nees = found.get((name, "anees", "state", "all"))
+        value = None if nees is None else nees.value
+        score = found.get((name, "score", "", "all"))
+        rows.append(
+            [
+                Entry(name, name),
+                Entry(origin(result, name, kind), origin(result, name, kind)),
+                Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
+                number(name, "relative_cost_difference", "", 100.0),
+                Entry(median, _number(median)),
+                Entry(wins, _number(wins)),
+                Entry("-" if value is None else f"{value:.3g}", value),
+                Entry(consistency_word(value), consistency_word(value)),
+                Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
+                *(number(name, "rmse", component) for component in shown),
+            ]
+        )
+    return header, rows
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text.replace(",", ""))
+    except ValueError:
+        return None
+
+
+def _differences(result: Result) -> list[list[Any]]:
+    """Name, and cost against the paper's algorithm with its interval in percent, of the ranked and the reference."""
+    found: dict[str, Record] = {
+        r.policy: r for r in result.records if (r.metric, r.window) == ("relative_cost_difference", "all")
+    }
+    rows = []
+    for name, kind, _ in ranked(result.records):
+        record = found.get(name)
+        if record is None or record.value is None or (kind not in RANKED and name != result.reference):
+            continue
+        low, high = (record.value if end is None else end for end in (record.low, record.high))
+        rows.append([name, origin(result, name, kind), *(100.0 * x for x in (record.value, low, high))])
+    return rows
+
+
+def _dots(group: Sequence[Result]) -> dict[str, Any]:
+    """What the picture over all scenarios of an environment shows: the competitors of the first one's curves."""
+    return {
+        "paper": group[0].paper,
+        "lines": [line for line in _lines(group[0], group) if line["origin"] != "bound"],
+        "scenarios": [
+            [result.scenario, "training" if result.training else "held out", _differences(result)]
+            for result in group
+        ],
+    }
+
+
+def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
+    """Name, origin and colour of what is drawn; a name has the same colour in all scenarios of its environment."""
+    names: dict[str, str] = {}
+    for one in [*(other for other in group if other.default), *group]:
+        kinds = {record.policy: record.kind for record in one.records}
+        present = [] if one.curves is None else [str(name) for name in one.curves["policy"].values.tolist()]
+        for name in present:
+            names.setdefault(name, origin(one, name, kinds.get(name, "policy")))
+    coloured = [name for name, where in names.items() if where not in ("paper", "reference", "bound")]
+    own = names if result.curves is None else map(str, result.curves["policy"].values.tolist())
+    return [
+        {
+            "name": name,
+            "origin": names[name],
+            "colour": coloured.index(name) if name in coloured else None,
+        }
+        for name in own
+    ]
+
+
+def _figures(result: Result) -> list[dict[str, str]]:
+    """Figures of a scenario: what each is called, what it shows in words, and what reads it instead of looking."""
+    found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
+    order = [name for name, kind, _ in ranked(result.records) if kind in RANKED]
+
+    def told(metric: str, component: str, names: Sequence[str]) -> str:
+        parts = []
+        for name in names:
+            record = found.get((name, metric, component))
+            if record is not None and record.value is not None:
+                parts.append(f"{name} {record.value:.3g}{'' if record.unit == '1' else ' ' + record.unit}")
+        return ", ".join(parts)
+
+    figures = [
+        {
+            "kind": "ranking",
+            "title": f"Cost against {result.paper or 'the paper'}",
+            "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
+            "alternative": "The table above holds these numbers.",
+        }
+    ]
+    if result.curves is not None and "rmse" in result.curves:
+        component = str(result.curves["quantity"].values[0])
+        figures += [
+            {
+                "kind": "rmse",
+                "title": "Error over time",
+                "text": "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second "
+                "one all again.",
+                "alternative": f"RMSE of {component} over the whole run: {told('rmse', component, order[:6])}.",
+            },
+            {
+                "kind": "exceeded",
+                "title": "Distribution of errors",
+                "text": "Share of measurements whose error is larger.",
+                "alternative": f"Largest RMSE at any time: {told('peak_rmse', component, order[:6])}.",
+            },
+        ]
+    if result.curves is not None and {"anees", "anis"} & set(result.curves):
+        figures.append(
+            {
+                "kind": "consistency",
+                "title": "Consistency",
+                "text": "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is "
+                "consistent; the band holds 95 % of a consistent estimator's (chi-square).",
+                "alternative": f"Mean NEES over its dimension: {told('anees', 'state', order[:6])}.",
+            }
+        )
+    if result.curves is not None and STEERED & set(result.curves):
+        figures.append(
+            {
+                "kind": "steering",
+                "title": "Gains, weights and actions over time",
+                "text": "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten episodes of "
+                "an action or a gain.",
+                "alternative": "What each competitor steers, and how, says the page of the environment.",
+            }
+        )
+    if result.track is not None:
+        figures.append(
+            {
+                "kind": "track",
+                "title": "A track to look at",
+                "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, what was "
+                "measured, estimates, and their covariances at two standard deviations. Move the slider.",
+                "alternative": "An animation of one episode; its numbers are in the table above, over all episodes.",
+            }
+        )
+    return figures
+
+
+STEERED = {"mode_probability", "true_class_probability", "action", "gain"}
+"""Curves of what competitors do."""

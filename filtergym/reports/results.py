@@ -1,0 +1,252 @@
+"""Results of a benchmark or an evaluation in one file, from which a report can be made anywhere.
+
+The file holds numbers and names: who reads it executes nothing of it, and needs none of its environments.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from platform import python_version
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ..evaluation.competitors import RANKED
+from ..evaluation.files import write_text
+from ..evaluation.metrics import Record
+from ..evaluation.stored import read_json, restored
+from ..evaluation.stored_dataset import dataset_as_json, dataset_from_json
+
+FORMAT = 1
+LIBRARIES = ("filtergym", "numpy", "scipy", "gymnasium", "xarray", "llvmlite")
+"""Whose versions a file tells."""
+MOST_SHOWN = 10
+"""Competitors of which a file holds curves and a track; all have their records."""
+MOST_TIMES = 120
+"""Times of a curve; of more, these are spread over the episode."""
+TRACK_TIMES = 240
+CURVE_DIGITS, TRACK_DIGITS = 4, 7
+"""Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
+
+
+class Settings(NamedTuple):
+    """How results were made."""
+
+    command: str
+    """That makes them again."""
+    versions: dict[str, str]
+    """Of Python and the libraries."""
+
+
+class Result(NamedTuple):
+    """One environment in one scenario."""
+
+    environment: str
+    scenario: str
+    description: str
+    """Of the scenario, in words."""
+    default: bool
+    """Whether it is the environment's training distribution."""
+    training: bool
+    """Whether agents may be trained in it."""
+    paper: str
+    """Name of the paper's algorithm; empty where there is none."""
+    reference: str
+    """Name of the reference whose score is 1; empty where there is none."""
+    learned: list[str]
+    """Names of the competitors that were learned."""
+    knows: dict[str, str]
+    """What references and bounds know, by their names."""
+    notes: list[str]
+    """What was left out, in sentences."""
+    records: list[Record]
+    curves: xarray.Dataset | None
+    """See :func:`.evaluation.curves.curves_of`, of the competitors that are shown."""
+    track: xarray.Dataset | None
+    """Of one episode, see :func:`track_of`."""
+
+    @property
+    def name(self) -> str:
+        """Environment without its namespace and version, and scenario."""
+        return f"{self.short} {self.scenario}"
+
+    @property
+    def short(self) -> str:
+        """Environment without its namespace and version."""
+        return self.environment.rpartition("/")[2].removesuffix("-v0")
+
+
+def settings_of(command: str) -> Settings:
+    """Return a command with the versions of what runs it."""
+    versions = {"Python": python_version()}
+    for library in LIBRARIES:
+        try:
+            versions[library] = metadata.version(library)
+        except metadata.PackageNotFoundError:
+            continue
+    return Settings(command, versions)
+
+
+def shown_competitors(
+    records: Sequence[Record], paper: str, reference: str, learned: Sequence[str]
+) -> list[str]:
+    """Return at most ``MOST_SHOWN`` names whose curves tell most.
+
+    The paper's algorithm, the reference, the learned, the cheapest of each kind, a bound; then by cost.
+    """
+    cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
+    kinds = {r.policy: r.kind for r in records}
+
+    def place(name: str) -> float:
+        value = cost.get(name)
+        return math.inf if value is None else value
+
+    by_cost = sorted((name for name in kinds if kinds[name] in RANKED), key=place)
+    classical = [name for name in by_cost if name not in learned and name != paper]
+    first = [name for kind in RANKED for name in [n for n in classical if kinds[n] == kind][:2]]
+    bounds = [name for name in kinds if kinds[name] == "bound"]
+    wanted = [paper, reference, *first, *(n for n in by_cost if n in learned), *bounds[:1], *by_cost]
+    return list(dict.fromkeys(name for name in wanted if name in kinds))[:MOST_SHOWN]
+
+
+def spread(count: int, most: int) -> numpy.ndarray:
+    """Return at most ``most`` indices of ``count``, spread evenly, with the first and the last."""
+    return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
+
+
+def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) -> xarray.Dataset:
+    """Return the first episode of an evaluation with tracks: what was true, measured and estimated.
+
+    Args:
+        dataset: from an evaluation with ``tracks=True``.
+        components: that are drawn.
+        plane: whether the first two of them are the axes of a plane.
+
+    Returns:
+        ``truth`` and ``seen`` (component, time), where they are known; ``estimate`` (policy, component, time) and
+        ``covariance`` (policy, component, other_component, time).
+    """
+    names = list(components)
+    # A bound estimates nothing.
+    present = [
+        name
+        for name in dataset["policy"].values.tolist()
+        if not numpy.isnan(dataset["estimate"].sel(policy=name).values[0]).all()
+    ]
+    episode = dataset.sel(policy=present).isel(episode=0).sel(component=names)
+    there = numpy.flatnonzero(numpy.isfinite(episode["estimate"].values).any(axis=(0, 2)))
+    episode = episode.isel(time=slice(0, int(there[-1]) + 1))
+    episode = episode.isel(time=spread(episode.sizes["time"], TRACK_TIMES))
+    which = [dataset["component"].values.tolist().index(name) for name in names]
+    kept = {
+        "estimate": episode["estimate"].transpose("policy", "component", "time"),
+        "covariance": episode["covariance"]
+        .isel(other_component=which)
+        .transpose("policy", "component", "other_component", "time"),
+    }
+    for name in ("truth", "seen"):
+        if name in episode:
+            # In a closed loop every competitor flies a truth of its own.
+            kept[name] = episode[name].transpose("policy", "component", "time")
+    found = xarray.Dataset(
+        {name: values.drop_vars("episode_seed", errors="ignore") for name, values in kept.items()}
+    )
+    found = found.drop_vars(["episode", "mode", "flight", "length"], errors="ignore")
+    found.attrs = {"plane": int(plane), "seed": str(episode["episode_seed"].values)}
+    return found
+
+
+def drawn_components(
+    groups: Mapping[str, Sequence[str]], components: Sequence[str]
+) -> tuple[list[str], bool]:
+    """Return what a track is drawn of: two components of a group that has several, as a plane; else the first three."""
+    for parts in groups.values():
+        if len(parts) > 1:
+            return list(parts[:2]), True
+    return list(components[:3]), False
+
+
+def write_results(path: Path, results: Iterable[Result], settings: Settings) -> None:
+    """Write results, whole or not at all.
+
+    Raises:
+        ValueError: if the file cannot be written.
+    """
+    parts = [json.dumps(_as_json(result), allow_nan=False) for result in results]
+    head = json.dumps({"format": FORMAT, "settings": settings._asdict()})
+    write_text(path, f'{head[:-1]}, "results": [\n' + ",\n".join(parts) + "\n]}\n")
+
+
+def _as_json(result: Result) -> dict[str, Any]:
+    return {
+        **result._asdict(),
+        "records": [record._asdict() for record in result.records],
+        "curves": None if result.curves is None else dataset_as_json(result.curves, CURVE_DIGITS),
+        "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS),
+    }
+
+
+def read_results(path: Path) -> tuple[list[Result], Settings]:
+    """Read what :func:`write_results` has written, or say why not.
+
+    Args:
+        path: of the file, or of the folder where it is called ``results.json``.
+
+    Raises:
+        ValueError: if it holds anything else.
+    """
+    path = path / "results.json" if path.is_dir() else path
+    try:
+        values = read_json(path)
+        if not isinstance(values, dict) or values.get("format") != FORMAT:
+            raise ValueError("it is no file of results, or one of another version of filtergym")
+        settings = restored(Settings, values.get("settings"))
+        if not isinstance(values.get("results"), list):
+            raise ValueError("it holds no list of results")
+        return [_restored(fields) for fields in values["results"]], settings
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot read the results in {path}: {error}") from error
+
+
+def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
+    """Read several files of results as one.
+
+    Raises:
+        ValueError: if one cannot be read, or they hold a scenario twice.
+    """
+    read = [read_results(path) for path in paths]
+    results = [result for found, _ in read for result in found]
+    names = [(result.environment, result.scenario) for result in results]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{' '.join(map(str, paths))} hold the same environment and scenario more than once")
+    commands = dict.fromkeys(settings.command for _, settings in read)
+    return results, Settings("\n".join(commands), read[0][1].versions)
+
+
+def _restored(fields: Any) -> Result:
+    if not isinstance(fields, dict) or not isinstance(fields.get("records"), list):
+        raise ValueError("a result needs its fields, and a list of records among them")
+    records = [restored(Record, record) for record in fields["records"]]
+    for record in records:
+        check_numbers(record)
+    datasets = {
+        name: None if fields.get(name) is None else dataset_from_json(fields[name])
+        for name in ("curves", "track")
+    }
+    result = restored(Result, {**fields, "records": records, **datasets})
+    if not records:
+        raise ValueError("a result holds no records")
+    if any((r.environment, r.scenario) != (result.environment, result.scenario) for r in records):
+        raise ValueError("a result holds records of another environment or scenario")
+    return result
+
+
+def check_numbers(record: Record) -> None:
+    """Raise ValueError unless value and interval of a record are finite, or None."""
+    numbers = (record.value, record.low, record.high)
+    finite = all(number is None or math.isfinite(number) for number in numbers)
+    if not finite or (record.low is None) != (record.high is None):
+        raise ValueError(f"value and interval must be finite or null, got {numbers}")
