@@ -22,6 +22,8 @@ from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
 
+LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
+"""Names of blocks of an observation that show the action before."""
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
@@ -155,7 +157,8 @@ def evaluate(
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
         truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
-        ``mode_probability``), and ``mean_square`` of bounds. Coordinates: ``unit`` and ``group`` of every component,
+        ``mode_probability``), ``mean_square`` of bounds, and ``action`` (also over action_name) of policies whose
+        action is a box. Coordinates: ``unit`` and ``group`` of every component,
         ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
         number), ``window_first`` and ``window_last`` of every window, and ``elapsed``, seconds since the start of the
         track, where measurements come regularly. Of a set of flights ``flight`` and ``length`` say which each episode
@@ -214,6 +217,7 @@ def evaluate(
                 tick,
                 name,
                 i,
+                actions=True,
             )
             for i in range(0, episodes, CHUNK)
         ]
@@ -283,6 +287,47 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     return ["mode" if "mode" in key else key]
 
 
+def action_names(task: Task, count: int) -> tuple[str, ...]:
+    """Names of the components of a box of actions.
+
+    As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
+    for each; else the control, with numbers from 1 on where there are several.
+    """
+    shown = [block.parts for block in task.bank.blocks if block.name in LAST_ACTIONS]
+    for names in (*shown, task.modes):
+        # A number alone says less than the hypothesis's name.
+        if len(names) == count and not any(str(name).isdigit() for name in names):
+            return tuple(str(name).replace("-", "_") for name in names)
+    return tuple(f"{task.control}_{i + 1}" for i in range(count)) if count > 1 else (task.control,)
+
+
+def _actions_named(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
+    controls: Mapping[str, str],
+    tasks: Mapping[str, Task],
+) -> dict[str, tuple[str, ...]]:
+    """Names of the actions of every policy that has any; of their control too, where they steer by several."""
+    acting = [name for name, series in per_policy.items() if "action" in series]
+    several = len({controls[name] for name in acting}) > 1
+    found = {name: action_names(tasks[name], per_policy[name]["action"].shape[-1]) for name in acting}
+    if several:
+        return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
+    return found
+
+
+def _actions_aligned(
+    per_policy: Mapping[str, Mapping[str, numpy.ndarray]], actions: Mapping[str, tuple[str, ...]]
+) -> numpy.ndarray:
+    """Actions side by side, ``(policy, episode, time, name)``; NaN where a policy does not steer by that."""
+    every = list(dict.fromkeys(sum(actions.values(), ())))
+    episodes, length = per_policy[next(iter(actions))]["action"].shape[:2]
+    aligned = numpy.full((len(per_policy), episodes, length, len(every)), numpy.nan)
+    for i, (name, series) in enumerate(per_policy.items()):
+        if name in actions:
+            aligned[i][..., [every.index(part) for part in actions[name]]] = series["action"]
+    return aligned
+
+
 def _dataset(
     per_policy: dict[str, dict[str, numpy.ndarray]],
     kinds: Mapping[str, str],
@@ -299,7 +344,14 @@ def _dataset(
     components = [c.name for c in task.components]
     times = numpy.arange(1, task.horizon + 1)
     variables: dict[str, Any] = {}
+    actions = _actions_named(per_policy, controls, tasks)
     for key in sorted({key for series in per_policy.values() for key in series}):
+        if key == "action":
+            variables[key] = (
+                ["policy", "episode", "time", "action_name"],
+                _actions_aligned(per_policy, actions),
+            )
+            continue
         example = next(series[key] for series in per_policy.values() if key in series)
         stacked = numpy.full((len(names), *example.shape), numpy.nan)
         for i, name in enumerate(names):
@@ -341,4 +393,6 @@ def _dataset(
     dataset = with_windows(dataset, windows)
     if "mode_probability" in dataset:
         dataset = dataset.assign_coords(mode=list(task.modes))
+    if actions:
+        dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
     return dataset

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy
 
 from ..compiler.functions import mapped, padded_width
@@ -42,6 +43,7 @@ def run_policy(
     record: Callable[[Any], None],
     tick: Progress,
     report: Report = lambda task, episode: episode,
+    acted: Callable[[Array], None] | None = None,
 ) -> None:
     """Run a policy over one episode for each seed.
 
@@ -52,6 +54,7 @@ def run_policy(
         record: called after every action with the report on it; lanes beyond ``len(seeds)`` are padding.
         report: function of the task and the state after the action; default: the state itself.
         tick: told of progress.
+        acted: called after every ``record`` with the actions applied to the same measurement, batch first.
     """
     lanes = started_lanes(task, seeds)
     stepping = SteppingPolicy(task, policy)
@@ -60,6 +63,8 @@ def run_policy(
         action, memory = stepping.predict(lanes.observe(), memory)
         for found, _ in lanes.decide(action, report):
             record(found)
+            if acted is not None:
+                acted(action)
         tick(lanes.count * task.decision_interval)
 
 
@@ -251,6 +256,7 @@ def run_competitor(
     tick: Progress = lambda measurements: None,
     name: str = "competitor",
     first_episode: int = 0,
+    actions: bool = False,
 ) -> dict[str, numpy.ndarray]:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -264,6 +270,8 @@ def run_competitor(
         tick: likewise.
         name: of the competitor, in errors.
         first_episode: number of the first episode, in errors.
+        actions: of a policy whose action is a box, report too what was applied: ``action``, ``(episodes, time, A)``,
+            within the limits of the box, as every bank takes it.
 
     Returns:
         Arrays ``(episodes, time, ...)`` by name; of a bound its ``mean_square``.
@@ -280,8 +288,15 @@ def run_competitor(
     def record(episode: Episode) -> None:
         keep_all(task.run(report, episode))
 
+    space: Any = task.action_space
+
+    def keep_action(action: Array) -> None:
+        bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), space.low, space.high)
+        keep("action", bounded.reshape(len(seeds), -1).T)
+
     if kind == "policy":
-        run_policy(task, competitor, seeds, keep_all, tick, report)
+        acted = keep_action if actions and isinstance(space, gymnasium.spaces.Box) else None
+        run_policy(task, competitor, seeds, keep_all, tick, report, acted)
     elif kind == "estimator":
         run_estimator(task, competitor, seeds, record, tick, name, first_episode)
     elif kind == "reference":
