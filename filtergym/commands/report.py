@@ -23,7 +23,8 @@ from .terminal import Environment, Episodes, Experiment, Split, Trust, console, 
 
 def make(
     results: Annotated[
-        list[Path], typer.Argument(help="Files of results, or folders that hold one; several make one report.")
+        list[Path],
+        typer.Argument(help="Files of results, or folders that hold one; several make one report."),
     ],
     out: Annotated[Path, typer.Option(help="HTML file.")] = Path(REPORT),
 ) -> None:

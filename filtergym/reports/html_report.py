@@ -28,6 +28,10 @@ from .tables import against_paper, main_components, ranked, score_text, with_int
 HTML = Path(__file__).parent / "html"
 
 
+WORDS = ("competitor", "covariance", "origin", "control")
+"""Columns that hold no numbers."""
+
+
 class Entry(NamedTuple):
     """One cell of a table."""
 
@@ -71,8 +75,9 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         headline=headline(results),
         environments=environments,
         settings=settings,
+        words=WORDS,
         first=results[0].records[0],
-        style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),  # noqa: S704
+        style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),
         script=markupsafe.Markup(script),
         plotly=markupsafe.Markup(plotly),
         hashes=[_hash(plotly), _hash(script)],
@@ -137,8 +142,9 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
         text = with_interval(record, scale, negligible=0.005 if scale == 100.0 else 0.0)
         return Entry(text, None if record is None else record.value)
 
-    header = ["competitor", "origin", "control", f"cost against {result.paper or 'paper'}, %", "median, %", "wins, %"]
-    header += ["ANEES", "covariance", "score", *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown)]
+    against = f"cost against {result.paper or 'paper'}, %"
+    header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
+    header += [*(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown), "origin", "control"]
     rows = []
     for name, kind, control in ranked(records):
         median, wins = against_paper(found, name)
@@ -148,8 +154,6 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
         rows.append(
             [
                 Entry(name, name),
-                Entry(origin(result, name, kind), origin(result, name, kind)),
-                Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
                 number(name, "relative_cost_difference", "", 100.0),
                 Entry(median, _number(median)),
                 Entry(wins, _number(wins)),
@@ -157,6 +161,8 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(consistency_word(value), consistency_word(value)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
                 *(number(name, "rmse", component) for component in shown),
+                Entry(origin(result, name, kind), origin(result, name, kind)),
+                Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
             ]
         )
     return header, rows
@@ -204,7 +210,11 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
         present = [] if one.curves is None else [str(name) for name in one.curves["policy"].values.tolist()]
         for name in present:
             names.setdefault(name, origin(one, name, kinds.get(name, "policy")))
-    coloured = [name for name, where in names.items() if where not in ("paper", "reference", "bound")]
+    # Learned ones first: there are fewer colours than names.
+    coloured = sorted(
+        (name for name, where in names.items() if where not in ("paper", "reference", "bound")),
+        key=lambda name: names[name] != "learned",
+    )
     own = names if result.curves is None else map(str, result.curves["policy"].values.tolist())
     return [
         {
@@ -269,8 +279,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
             {
                 "kind": "steering",
                 "title": "Gains, weights and actions over time",
-                "text": "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten episodes of "
-                "an action or a gain.",
+                "text": "Mean over episodes; bands hold 95 % of the mean of a probability, and eight of ten "
+                "episodes of an action or a gain.",
                 "alternative": "What each competitor steers, and how, says the page of the environment.",
             }
         )
@@ -279,8 +289,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
             {
                 "kind": "track",
                 "title": "A track to look at",
-                "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, what was "
-                "measured, estimates, and their covariances at two standard deviations. Move the slider.",
+                "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, "
+                "what was measured, estimates, and their covariances at two standard deviations. Move the slider.",
                 "alternative": "An animation of one episode; its numbers are in the table above, over all episodes.",
             }
         )

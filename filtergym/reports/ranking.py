@@ -125,22 +125,26 @@ def verdict(results: Sequence[Result]) -> list[str]:
         was_learned = first.role == "learned"
         rival = next((place for place in others if (place.role == "learned") != was_learned), None)
         if not result.learned or rival is None:
-            outcome = "no learned agent took part"
+            outcome = "No learned agent takes part"
         elif rival.behind is not None and (rival.behind.low or 0.0) <= 0.0:
-            outcome = "nobody is significantly best"
+            outcome = "Learned and classical competitors do not differ significantly"
         else:
-            outcome = "a learned agent costs least" if was_learned else "a classical competitor costs least"
-        won.setdefault(outcome, []).append(f"{result.short} (`{first.name}`)")
-    where = "on the training distribution" if any(result.default for result in judged) else ""
+            outcome = (
+                f"A {'learned agent' if was_learned else 'classical competitor'} costs significantly least"
+            )
+        won.setdefault(outcome, []).append(f"{result.short} (lowest: `{first.name}`)")
     for outcome, names in won.items():
-        sentences.append(f"{outcome[0].upper()}{outcome[1:]} {where} of {', '.join(names)}.".replace("  ", " "))
+        sentences.append(f"{outcome} in {len(names)} of {len(judged)}: {', '.join(names)}.")
+    if won and any(result.default for result in judged):
+        sentences[0] = f"On the training distributions: {sentences[0][0].lower()}{sentences[0][1:]}"
     harmful = [harm for result in results for harm in _harms(result)]
     agents = {(result.environment, name) for result in results for name in result.learned}
     if agents:
         cells = sum(len(result.learned) for result in results)
         sentences.append(
-            f"Learned agents cost more than {100.0 * HARM:g} % above the paper's algorithm in {len(harmful)} of {cells} "
-            "cases (agents times scenarios)" + (f"; worst: {max(harmful)[1]}." if harmful else ".")
+            f"Learned agents cost more than {100.0 * HARM:g} % above the paper's algorithm, significantly, in "
+            f"{len(harmful)} of {cells} cases (agent and scenario)"
+            + (f"; worst: {max(harmful)[1]}." if harmful else ".")
         )
     off = [
         f"`{name}` in {result.short} ({_nees(result, name):.2g})"

@@ -131,7 +131,11 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
     )
     # As many columns beside each other as fit.
     tables = [_of_competitors(names, {**costs, **errors}, True)]
-    for control, parts in ((True, [costs, errors]), (False, [costs, errors]), (False, [costs, *_single(errors)])):
+    for control, parts in (
+        (True, [costs, errors]),
+        (False, [costs, errors]),
+        (False, [costs, *_single(errors)]),
+    ):
         if all(_widest(table) <= width for table in tables):
             break
         tables = [_of_competitors(names, part, control and i == 0) for i, part in enumerate(parts)]

@@ -59,13 +59,14 @@
     return {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: "system-ui, sans-serif", size: narrow ? 11 : 12, color: css("--fg") },
-      margin: { l: narrow ? 45 : 60, r: 10, t: 10, b: 45 }, height: narrow ? 380 : 400,
+      margin: { l: narrow ? 45 : 60, r: 10, t: 10, b: 45 }, height: narrow ? 430 : 440,
       hoverlabel: { namelength: -1 },
+      modebar: { bgcolor: "rgba(0,0,0,0)", color: css("--soft"), activecolor: css("--fg") },
       legend: { orientation: "h", y: -0.22, yanchor: "top", itemclick: "toggleothers", itemdoubleclick: "toggle", groupclick: "togglegroup" },
       xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...others,
     };
   }
-  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
+  const config = { displayModeBar: window.innerWidth < 640 ? false : "hover", responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
 
   // --- lines with bands; those that are the same are drawn once, with both names
 
@@ -86,7 +87,7 @@
     // Grey ones first: they lie below.
     for (const { line, values, names } of together(lines, of).sort((a, b) => isGrey(b.line) - isGrey(a.line))) {
       const style = look(line), name = names.map(plain).join(" = "), group = plain(line.name);
-      if (values.low && !isGrey(line)) {
+      if (values.low && !isGrey(line) && !["reference", "bound"].includes(line.origin)) {
         const fill = faint(style.color.length === 7 ? style.color : "#888888");
         const edge = { x, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false, legendgroup: group };
         drawn.push({ ...edge, y: values.low }, { ...edge, y: values.high, fill: "tonexty", fillcolor: fill });
@@ -120,7 +121,7 @@
     return [traces(lines, curves.time, of, curves.numbers("time")), layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: title }, ...changes }, shapes })];
   }
 
-  const logarithmic = { type: "log", exponentformat: "none", minorloglabels: "none", dtick: "D2" };
+  const logarithmic = { type: "log", exponentformat: "none", dtick: "D2", minorloglabels: "complete" };
 
   const FIGURES = {
     ranking: (cell) => [["cost", () => dotted([["", "", cell.ranking]], null, cell.paper)]],
@@ -130,7 +131,10 @@
       const names = curves.words("policy"), share = curves.numbers("share");
       const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null);
       for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}<extra>" + trace.name + "</extra>"];
-      return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
+      // Tiny errors are told apart by nobody.
+      const sizes = drawn.flatMap(({ x }) => x.filter((size, k) => size > 0 && share[k] < 0.9)), largest = Math.max(...drawn.flatMap(({ x }) => x));
+      const range = [Math.log10(Math.min(...sizes) || 1), Math.log10(largest || 1) + 0.05];
+      return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic, range }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
     }]),
     consistency: (cell) => ["anees", "anis"].filter((name) => cell.curves.has(name)).map((name) => [name.slice(1).toUpperCase(), () => {
       const { curves } = cell;
@@ -175,13 +179,13 @@
     const range = [Math.max(-100, Math.min(...values, 0) * 1.15 - 3), Math.min(200, Math.max(...values, 5) * 1.1 + 3)];
     const beyond = values.filter((x) => x > range[1]).length;
     const narrow = window.innerWidth < 640;
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `${narrow ? "<br>" : " "}(${beyond} beyond the right edge)` : "");
     const yaxis = single
       ? { automargin: true, categoryorder: "array", categoryarray: entries.map((line) => plain(line.name)).reverse(), tickfont: { size: narrow ? 9 : 11 }, dtick: 1 }
       : { tickvals: rows.map((_, i) => i), ticktext: rows.map(([scenario, role]) => `${plain(scenario)}<br><i>${plain(role)}</i>`), range: [rows.length - 0.5, -0.5], zeroline: false, tickfont: { size: narrow ? 9 : 11 } };
     const shapes = single ? [] : rows.flatMap((_, i) => i % 2 ? [] : [{ type: "rect", xref: "paper", x0: 0, x1: 1, y0: i - 0.5, y1: i + 0.5, fillcolor: css("--soft"), opacity: 0.07, line: { width: 0 }, layer: "below" }]);
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? ` (${beyond} beyond the right edge)` : "");
-    const height = single ? Math.max(260, 70 + 19 * entries.length) : 140 + rows.length * Math.max(44, 11 * entries.length);
-    const legend = single ? {} : { legend: { ...layout({}).legend, y: 1.02, yanchor: "bottom" } };
+    const height = single ? Math.max(260, 70 + 19 * entries.length) : (narrow ? 270 : 170) + rows.length * Math.max(44, 11 * entries.length);
+    const legend = single ? {} : { legend: { ...layout({}).legend, y: -70 / height } };
     return [drawn, layout({ xaxis: { title: { text: title }, range, zeroline: true, zerolinewidth: 2 }, yaxis, shapes, height, ...legend })];
   }
 
