@@ -12,6 +12,7 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
+from ..evaluation.curves import curves_of
 from ..evaluation.figures import evaluation_figures, save
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
@@ -110,7 +111,7 @@ def run_cell(
     # Not all of the full benchmark's policies: nobody can tell twenty lines apart.
     clear = {*(known.benchmark or known.names), *shipped_agents(cell.environment)}
     shown = [name for name in cell.policies if name in clear]
-    for name, figure in evaluation_figures(dataset.sel(policy=shown)):
+    for name, figure in evaluation_figures(curves_of(dataset.sel(policy=shown))):
         save(figure, folder / f"{cell.name}.{name}.png")
     return tidy_records(dataset)
 
