@@ -651,22 +651,20 @@ class Task(ABC):
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
         return self._estimating(episode).covariance(episode.bank)
 
-    def track(self, episode: Episode) -> dict[str, Array]:
+    def drawn(self, episode: Episode) -> dict[str, Array]:
         """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
-        ``(C, C, N)``, what is ``seen`` of the components ``(C, N)`` (where anything is), and every array of the
-        measurement, named ``measurement_NAME``.
+        ``(C, C, N)``, and what is ``seen`` of the components ``(C, N)``, where anything is.
         """
-        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        found = {"estimate": self.mean(episode), "covariance": self.covariance(episode)}
+        if self.has_truth:
+            found["truth"] = self.world.state(episode.truth)
         seen = self.world.seen(episode.measurement)
-        if seen is not None:
-            said["seen"] = seen
-        true = {"truth": self.world.state(episode.truth)} if self.has_truth else {}
-        return {
-            **true,
-            "estimate": self.mean(episode),
-            "covariance": self.covariance(episode),
-            **said,
-        }
+        return found if seen is None else {**found, "seen": seen}
+
+    def track(self, episode: Episode) -> dict[str, Array]:
+        """What a track is drawn from, and every array of the measurement, named ``measurement_NAME``."""
+        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        return {**self.drawn(episode), **said}
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""

@@ -24,6 +24,8 @@ from .seeds import episode_seeds
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
+DRAWN = "drawn_"
+"""Begins the names of what is kept of the first episodes only."""
 CHUNK = 2048
 """Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
@@ -109,8 +111,16 @@ def _measured_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
     return {**_measured(task, episode), **task.track(episode)}
 
 
-def _report(task: Task, tracks: bool) -> Report:
+def _and_drawn(task: Task, episode: Episode) -> dict[str, Any]:
+    """What is kept of every measurement, and what is kept of the first episodes only."""
+    kept = _measured(task, episode) if task.has_truth else _said(task, episode)
+    return {**kept, **{f"{DRAWN}{name}": values for name, values in task.drawn(episode).items()}}
+
+
+def _report(task: Task, tracks: bool, drawn: bool) -> Report:
     """What is kept of every measurement of a task."""
+    if drawn:
+        return _and_drawn
     if task.has_truth:
         return _measured_and_tracked if tracks else _measured
     return _said_and_tracked if tracks else _said
@@ -127,6 +137,7 @@ def evaluate(
     progress: Progress | None = None,
     *,
     tracks: bool = False,
+    drawn_episodes: int = 0,
     paper: str = "",
     reference: str = "",
     backend: str = "auto",
@@ -148,6 +159,8 @@ def evaluate(
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
         tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
+        drawn_episodes: of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate``
+            and so on over policy, drawn_episode and time; not beside ``tracks``.
         paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
         reference: name of the competitor whose score is 1; kept likewise.
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
@@ -180,6 +193,8 @@ def evaluate(
         raise ValueError("name at least one policy")
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if tracks and drawn_episodes:
+        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
@@ -213,21 +228,25 @@ def evaluate(
                 _made(name, maker, kinds[name], tasks[name]),
                 kinds[name],
                 seeds[i : i + CHUNK],
-                _report(tasks[name], tracks),
+                _report(tasks[name], tracks, drawn_episodes > i),
                 tick,
                 name,
                 i,
                 actions=True,
+                only={DRAWN: drawn_episodes - i},
             )
             for i in range(0, episodes, CHUNK)
         ]
-        per_policy[name] = {key: numpy.concatenate([c[key] for c in chunks]) for key in chunks[0]}
+        per_policy[name] = {
+            key: numpy.concatenate([chunk[key] for chunk in chunks if key in chunk]) for key in chunks[0]
+        }
     dataset = _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
     if flown is not None and lengths is not None:
         there = xarray.DataArray(dataset["time"].values <= lengths[:, None], dims=("episode", "time"))
-        dataset = dataset.where(there).assign_coords(
-            flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths)
-        )
+        of_drawn = there.isel(episode=slice(drawn_episodes)).rename(episode="drawn_episode")
+        dataset = dataset.map(
+            lambda values: values.where(of_drawn if "drawn_episode" in values.dims else there)
+        ).assign_coords(flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths))
     return dataset.assign_attrs(
         paper=paper,
         reference=reference,
@@ -278,6 +297,7 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
     if count < 0:
         return []
+    key = key.removeprefix(DRAWN)
     if key == "covariance":
         return ["component", "other_component"]
     if key in ("error", "mean_square", "truth", "estimate", "seen"):
@@ -357,7 +377,7 @@ def _dataset(
         for i, name in enumerate(names):
             if key in per_policy[name]:
                 stacked[i] = per_policy[name][key]
-        dims = ["policy", "episode", "time"]
+        dims = ["policy", "drawn_episode" if key.startswith(DRAWN) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)
     dataset = xarray.Dataset(

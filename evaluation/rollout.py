@@ -1,7 +1,7 @@
 """Episodes from their seeds to their end, with a policy, a reference estimator or a bound in the loop."""
 
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -257,6 +257,7 @@ def run_competitor(
     name: str = "competitor",
     first_episode: int = 0,
     actions: bool = False,
+    only: Mapping[str, int] | None = None,
 ) -> dict[str, numpy.ndarray]:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -272,14 +273,23 @@ def run_competitor(
         first_episode: number of the first episode, in errors.
         actions: of a policy whose action is a box, report too what was applied: ``action``, ``(episodes, time, A)``,
             within the limits of the box, as every bank takes it.
+        only: beginning of names -> of how many of the first episodes these are kept.
 
     Returns:
         Arrays ``(episodes, time, ...)`` by name; of a bound its ``mean_square``.
     """
     series: dict[str, list[numpy.ndarray]] = {}
 
+    fewer = {} if only is None else only
+    counts: dict[str, int] = {}
+
     def keep(name: str, values: numpy.ndarray) -> None:
-        series.setdefault(name, []).append(numpy.moveaxis(values[..., : len(seeds)], -1, 0))
+        if name not in series:
+            most = [count for beginning, count in fewer.items() if name.startswith(beginning)]
+            counts[name], series[name] = min(len(seeds), *most) if most else len(seeds), []
+        kept = values[..., : counts[name]]
+        # A view of a few episodes would keep the numbers of all.
+        series[name].append(numpy.moveaxis(kept.copy() if counts[name] < len(seeds) else kept, -1, 0))
 
     def keep_all(found: dict[str, numpy.ndarray]) -> None:
         for name, values in found.items():

@@ -58,6 +58,15 @@ def competitor(env: str, name: str, *, trust: bool = False) -> Any:
     return check_competitor(name, getattr(holder, attribute))
 
 
+def is_learned(env: str, name: str) -> bool:
+    """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
+    id = task_class(env).id
+    inner = name.removeprefix(GATED)
+    if inner in baselines.own_names(id):
+        return False
+    return inner in shipped_agents(id) or ":" not in inner
+
+
 def evaluate(
     env: str,
     competitors: Sequence[str] | Mapping[str, Any],

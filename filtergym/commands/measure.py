@@ -11,13 +11,14 @@ from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.curves import curves_of
 from ..evaluation.dataset import notes_of
 from ..evaluation.estimates import check_estimates, write_estimates
-from ..evaluation.figures import evaluation_figures, save
+from ..evaluation.figures import check_columns, check_formats, evaluation_figures, save
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
 from ..evaluation.metrics import flight_records
 from ..evaluation.recording import record
-from ..names import competitor, evaluate, tidy_records
+from ..names import competitor, evaluate, is_learned, tidy_records
 from ..reports.benchmark import RESULTS, Cell, run_benchmark
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
@@ -26,9 +27,11 @@ from ..reports.tables import flights_table, recorded_table
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
+    Columns,
     Environment,
     Episodes,
     Experiment,
+    Formats,
     ScenarioName,
     Split,
     Threads,
@@ -83,7 +86,11 @@ def evaluate_policies(
     settings: Annotated[
         list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for figures and records.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for records, a table, the whole result and figures.")
+    ] = None,
+    format: Formats = None,
+    columns: Columns = 2,
     json: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     recording: Annotated[
         str | None,
@@ -124,6 +131,8 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     keywords = parsed_settings(settings or [])
+    formats = check_formats(format or ["png"])
+    check_columns(columns)
     if recording is not None and scenario is not None:
         raise ValueError("--recording takes the place of --scenario: leave one of them out")
     named = task_class(environment).scenarios if environment else {}
@@ -154,6 +163,7 @@ def evaluate_policies(
         check_estimates(estimates)
         writable_file(estimates)
     names = policy or list(known.benchmark or known.names)
+    learned = [name for name in names if is_learned(cls.id, name)]
     if isinstance(flown, Recording):
         episodes = len(flown.names)
         if not policy:  # references and bounds are told what a recording does not hold
@@ -190,8 +200,9 @@ def evaluate_policies(
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
-            for name, figure in evaluation_figures(dataset) if judged else ():
-                save(figure, waiting / f"{name}.png")
+            for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
+                for suffix in formats:
+                    save(figure, waiting / f"{name}.{suffix}")
     if of_flights:
         console.print(flights_table(dataset, of_flights, records))
     if judged:

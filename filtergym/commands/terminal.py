@@ -36,6 +36,15 @@ Backend = Annotated[
     str, typer.Option(help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.")
 ]
 Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
+Formats = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--format", help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several."
+    ),
+]
+Columns = Annotated[
+    int, typer.Option(help="Width of figures, in columns of a paper: 1 (3.5 in) or 2 (7.16 in).")
+]
 Split = Annotated[str, typer.Option(help="test, validation or train.")]
 
 

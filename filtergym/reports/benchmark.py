@@ -112,31 +112,27 @@ def run_cell(
     threads: int = 1,
 ) -> tuple[Result, xarray.Dataset]:
     """Evaluate one cell; return its result and all its curves."""
-    options: dict[str, Any] = {"seed": seed, "split": split, "backend": backend}
     dataset = evaluate(
         cell.environment,
         cell.policies,
         cell.scenario,
         cell.episodes,
+        seed,
+        split,
         progress=progress,
+        drawn_episodes=1,
+        backend=backend,
         threads=threads,
-        **options,
     )
-    return result_of(dataset, shipped_agents(cell.environment), **options)
+    return result_of(dataset, shipped_agents(cell.environment))
 
 
-def result_of(
-    dataset: xarray.Dataset, learned: Sequence[str], competitors: Any = None, **options: Any
-) -> tuple[Result, xarray.Dataset]:
+def result_of(dataset: xarray.Dataset, learned: Sequence[str]) -> tuple[Result, xarray.Dataset]:
     """Turn an evaluation into what a file of results holds of it.
 
     Args:
-        dataset: from an evaluation.
+        dataset: from an evaluation; with ``drawn_episodes`` there is a track.
         learned: names of those of its competitors that were learned.
-        competitors: what its names stand for, where they say more than the environment knows; see
-            :func:`~.names.evaluate`.
-        **options: of the evaluation, for the episode whose track is drawn: scenario, seed and others. Without any
-            there is none.
 
     Returns:
         The result, with curves of what is shown, and the curves of everything.
@@ -147,12 +143,7 @@ def result_of(
     records, curves = tidy_records(dataset), curves_of(dataset)
     names = dataset["policy"].values.tolist()
     shown = shown_competitors(records, paper, reference, [name for name in learned if name in names])
-    track = None
-    if options:
-        components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
-        chosen = shown if competitors is None else {name: competitors[name] for name in shown}
-        options.setdefault("scenario", scenario)
-        track = track_of(evaluate(id, chosen, episodes=1, tracks=True, **options), components, plane)
+    components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
     told = {**known.references, **known.bounds}
     named = cls.scenarios.get(scenario)
     result = Result(
@@ -168,7 +159,7 @@ def result_of(
         dataset.attrs["notes"].splitlines(),
         records,
         curves.sel(policy=shown).isel(time=spread(curves.sizes["time"], MOST_TIMES)),
-        track,
+        track_of(dataset.sel(policy=shown), components, plane),
     )
     return result, curves
 

@@ -117,45 +117,47 @@ def spread(count: int, most: int) -> numpy.ndarray:
     return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) -> xarray.Dataset:
-    """Return the first episode of an evaluation with tracks: what was true, measured and estimated.
+def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) -> xarray.Dataset | None:
+    """Return the first episode of an evaluation: what was true, measured and estimated.
 
     Args:
-        dataset: from an evaluation with ``tracks=True``.
+        dataset: from an evaluation with ``drawn_episodes``; without there is no track.
         components: that are drawn.
         plane: whether the first two of them are the axes of a plane.
 
     Returns:
-        ``truth`` and ``seen`` (component, time), where they are known; ``estimate`` (policy, component, time) and
-        ``covariance`` (policy, component, other_component, time).
+        ``truth`` and ``seen`` (policy, component, time), where they are known: in a closed loop every competitor flies
+        a truth of its own; ``estimate`` likewise, and ``covariance`` (policy, component, other_component, time).
     """
-    names = list(components)
+    if "drawn_estimate" not in dataset:
+        return None
     # A bound estimates nothing.
     present = [
         name
         for name in dataset["policy"].values.tolist()
-        if not numpy.isnan(dataset["estimate"].sel(policy=name).values[0]).all()
+        if not numpy.isnan(dataset["drawn_estimate"].sel(policy=name).values[0]).all()
     ]
-    episode = dataset.sel(policy=present).isel(episode=0).sel(component=names)
-    there = numpy.flatnonzero(numpy.isfinite(episode["estimate"].values).any(axis=(0, 2)))
-    episode = episode.isel(time=slice(0, int(there[-1]) + 1))
-    episode = episode.isel(time=spread(episode.sizes["time"], TRACK_TIMES))
-    which = [dataset["component"].values.tolist().index(name) for name in names]
-    kept = {
-        "estimate": episode["estimate"].transpose("policy", "component", "time"),
-        "covariance": episode["covariance"]
-        .isel(other_component=which)
-        .transpose("policy", "component", "other_component", "time"),
-    }
-    for name in ("truth", "seen"):
-        if name in episode:
-            # In a closed loop every competitor flies a truth of its own.
-            kept[name] = episode[name].transpose("policy", "component", "time")
-    found = xarray.Dataset(
-        {name: values.drop_vars("episode_seed", errors="ignore") for name, values in kept.items()}
+    kept = [name for name in dataset if str(name).startswith("drawn_")]
+    episode = dataset[kept].sel(policy=present).isel(drawn_episode=0)
+    which = [dataset["component"].values.tolist().index(name) for name in components]
+    episode = episode.isel(component=which, other_component=which)
+    there = numpy.flatnonzero(numpy.isfinite(episode["drawn_estimate"].values).any(axis=(0, 2)))
+    episode = episode.isel(time=spread(int(there[-1]) + 1, TRACK_TIMES))
+    names = {str(name): str(name).removeprefix("drawn_") for name in kept}
+    found = episode.rename(names).transpose(
+        "policy", "component", "other_component", "time", missing_dims="ignore"
     )
-    found = found.drop_vars(["episode", "mode", "flight", "length"], errors="ignore")
-    found.attrs = {"plane": int(plane), "seed": str(episode["episode_seed"].values)}
+    further = set(map(str, found.coords)) - {
+        "policy",
+        "kind",
+        "control",
+        "time",
+        "elapsed",
+        "component",
+        "unit",
+    }
+    found = found.drop_vars(list(further))
+    found.attrs = {"plane": int(plane), "seed": str(dataset["episode_seed"].values[0])}
     return found
 
 
