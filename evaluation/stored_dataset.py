@@ -1,6 +1,7 @@
 """Small datasets as JSON: curves and tracks, for whoever has neither NetCDF nor Python."""
 
 import reprlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy
@@ -11,18 +12,24 @@ from .stored import fits
 PARTS = ("coords", "variables", "attrs")
 
 
-def dataset_as_json(dataset: xarray.Dataset, digits: int) -> dict[str, Any]:
-    """Return a dataset of numbers and words as what JSON can say: as many significant digits, null for NaN."""
+def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwise: int) -> dict[str, Any]:
+    """Return a dataset of numbers and words as what JSON can say, null for NaN.
 
-    def said(values: numpy.ndarray) -> Any:
+    Args:
+        dataset: whatever is no number is words.
+        digits: significant digits of variables, by their names.
+        otherwise: of all others.
+    """
+
+    def said(name: str, values: numpy.ndarray) -> Any:
         if values.dtype.kind != "f":
             return values.tolist()
-        words = numpy.char.mod(f"%.{digits}g", values.ravel()).tolist()
+        words = numpy.char.mod(f"%.{digits.get(name, otherwise)}g", values.ravel()).tolist()
         numbers = [float(word) if word[-1] not in "nf" else None for word in words]
         return {"shape": list(values.shape), "numbers": numbers}
 
     def part(variables: Any) -> dict[str, Any]:
-        return {str(name): [list(v.dims), said(v.values)] for name, v in variables.items()}
+        return {str(name): [list(v.dims), said(str(name), v.values)] for name, v in variables.items()}
 
     return {
         "coords": part(dataset.coords),

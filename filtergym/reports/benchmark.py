@@ -20,13 +20,12 @@ from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..names import evaluate, tidy_records
 from .results import (
-    MOST_TIMES,
     Result,
     drawn_components,
     read_results,
     settings_of,
     shown_competitors,
-    spread,
+    thinned,
     track_of,
     write_results,
 )
@@ -158,7 +157,7 @@ def result_of(dataset: xarray.Dataset, learned: Sequence[str]) -> tuple[Result, 
         {name: told[name].knows for name in names if name in told},
         dataset.attrs["notes"].splitlines(),
         records,
-        curves.sel(policy=shown).isel(time=spread(curves.sizes["time"], MOST_TIMES)),
+        thinned(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
     )
     return result, curves

@@ -19,10 +19,9 @@ from plotly.offline import get_plotlyjs
 
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
-from ..evaluation.stored_dataset import dataset_as_json
 from .headline import consistency_word, headline
 from .ranking import origin, ranking_sentence, verdict
-from .results import CURVE_DIGITS, TRACK_DIGITS, Result, Settings
+from .results import Result, Settings, stored_datasets
 from .tables import against_paper, main_components, ranked, score_text, with_interval
 
 HTML = Path(__file__).parent / "html"
@@ -79,7 +78,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         first=results[0].records[0],
         style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),
         script=markupsafe.Markup(script),
-        plotly=markupsafe.Markup(plotly),
+        plotly=_packed_text(plotly),
         hashes=[_hash(plotly), _hash(script)],
     )
 
@@ -90,7 +89,10 @@ def _hash(script: str) -> str:
 
 def _packed(values: Any) -> str:
     """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
-    text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+    return _packed_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
+
+
+def _packed_text(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
@@ -123,8 +125,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
                 "lines": _lines(result, group),
                 "paper": result.paper,
                 "ranking": _differences(result),
-                "curves": None if result.curves is None else dataset_as_json(result.curves, CURVE_DIGITS),
-                "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS),
+                **stored_datasets(result),
             }
         ),
     }

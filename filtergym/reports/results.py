@@ -27,8 +27,9 @@ MOST_SHOWN = 10
 """Competitors of which a file holds curves and a track; all have their records."""
 MOST_TIMES = 120
 """Times of a curve; of more, these are spread over the episode."""
-TRACK_TIMES = 240
-CURVE_DIGITS, TRACK_DIGITS = 4, 7
+TRACK_TIMES = 160
+TRACK_DIGITS = {"truth": 7, "estimate": 7, "seen": 7}
+DIGITS = 4
 """Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
 
 
@@ -117,6 +118,12 @@ def spread(count: int, most: int) -> numpy.ndarray:
     return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
+def thinned(curves: xarray.Dataset) -> xarray.Dataset:
+    """Return curves at fewer times, and every other share of the errors."""
+    fewer = curves.isel(time=spread(curves.sizes["time"], MOST_TIMES))
+    return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
+
+
 def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) -> xarray.Dataset | None:
     """Return the first episode of an evaluation: what was true, measured and estimated.
 
@@ -127,7 +134,8 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
 
     Returns:
         ``truth`` and ``seen`` (policy, component, time), where they are known: in a closed loop every competitor flies
-        a truth of its own; ``estimate`` likewise, and ``covariance`` (policy, component, other_component, time).
+        a truth of its own; ``estimate`` likewise, with ``sigma``, its standard deviation as reported; of a plane also
+        the ``correlation`` (policy, time) of both.
     """
     if "drawn_estimate" not in dataset:
         return None
@@ -147,6 +155,15 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
     found = episode.rename(names).transpose(
         "policy", "component", "other_component", "time", missing_dims="ignore"
     )
+    covariance = found["covariance"].values
+    variance = numpy.maximum(numpy.diagonal(covariance, axis1=1, axis2=2), 0.0)
+    sigma = numpy.moveaxis(numpy.sqrt(variance), -1, 1)
+    found = found.drop_vars("covariance").assign(sigma=(("policy", "component", "time"), sigma))
+    if plane:
+        product = sigma[:, 0] * sigma[:, 1]
+        nothing = numpy.where(numpy.isnan(product), numpy.nan, 0.0)
+        correlation = numpy.divide(covariance[:, 0, 1], product, out=nothing, where=product > 0.0)
+        found = found.assign(correlation=(("policy", "time"), correlation.round(3)))
     further = set(map(str, found.coords)) - {
         "policy",
         "kind",
@@ -186,8 +203,15 @@ def _as_json(result: Result) -> dict[str, Any]:
     return {
         **result._asdict(),
         "records": [record._asdict() for record in result.records],
-        "curves": None if result.curves is None else dataset_as_json(result.curves, CURVE_DIGITS),
-        "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS),
+        **stored_datasets(result),
+    }
+
+
+def stored_datasets(result: Result) -> dict[str, Any]:
+    """Curves and track as JSON can say them."""
+    return {
+        "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
+        "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS, DIGITS),
     }
 
 

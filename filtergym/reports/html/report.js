@@ -8,11 +8,14 @@
   const root = document.documentElement;
   const css = (name) => getComputedStyle(root).getPropertyValue(name).trim();
 
-  async function unpacked(script) {
+  function unpacked(script) {
     const bytes = Uint8Array.from(atob(script.textContent.trim()), (c) => c.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return new Response(stream).json();
+    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip")));
   }
+  // Plotly stands in the page once, packed; the page's policy lets it run by its hash.
+  const library = unpacked(document.getElementById("plotly")).text().then((text) => {
+    document.head.append(Object.assign(document.createElement("script"), { textContent: text }));
+  });
 
   // --- a dataset: variables with names of their dimensions, numbers in row-major order
 
@@ -225,7 +228,7 @@
     const state = (line, i) => track.row("estimate", names.indexOf(line.name), i);
     const truth = (line, i) => track.has("truth") ? track.row("truth", names.indexOf(line.name), i) : state(line, i).map(() => null);
     const seen = (i) => track.has("seen") ? track.row("seen", 0, i) : [];
-    const covariance = (line, i, j) => track.row("covariance", names.indexOf(line.name), i, j);
+    const sigma = (line, i) => track.row("sigma", names.indexOf(line.name), i);
     const marks = { color: css("--soft"), size: 5, symbol: "cross-thin-open" };
 
     function drawPlane(n) {
@@ -246,10 +249,10 @@
       for (const line of shown) {
         const [x, y] = [minus(state(line, 0), truth(line, 0)), minus(state(line, 1), truth(line, 1))];
         if (x[n] === null) continue;
-        const P = [[0, 0], [0, 1], [1, 1]].map(([i, j]) => covariance(line, i, j));
-        const around = ellipse(x[n], y[n], P[0][n], P[1][n], P[2][n]), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
+        const [u, v, r] = [sigma(line, 0)[n], sigma(line, 1)[n], track.row("correlation", names.indexOf(line.name))[n]];
+        const around = ellipse(x[n], y[n], u * u, r * u * v, v * v), style = look(line), group = { legendgroup: plain(line.name), showlegend: false, name: plain(line.name) };
         const errors = x.map((u, i) => Math.hypot(u, y[i])).filter(Number.isFinite).sort((a, b) => a - b);
-        reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.sqrt(Math.max(P[0][n], P[2][n])) / 1.5);
+        reach = Math.max(reach, errors[Math.floor(0.9 * (errors.length - 1))] || 0, 2 * Math.max(u, v) / 1.5);
         close.push(path(x.slice(Math.max(0, n - 12), n + 1), y.slice(Math.max(0, n - 12), n + 1), { line: { ...style, width: 1 }, opacity: 0.5, hoverinfo: "skip", ...group }),
           path(around.x, around.y, { line: style, hoverinfo: "skip", ...group }),
           { x: [x[n]], y: [y[n]], mode: "markers", marker: { color: style.color, size: 8 }, ...group });
@@ -266,10 +269,10 @@
       for (const line of shown) {
         const style = look(line), group = { legendgroup: plain(line.name), name: plain(line.name) };
         values.push({ x: upTo(time, n), y: upTo(state(line, i), n), mode: "lines", line: style, ...group });
-        const error = minus(state(line, i), truth(line, i)), sigma = covariance(line, i, i).map((v) => (v === null ? null : 2 * Math.sqrt(Math.max(v, 0))));
+        const error = minus(state(line, i), truth(line, i)), two = sigma(line, i).map((v) => (v === null ? null : 2 * v));
         if (!something(error)) continue;
         const edge = { x: upTo(time, n), mode: "lines", line: { width: 0.7, color: style.color, dash: "dot" }, hoverinfo: "skip", showlegend: false, ...group };
-        errors.push({ ...edge, y: upTo(sigma, n) }, { ...edge, y: upTo(sigma.map((v) => v === null ? null : -v), n) }, { x: upTo(time, n), y: upTo(error, n), mode: "lines", line: style, ...group, showlegend: false });
+        errors.push({ ...edge, y: upTo(two, n) }, { ...edge, y: upTo(two.map((v) => v === null ? null : -v), n) }, { x: upTo(time, n), y: upTo(error, n), mode: "lines", line: style, ...group, showlegend: false });
       }
       const unit = plain(units[i]), axis = { title: { text: track.clock }, range: extent([time], 0.02) };
       const everything = shown.map((line) => state(line, i));
@@ -314,7 +317,8 @@
   async function open(details) {
     if (details.dataset.drawn) return;
     details.dataset.drawn = "begun";
-    const cell = await unpacked(details.querySelector(":scope > script.data"));
+    await library;
+    const cell = await unpacked(details.querySelector(":scope > script.data")).json();
     cell.curves = cell.curves && new Data(cell.curves);
     cell.track = cell.track && new Data(cell.track);
     for (const figure of details.querySelectorAll("figure")) {
@@ -325,7 +329,8 @@
   for (const details of document.querySelectorAll("details.cell")) details.addEventListener("toggle", () => details.open && open(details));
   const wide = new IntersectionObserver((seen) => seen.filter((entry) => entry.isIntersecting).forEach(async ({ target }) => {
     wide.unobserve(target);
-    drawFigure(target, await unpacked(target.querySelector("script.data")));
+    await library;
+    drawFigure(target, await unpacked(target.querySelector("script.data")).json());
     target.dataset.drawn = "done";
   }), { rootMargin: "300px" });
   for (const figure of document.querySelectorAll("figure[data-kind=dots]")) wide.observe(figure);
