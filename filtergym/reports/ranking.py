@@ -37,6 +37,23 @@ def ranking(records: Sequence[Record]) -> list[Place]:
     return sorted(places, key=lambda place: place.cost)
 
 
+def verdict(records: Sequence[Record]) -> str:
+    """Who is best of learned and classical competitors in a scenario, in two or three words.
+
+    It rests on the paired difference between the best one and the best of the other origin: where its interval holds
+    zero, nobody is called best.
+    """
+    best, *others = ranking(records)
+    origin = "learned" if best.role == "learned" else "classical"
+    rival = next((place for place in others if (place.role == "learned") != (origin == "learned")), None)
+    if rival is None:
+        return f"{origin} only"
+    behind = rival.behind
+    if behind is None or behind.low is None or behind.low <= 0.0:
+        return "no significant difference"
+    return f"{origin} best"
+
+
 def ranking_sentence(records: Sequence[Record]) -> str:
     """Say who is best, by how much, and how the strongest of another origin stands to it."""
     first, paper = records[0], baselines_of(records[0].environment).score_paper
