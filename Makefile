@@ -20,7 +20,7 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
   test_example_environment.py test_observation.py)
 # A link that leads nowhere, or a page that no other leads to, is an error.
-SITE := $(BIN)/python -m sphinx -W --keep-going -q -b html docs site
+SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
 .PHONY: benchmark test coverage core-tests test-lowest test-pythons distributions check format docs clean
@@ -90,4 +90,4 @@ $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build site *.egg-info

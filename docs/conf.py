@@ -1,8 +1,15 @@
 """How the documentation is built: ``make docs``. What is built works offline: nothing is fetched from elsewhere."""
 
-from typing import Any
+import re
+from typing import Any, NewType
 
-import filtergym
+import numpy.typing
+from docutils import nodes
+
+# By its name, not as the union of ten types that it is; said before anything imports it.
+numpy.typing.ArrayLike = NewType("ArrayLike", object)
+
+import filtergym  # noqa: E402
 
 project = "filtergym"
 author = "The filtergym developers"
@@ -17,12 +24,13 @@ exclude_patterns = ["examples", "recipes", "package_index.md"]
 myst_heading_anchors = 4
 myst_enable_extensions = ["attrs_inline", "colon_fence"]
 
+highlight_language = "none"  # of what names no language: output, formulas
+
 # Types stand in the annotations only, and each argument shows its own.
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
-autodoc_class_signature = "separated"
 autodoc_preserve_defaults = True
 napoleon_numpy_docstring = False
 napoleon_use_rtype = False
@@ -35,6 +43,7 @@ html_static_path = ["_static"]
 html_css_files = ["filtergym.css"]
 html_show_sourcelink = False
 html_copy_source = False
+html_use_index = html_domain_indices = False  # the search finds names
 html_theme_options = {
     "logo": {"text": "filtergym"},
     "navbar_align": "left",
@@ -47,6 +56,20 @@ html_theme_options = {
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
+
+
+COLON = "\ue000"
+"""Stands for a colon where Google's style would take what is before it for a type."""
+
+
+def _hide_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Keep the sentence below a field whole: types stand in the annotations."""
+    if what in ("attribute", "property", "data"):
+        lines[:] = [line.replace(":", COLON) for line in lines]
+
+
+def _show_colons(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    lines[:] = [line.replace(COLON, ":") for line in lines]
 
 
 def _formulas_as_they_stand(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -69,7 +92,18 @@ def _without_counted_fields(app: Any, what: str, name: str, obj: Any, options: A
         lines.clear()
 
 
+def _intervals_in_one_piece(app: Any, document: nodes.document) -> None:
+    """Do not break ``[-48.1, -43.0]`` in a cell of a table."""
+    for entry in document.findall(nodes.entry):
+        for text in list(entry.findall(nodes.Text)):
+            kept = re.sub(r"\[([-+\d.]+), ([-+\d.]+\])", "[\\1,\N{NO-BREAK SPACE}\\2", text)
+            if kept != text:
+                text.parent.replace(text, nodes.Text(kept))
+
+
 def setup(app: Any) -> None:
-    """Register what is done to docstrings, after the sections of Google's style have been read."""
-    app.connect("autodoc-process-docstring", _formulas_as_they_stand, priority=600)
-    app.connect("autodoc-process-docstring", _without_counted_fields, priority=600)
+    """Register what is done to docstrings before and after Google's style is read, and to pages."""
+    app.connect("autodoc-process-docstring", _hide_colons, priority=400)
+    for change in (_show_colons, _formulas_as_they_stand, _without_counted_fields):
+        app.connect("autodoc-process-docstring", change, priority=600)
+    app.connect("doctree-read", _intervals_in_one_piece)

@@ -91,7 +91,7 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
             exec(compile(block, name, "exec"), {"__name__": "block"})
             assert "print(" not in block or capsys.readouterr().out.strip()
         else:
-            for line in block.splitlines():
+            for line in block.replace("\\\n", "").splitlines():
                 _, *words = shlex.split(re.sub(r"--steps \d+", "--steps 12800", line))
                 code, shown, errors = command(*words)
                 assert (code, bool(shown)) == (0, True), errors
