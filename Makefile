@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := filtergym compiler filters envs evaluation baselines agents tests benchmarks
+SOURCES := docs/conf.py filtergym compiler filters envs evaluation baselines agents tests benchmarks
 
 # Numbers, and every library once: gymnasium, scipy, xarray, matplotlib, typer and rich, safetensors.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
@@ -19,6 +19,8 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
 # What reads files beside the packages, so that an unpacked source distribution must hold them.
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
   test_example_environment.py test_observation.py)
+# A link that leads nowhere, or a page that no other leads to, is an error.
+SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
 .PHONY: benchmark test coverage core-tests test-lowest test-pythons distributions check format docs clean
@@ -66,10 +68,10 @@ check: $(VENV)/.dev  ## format, lint and types
 	rm -rf $(VENV)/typed
 	$(BIN)/python -m pip install --quiet --no-deps --target $(VENV)/typed .
 	MYPYPATH=$(VENV)/typed $(BIN)/mypy -p filtergym
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	$(SITE)
 
 docs: $(VENV)/.dev  ## build the documentation into site/
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(SITE)
 
 format: $(VENV)/.dev  ## put the code into its form
 	$(BIN)/ruff format $(SOURCES)
@@ -88,4 +90,4 @@ $(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
 	touch $@ $(VENV)/.core
 
 clean:  ## remove everything that make made
-	rm -rf $(VENV) build *.egg-info
+	rm -rf $(VENV) build site *.egg-info

@@ -15,7 +15,7 @@ The clock of every task:
 ====  ==============================================================  =========================
  1    the truth moves on; the sensors say where it seems to be        :meth:`World.advance`
  2    the filters predict to that time; innovations and likelihoods   :meth:`Bank.predict`
- 3    the agent is shown them                                         :meth:`Bank.observe`
+ 3    the agent is shown them                                         :meth:`Task.observe`
  4    the agent's action is applied to *that same* measurement        :meth:`Bank.act`
  5    the estimate is compared with the truth                         :meth:`World.cost`
 ====  ==============================================================  =========================

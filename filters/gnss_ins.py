@@ -11,7 +11,7 @@ pitch, roll) rad, their rates rad/s. One step of length T:
     clock     D' += T V' + w,  V' += w,   white frequency and random-walk frequency noise
     attitude  eps += T V_eps + w,  V_eps = exp(-T / tau) V_eps + w
 
-Observations, S satellites at s_j with velocities w_j, u_j = (s_j - X) / |s_j - X|:
+Observations, S satellites at s_j with velocities w_j, ``u_j = (s_j - X) / |s_j - X|``:
 
     pseudorange        rho_j  = |s_j - X| + D'
     pseudorange rate   rho'_j = u_j^T (w_j - V) + V'
@@ -211,7 +211,7 @@ class Geometry(NamedTuple):
     """Where the satellites stand, relative to a user."""
 
     distance: Array
-    """|s - X|, ``(S, ...)``, m."""
+    """``|s - X|``, ``(S, ...)``, m."""
     unit: Array
     """From the user to the satellite, ``(3, S, ...)``."""
     relative_velocity: Array

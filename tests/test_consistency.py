@@ -9,7 +9,7 @@ from filtergym.filters import alpha_beta
 from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
-from filtergym.reports.ranking import ranking, ranking_sentence
+from filtergym.reports.ranking import ranking, ranking_sentence, verdict
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -120,6 +120,32 @@ def test_who_is_best(dataset, found):
     classical = next(name for name in names if name not in ("bptt", "ppo"))
     assert f"The strongest classical competitor, `{classical}` (" in sentence
     assert ("known-turn", "behind_best") not in found
+
+
+def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
+    records = tidy_records(dataset)
+    learned = ("bptt", "ppo")
+
+    def told(names, low=None):
+        """Verdict on these competitors, the lower end of every difference to the best one set to ``low``."""
+        kept = [record for record in records if record.policy in names]
+        if low is not None:
+            kept = [r._replace(low=low) if r.metric == "behind_best" else r for r in kept]
+        return verdict(kept)
+
+    everyone = [place.name for place in ranking(records)]
+    classical = [name for name in everyone if name not in learned]
+    assert told(everyone, low=0.01) == "learned best"
+    assert told(everyone, low=0.0) == told(everyone, low=-0.01) == "no significant difference"
+    assert told(learned) == "learned only"
+    assert told(classical) == "classical only"
+    # References are told what the others are not, and judge nothing.
+    assert told([*everyone, "known-turn"], low=0.01) == "learned best"
+    swapped = [
+        r._replace(value=1e-9) if (r.policy, r.metric) == (classical[0], "cost") else r for r in records
+    ]
+    beaten = [r._replace(low=0.01) if (r.policy, r.metric) == ("bptt", "behind_best") else r for r in swapped]
+    assert verdict(beaten) == "classical best"
 
 
 def test_tracks_hold_what_a_track_is_drawn_from(dataset):

@@ -1,15 +1,22 @@
-"""Every environment has a page that names all there is: fields, keywords, scenarios, policies."""
+"""Every environment has a page that names all there is: fields, keywords, scenarios, policies.
+
+And the pages for each audience run, the command line's page is that of the code, and every page is in the navigation.
+"""
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, parameter_names
 
+from filtergym.reports import command_line
 from filtergym.reports.environment_page import environment_tables, put_tables
+from filtergym.reports.pages import insert_between_markers
 
 DOCS = Path(__file__).parent.parent / "docs"
+AUDIENCES = ("filter_designer.md", "rl_researcher.md", "log_file.md")
 HEADINGS = (
     "Description", "Action Space", "Observation Space", "Rewards", "Starting State", "Episode End", "Arguments",
     "Scenarios", "Room table", "References", "Version History",
@@ -64,3 +71,76 @@ def test_page_names_every_field(id):
             while stem and stem not in words:
                 stem = stem.rpartition("_")[0]
             assert stem, f"{field.name} of control {control}"
+
+
+@pytest.mark.parametrize("name", AUDIENCES)
+def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch):
+    """One block after the other in an empty folder, with a short training; a block that names its file becomes it."""
+    text = (DOCS / name).read_text(encoding="utf-8")
+    blocks = re.findall(r"```(python|sh)\n(.*?)```", text, re.S)
+    assert {language for language, _ in blocks} == {"python", "sh"}
+    if "filtergym train" in text:
+        pytest.importorskip("torch")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for language, block in blocks:
+        file = re.match(r"# (\w+\.py)\n", block)
+        if file:
+            Path(file[1]).write_text(block, encoding="utf-8")
+        elif language == "python":
+            exec(compile(block, name, "exec"), {"__name__": "block"})
+            assert "print(" not in block or capsys.readouterr().out.strip()
+        else:
+            for line in block.replace("\\\n", "").splitlines():
+                _, *words = shlex.split(re.sub(r"--steps \d+", "--steps 12800", line))
+                code, shown, errors = command(*words)
+                assert (code, bool(shown)) == (0, True), errors
+
+
+def test_page_of_the_command_line_is_that_of_the_code(tmp_path):
+    """If not: ``python -m filtergym.reports.command_line docs/command_line.md``."""
+    copy = tmp_path / "page.md"
+    copy.write_text((DOCS / "command_line.md").read_text(encoding="utf-8"), encoding="utf-8")
+    insert_between_markers(copy, {command_line.MARKER: command_line.command_line_markdown()})
+    assert copy.read_text(encoding="utf-8") == (DOCS / "command_line.md").read_text(encoding="utf-8")
+
+
+def test_page_of_the_command_line_holds_what_help_says(command):
+    sections = re.split(r"^## ", (DOCS / "command_line.md").read_text(encoding="utf-8"), flags=re.M)[1:]
+    options = {
+        name: set(re.findall(r"--[a-z-]+", table)) for name, _, table in (s.partition("\n") for s in sections)
+    }
+    assert list(options) == list(command_line.COMMANDS)
+    for name, known in options.items():
+        _, shown, _ = command(name, "--help")
+        assert set(re.findall(r"(?<![\w-])--[a-z-]+(?= |$)", shown)) - {"--help"} <= known
+
+
+def test_first_page_shows_the_result_and_the_commands_of_the_readme():
+    """They are included, so that they stand in one place."""
+    readme, index = (
+        (file).read_text(encoding="utf-8") for file in (DOCS.parent / "README.md", DOCS / "index.md")
+    )
+    for marker, words in (
+        ("headline", ("| competitor | kind |", "filtergym evaluate filtergym/ManeuveringTarget-v0")),
+        ("two commands", ("make benchmark", "make test")),
+    ):
+        assert re.search(
+            f"```{{include}} ../README.md\n:start-after: .<!-- {marker}: begin -->.\n"
+            f":end-before: .<!-- {marker}: end -->.\n",
+            index,
+        )
+        [text] = re.findall(f"<!-- {marker}: begin -->(.*?)<!-- {marker}: end -->", readme, re.S)
+        assert all(word in text for word in words)
+
+
+def test_every_page_of_results_says_what_makes_it():
+    for name, words in (
+        ("comparison.md", "filtergym comparison results/benchmark.json --into docs/comparison.md"),
+        ("training_seeds.md", "--into docs/training_seeds.md"),
+        ("speed.md", "python benchmarks/throughput.py"),
+    ):
+        assert words in (DOCS / name).read_text(encoding="utf-8"), name
+    for report in (DOCS / "reproductions").glob("*/report.md"):
+        made = f"\nMade by `filtergym reproduce {report.parent.name} --out DIR`.\n"
+        assert made in report.read_text(encoding="utf-8"), report

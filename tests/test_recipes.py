@@ -79,9 +79,9 @@ def test_recipe_runs(recipe, tmp_path):
 
 def test_page_shows_every_recipe():
     page = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-    shown = re.findall(r'^```(\w+)\n--8<-- "docs/recipes/(with_[^"]+)"\n```$', page, re.M)
-    assert sorted(name for _, name in shown) == RECIPES
-    assert {language for language, name in shown if name.endswith(".py")} == {"python"}
+    shown = re.findall(r"^```{literalinclude} recipes/(with_\S+)\n:language: (\w+)\n```$", page, re.M)
+    assert sorted(name for name, _ in shown) == RECIPES
+    assert {language for name, language in shown if name.endswith(".py")} == {"python"}
     for file in FOLDER.glob("*.txt"):
         assert f"--install {file.stem}" in page or f"`{file.stem}`" in page, file
 

@@ -11,6 +11,7 @@ from filtergym.baselines.reproduction import (
     Reproduction,
     as_markdown,
     episode_count,
+    its_command,
     paper_module,
     papers,
     save_reproduction,
@@ -29,6 +30,7 @@ def example() -> Reproduction:
         [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
         [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
         {"figure_1": (figure, "The error."), "figure_2": (figure, "The same again.")},
+        its_command("a-paper", 3),
     )
 
 
@@ -57,6 +59,7 @@ def test_every_paper_refuses_episodes_without_an_interval() -> None:
 def test_the_page_holds_claims_tables_and_figures() -> None:
     lines = as_markdown(example()).splitlines()
     assert lines[0] == "# A paper"
+    assert lines[2] == "Made by `filtergym reproduce a-paper --episodes 3 --out DIR`."
     # A bar inside a cell must not open another cell.
     assert "| **C1.** It is small. | \\|e\\| = 3.1 ± 0.2 m | 10 runs | **not reproduced** |" in lines
     table = lines[lines.index("## Errors") + 2 :][:4]

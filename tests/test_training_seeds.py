@@ -1,7 +1,9 @@
 """Training seeds: the spread against naive sums, what its interval promises, and the command from end to end."""
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,10 +167,29 @@ def test_command_fills_the_page(folders, tmp_path, command, monkeypatch):
     assert (text[:2], text[-2:], "old" in text) == ("a\n", "\nb", False)
     for word in ("`bptt seed 0`", "`adaptive-rearm-tuned`", "--split validation", "--seed 0|1"):
         assert word in text
+    # The first table is shown, the others wait for a click; inside HTML, Markdown needs blank lines around it.
+    shown, *folded = text.split("<details>\n")
+    assert shown.count("\n|---") == shown.count("**Scenario `random`, 20 episodes") == 1
+    assert len(folded) == text.count("\n\n</details>\n\n") == 2
+    for part in folded:
+        assert re.match(r"<summary>[^`]*<code>random</code></summary>\n\n\| ", part)
     assert (tmp_path / "curves.png").stat().st_size > 10_000
     assert not (tmp_path / "seeds.json.unfinished").exists()
     records = json.loads((tmp_path / "seeds.json").read_text())
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
+
+
+def test_the_page_folds_what_the_command_folds():
+    page = (Path(__file__).parent.parent / "docs" / "training_seeds.md").read_text(encoding="utf-8")
+    tables = re.findall(r"<!-- seeds \S+: begin -->\n(.*?)<!-- seeds \S+: end -->", page, re.S)
+    assert len(tables) == 5
+    for text in tables:
+        shown, *folded = text.split("<details>\n")
+        after = folded[-1].partition("</details>")[2]
+        assert "Made by `filtergym seeds RUN" in after
+        assert [part.count("</details>") for part in (shown, *folded)] == [0, *(1 for _ in folded)]
+        assert shown.count("\n|---") == 1
+        assert all(part.count("\n|---") == 1 for part in folded)
 
 
 def test_what_cannot_be_compared(folders, tmp_path, command, monkeypatch):

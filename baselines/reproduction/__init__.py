@@ -67,6 +67,8 @@ class Reproduction:
     tables: Sequence[Grid] = ()
     figures: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
     """File name without suffix -> Matplotlib figure and its caption, one sentence."""
+    command: str = ""
+    """What made it."""
 
 
 def papers() -> dict[str, str]:
@@ -98,9 +100,18 @@ def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
     return count
 
 
+def its_command(paper: str, episodes: int | None) -> str:
+    """Command that reproduces a paper with this number of runs; None: its own."""
+    runs = "" if episodes is None else f" --episodes {episodes}"
+    return f"filtergym reproduce {paper}{runs} --out DIR"
+
+
 def as_markdown(result: Reproduction) -> str:
     """Claims, tables and figures as one page."""
-    lines = [f"# {result.title}", "", UNCERTAINTY, "", "## Claims", ""]
+    lines = [f"# {result.title}", ""]
+    if result.command:
+        lines += [f"Made by `{result.command}`.", ""]
+    lines += [UNCERTAINTY, "", "## Claims", ""]
     lines += markdown_table(
         ("claim", "what was measured", "how", "verdict"),
         [(f"**{c.key}.** {c.statement}", c.measured, c.method, f"**{c.verdict}**") for c in result.claims],

@@ -11,7 +11,7 @@ from ..envs.catalogue import short_name, task_class
 from ..evaluation.competitors import RANKED
 from ..evaluation.figures import draw_differences
 from ..evaluation.metrics import Record
-from .ranking import ranking, ranking_sentence
+from .ranking import HARM, ranking, ranking_sentence, who_is_best
 from .records import check_known
 from .results import read_all_results
 from .tables import INCONSISTENT, against_paper, consistency, score_text, with_interval
@@ -19,8 +19,6 @@ from .tables import INCONSISTENT, against_paper, consistency, score_text, with_i
 STRONGEST = 4
 """Classical competitors that the page shows."""
 DIFFERENCE = "relative_cost_difference"
-HARM = 0.02
-"""Relative difference to the paper's algorithm beyond which, with its whole interval, an agent does harm."""
 
 
 class Comparison(NamedTuple):
@@ -48,10 +46,11 @@ def read_benchmark(paths: Sequence[Path]) -> dict[str, list[Record]]:
 
 
 def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
-    """Names that the page shows, of those in the records.
+    """Names that the page shows, of those in the records, in the order of its columns.
 
-    What costs least in the training distribution, of any control and kind; learned agents; the paper's algorithm and
-    the best constant action, tuned; the reference whose score is 1. The others stand in the records.
+    Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
+    algorithm; it and the best constant action, tuned; the reference whose score is 1. The others stand in the records.
+    On a narrow screen only the first columns are seen without scrolling.
     """
     known, cls = baselines_of(id), task_class(id)
     of_default = [record for record in records if record.scenario == cls.default_scenario]
@@ -62,7 +61,8 @@ def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
     ]
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
-    wanted = dict.fromkeys((*classical[:STRONGEST], *shipped_agents(id), *tuned, known.score_bound))
+    strongest, paper = classical[:STRONGEST], known.score_paper
+    wanted = dict.fromkeys((*shipped_agents(id), *strongest, paper, *tuned, known.score_bound))
     return [name for name in wanted if name in present]
 
 
@@ -150,71 +150,67 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
     cls = task_class(records[0].environment)
     known = baselines_of(cls.id)
     paper, columns = paper_of(cls.id), compared_policies(cls.id, records)
-    if paper not in {record.policy for record in records}:
+    if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
+    others = [name for name in columns if name != paper]
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records if r.window == "all"}
     sizes = {record.scenario: record.episodes for record in records}
     metric, component = known.physical
     units = [r.unit for r in records if (r.metric, r.component) == known.physical]
-    if not columns or not units:
+    if not others or not units:
         raise ValueError(
             f"the records of {cls.id} hold nothing to compare with {paper!r}, or no {metric} {component}: make them by "
             "filtergym benchmark --full"
         )
-
-    def rows(metric: str, component: str, names: Sequence[str], scale: float = 1.0) -> list[list[str]]:
-        return [
-            [
-                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
-                *(_two_lines(found.get((scenario, name, metric, component)), scale) for name in names),
-            ]
-            for scenario in sizes
-        ]
-
-    def of_each(text: Callable[[str, str], str]) -> list[list[str]]:
-        return [
-            [
-                f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
-                *(text(scenario, name) for name in (paper, *columns)),
-            ]
-            for scenario in sizes
-        ]
-
     by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
+    bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
+    kinds, learned = {r.policy: r.kind for r in records}, shipped_agents(cls.id)
+    verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
+
+    def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
+        """Table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
+        return Grid(
+            title,
+            ["scenario", *(["verdict"] if judged else []), *heads],
+            [
+                [
+                    f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
+                    *([verdicts[scenario]] if judged else []),
+                    *(text(scenario, name) for name in names),
+                ]
+                for scenario in sizes
+            ],
+        )
 
     def typical(scenario: str, name: str) -> str:
         median, wins = against_paper(by_window, name, (scenario,))
         return "-" if median == "-" else f"{median}<br>{wins}"
 
-    shown = [
-        *columns,
-        *(name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found),
-    ]
-    kinds, learned = {r.policy: r.kind for r in records}, shipped_agents(cls.id)
-    heads = {name: f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in (paper, *shown)}
     quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
     grids = [
-        Grid(
+        grid(
             f"Cost against `{paper}`, %",
-            ["scenario", *(heads[name] for name in columns)],
-            rows(DIFFERENCE, "", columns, 100.0),
+            others,
+            lambda scenario, name: _two_lines(found.get((scenario, name, DIFFERENCE, "")), 100.0),
+            judged=True,
         ),
-        Grid(
+        grid(
             f"{quantity}, {units[0]}",
-            ["scenario", *(heads[name] for name in (paper, *shown))],
-            rows(metric, component, (paper, *shown)),
+            [*columns, *bounds],
+            lambda scenario, name: _two_lines(found.get((scenario, name, metric, component)), 1.0),
         ),
-        Grid(
+        grid(
             f"Episode by episode: median difference of the cost to `{paper}`, %, and share of episodes with a lower "
             "cost, %",
-            ["scenario", *(heads[name] for name in (paper, *columns))],
-            of_each(typical),
+            columns,
+            typical,
         ),
-        Grid(
+        grid(
             "Consistency: mean NEES over the dimension; 1 is consistent, "
             f"{INCONSISTENT} off by more than a factor of two",
-            ["scenario", *(heads[name] for name in (paper, *columns))],
-            of_each(lambda scenario, name: consistency(found.get((scenario, name, "anees", "state")))),
+            columns,
+            lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
         ),
     ]
     differences: dict[str, dict[str, tuple[float, ...]]] = {}
@@ -222,14 +218,14 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
         row = differences.setdefault(
             scenario + ("\n(training)" if cls.scenarios[scenario].training else ""), {}
         )
-        for name in columns:
+        for name in others:
             record = found.get((scenario, name, DIFFERENCE, ""))
             interval = () if record is None else (record.value, record.low, record.high)
             percent = tuple(100.0 * x for x in interval if x is not None)
             if len(percent) == 3:
                 row[name] = percent
-    unranked = [name for name in columns if kinds[name] not in RANKED]
-    figure = draw_differences(differences, columns, learned, unranked, cls.id, paper)
+    unranked = [name for name in others if kinds[name] not in RANKED]
+    figure = draw_differences(differences, others, learned, unranked, cls.id, paper)
     return Comparison(cls.id, grids, figure)
 
 

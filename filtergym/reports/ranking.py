@@ -19,6 +19,15 @@ ORIGINS = ("paper", "classical", "estimator", "learned", "reference")
 learned; filters of their own, likewise; who knows the truth."""
 
 
+OUTCOMES = {
+    "learned best": "A learned agent costs significantly least",
+    "classical best": "A classical competitor costs significantly least",
+    "no significant difference": "Learned and classical competitors do not differ significantly",
+    "learned only": "Only learned agents take part",
+    "classical only": "No learned agent takes part",
+}
+
+
 class Place(NamedTuple):
     """A ranked competitor with what is said of it."""
 
@@ -46,6 +55,23 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
             role = "learned" if name in learned else kind
             places.append(Place(name, role, record.value, found.get((name, "behind_best"))))
     return sorted(places, key=lambda place: place.cost)
+
+
+def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None) -> str:
+    """Who is best of learned and classical competitors in a scenario, in two or three words.
+
+    It rests on the paired difference between the best one and the best of the other origin: where its interval holds
+    zero, nobody is called best.
+    """
+    best, *others = ranking(records, learned)
+    where = "learned" if best.role == "learned" else "classical"
+    rival = next((place for place in others if (place.role == "learned") != (where == "learned")), None)
+    if rival is None:
+        return f"{where} only"
+    behind = rival.behind
+    if behind is None or behind.low is None or behind.low <= 0.0:
+        return "no significant difference"
+    return f"{where} best"
 
 
 def ranking_sentence(
@@ -121,17 +147,8 @@ def verdict(results: Sequence[Result]) -> list[str]:
     judged = [result for result in usual if ranking(result.records, result.learned)]
     won: dict[str, list[str]] = {}
     for result in judged:
-        first, *others = ranking(result.records, result.learned)
-        was_learned = first.role == "learned"
-        rival = next((place for place in others if (place.role == "learned") != was_learned), None)
-        if not result.learned or rival is None:
-            outcome = "No learned agent takes part"
-        elif rival.behind is not None and (rival.behind.low or 0.0) <= 0.0:
-            outcome = "Learned and classical competitors do not differ significantly"
-        else:
-            outcome = (
-                f"A {'learned agent' if was_learned else 'classical competitor'} costs significantly least"
-            )
+        first = ranking(result.records, result.learned)[0]
+        outcome = OUTCOMES[who_is_best(result.records, result.learned)]
         won.setdefault(outcome, []).append(f"{result.short} (lowest: `{first.name}`)")
     for outcome, names in won.items():
         sentences.append(f"{outcome} in {len(names)} of {len(judged)}: {', '.join(names)}.")
@@ -150,7 +167,7 @@ def verdict(results: Sequence[Result]) -> list[str]:
         f"`{name}` in {result.short} ({_nees(result, name):.2g})"
         for result in judged
         for name in [ranking(result.records, result.learned)[0].name]
-        if not 0.5 <= (_nees(result, name) or 1.0) <= 2.0
+        if (_nees(result, name) or 0.0) > 2.0 or (_nees(result, name) or 1.0) < 0.5
     ]
     if judged:
         sentences.append(

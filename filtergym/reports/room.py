@@ -47,11 +47,11 @@ def room_markdown(records: list[Record], command: str) -> str:
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     header = [
         "policy",
-        "control",
-        "mean cost",
-        f"cost against `{paper_of(first.environment)}`, %",
+        f"cost against `{paper_of(first.environment)}`, %",  # what a narrow screen shows without scrolling
         "median, %",
         "wins, %",
+        "control",
+        "mean cost",
         *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown),
         "ANEES",
         "score",
@@ -61,12 +61,12 @@ def room_markdown(records: list[Record], command: str) -> str:
         rows.append(
             [
                 f"`{name}`",
-                control if kind == "policy" else f"({kind})",
-                with_interval(found.get((name, "cost", "", "all"))),
                 with_interval(
                     found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
                 ),
                 *against_paper(found, name),
+                control if kind == "policy" else f"({kind})",
+                with_interval(found.get((name, "cost", "", "all"))),
                 *(with_interval(found.get((name, "rmse", c, "all"))) for c in shown),
                 consistency(found.get((name, "anees", "state", "all"))),
                 score_text(found.get((name, "score", "", "all"))),

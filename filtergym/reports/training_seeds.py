@@ -5,7 +5,9 @@ that what comes from the training seed and what comes from the episodes can be t
 """
 
 import hashlib
+import html
 import json
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -429,10 +431,16 @@ def compare_scenarios(
 
 
 def grids_as_markdown(grids: Sequence[Grid], runs: Sequence[SeedRun], command: str) -> str:
-    """Tables, and the commands that made them and the runs."""
+    """Tables, the first shown and the others folded, and the commands that made them and the runs."""
     lines: list[str] = []
-    for grid in grids:
-        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
+    for i, grid in enumerate(grids):
+        table = markdown_table(grid.header, grid.rows)
+        if i == 0:
+            lines += [f"**{grid.title}**", "", *table, ""]
+        else:
+            # Between blank lines Markdown is read inside HTML; the summary is HTML only.
+            title = re.sub("`(.+?)`", r"<code>\1</code>", html.escape(grid.title, quote=False))
+            lines += ["<details>", f"<summary>{title}</summary>", "", *table, "", "</details>", ""]
     lines += [f"95 % intervals. Made by `{command}` from the runs of", ""]
     trained: dict[str, list[str]] = {}
     for member in runs:

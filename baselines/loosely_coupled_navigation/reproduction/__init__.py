@@ -8,7 +8,8 @@ Reading: "the systematic errors are compensated" is tested twice, as attenuation
 as removal (no mean error left).
 """
 
-from ...reproduction import Progress, Reproduction, episode_count
+from ...reproduction import Progress, Reproduction, episode_count, its_command
+from .. import PAPER
 from . import claims, experiment, figures
 
 TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they follow, and INS/GNSS fusion"
@@ -18,4 +19,5 @@ STEPS = experiment.STEPS
 def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
     """Run the examples and judge the claims."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES))
-    return Reproduction(TITLE, claims.claims(r), claims.tables(r), figures.figures(r))
+    shown = claims.claims(r), claims.tables(r), figures.figures(r)
+    return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

@@ -11,7 +11,8 @@ Reading: the "posterior" deviations of figures 2 to 4 belong to one run "corresp
 are most likely the filters' own; both those and the errors really made are drawn and told apart.
 """
 
-from ...reproduction import Progress, Reproduction, episode_count
+from ...reproduction import Progress, Reproduction, episode_count, its_command
+from .. import PAPER
 from . import claims, experiment, figures
 
 TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
@@ -21,4 +22,5 @@ STEPS = experiment.STEPS
 def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
     """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100))
-    return Reproduction(TITLE, claims.claims(r), claims.tables(r), figures.figures(r))
+    shown = claims.claims(r), claims.tables(r), figures.figures(r)
+    return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))
