@@ -12,14 +12,15 @@ from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
-from ..evaluation.dataset import notes_of
+from ..evaluation.dataset import fits_classic, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import check_columns, check_formats, evaluation_figures, save
-from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
+from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import Record, flight_records
 from ..evaluation.recording import record
 from ..names import competitor, evaluate, is_learned, tidy_records
 from ..reports.benchmark import Cell, run_benchmark
+from ..reports.export import latex_table, records_as_csv
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.tables import flights_table, recorded_table, results_table
@@ -193,21 +194,31 @@ def evaluate_policies(
     if each and dataset.attrs["recorded"]:
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
     of_flights = flight_records(dataset) if each else []
+    tables = [flights_table(dataset, of_flights, records)] if of_flights else []
+    tables.append(results_table(records) if judged else recorded_table(records))
     if json is not None:
         write_records(json, [*records, *of_flights])
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
+            records_as_csv(waiting / "records.csv", [*records, *of_flights])
+            write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
+            if fits_classic(dataset):
+                write_dataset(waiting / "results.nc", dataset)
             for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
-    if of_flights:
-        console.print(flights_table(dataset, of_flights, records))
-    console.print(results_table(records) if judged else recorded_table(records))
+    for table in tables:
+        console.print(table)
     for note in notes_of(dataset):
         console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
-        console.print(f"figures and records in {out}" if judged else f"records in {out}")
+        console.print(f"figures and records in {out}")
+        if not fits_classic(dataset):
+            console.print(
+                "results.nc is left out: it is too large for NetCDF's classic format. From Python, "
+                "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
+            )
     if estimates is not None:
         console.print(f"estimates in {estimates}", soft_wrap=True)
 
