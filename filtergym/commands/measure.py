@@ -35,6 +35,8 @@ from .terminal import (
     Split,
     Threads,
     Trust,
+    complete_environment,
+    complete_policy,
     console,
     pair,
     parsed_settings,
@@ -48,7 +50,10 @@ MOST_RECORDINGS = 40
 def list_environments(
     environment: Annotated[
         list[str] | None,
-        typer.Argument(help="Environment ids, default all; module:id for one that a module registers."),
+        typer.Argument(
+            help="Environment ids, default all; module:id for one that a module registers.",
+            autocompletion=complete_environment,
+        ),
     ] = None,
 ) -> None:
     """List environments with their papers, controls, scenarios, policies, references and bounds.
@@ -67,14 +72,16 @@ def evaluate_policies(
         str | None,
         typer.Argument(
             help="Environment id; `filtergym list` shows them. module:id for one that a module registers. A recording "
-            "names its own."
+            "names its own.",
+            autocompletion=complete_environment,
         ),
     ] = None,
     policy: Annotated[
         list[str] | None,
         typer.Option(
             help="Policy, estimator, reference or bound; repeat for several. Also a file, the folder of a "
-            "training run, or module:Class."
+            "training run, or module:Class.",
+            autocompletion=complete_policy,
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -270,7 +277,10 @@ def benchmark(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for records and figures.")] = Path("results"),
     seed: Experiment = 0,
-    environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+    environment: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this environment; repeatable.", autocompletion=complete_environment),
+    ] = None,
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
@@ -296,7 +306,9 @@ def benchmark(
 
 def animate(
     environment: Environment,
-    policy: Annotated[list[str], typer.Option(help="Policy; repeat for several.")],
+    policy: Annotated[
+        list[str], typer.Option(help="Policy; repeat for several.", autocompletion=complete_policy)
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
     scenario: ScenarioName = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,

@@ -16,7 +16,20 @@ from ..reports.pages import check_markers, insert_between_markers, markers_of
 from ..reports.records import write_records
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table, results_table
-from .terminal import Columns, Environment, Episodes, Experiment, Formats, Split, Trust, console, progress_bar
+from .terminal import (
+    Columns,
+    Environment,
+    Episodes,
+    Experiment,
+    Formats,
+    Split,
+    Trust,
+    complete_policy,
+    complete_scenario,
+    console,
+    one_of,
+    progress_bar,
+)
 
 
 def comparison_page(
@@ -101,7 +114,9 @@ def page(
 
 
 def reproduce(
-    paper: Annotated[str, typer.Argument(help=f"One of: {', '.join(papers())}.")],
+    paper: Annotated[
+        str, typer.Argument(help=f"One of: {', '.join(papers())}.", autocompletion=one_of(*papers()))
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,
     episodes: Annotated[
         int | None, typer.Option(help="Monte Carlo runs instead of the module's own.")
@@ -129,11 +144,17 @@ def reproduce(
 def seeds(
     runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
     scenario: Annotated[
-        list[str] | None, typer.Option(help="Scenario; repeatable. Default: the training distribution.")
+        list[str] | None,
+        typer.Option(
+            help="Scenario; repeatable. Default: the training distribution.", autocompletion=complete_scenario
+        ),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        typer.Option(help="Opponent; repeatable. Default: tunable policies, tuned ones and references."),
+        typer.Option(
+            help="Opponent; repeatable. Default: tunable policies, tuned ones and references.",
+            autocompletion=complete_policy,
+        ),
     ] = None,
     episodes: Episodes = 2000,
     seed: Experiment = 0,
