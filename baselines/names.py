@@ -33,19 +33,21 @@ def own_competitor(id: str, name: str) -> Any:
 
 
 def evaluate(
-    id: str, competitors: Sequence[str] | Mapping[str, Any], *arguments: Any, **keywords: Any
+    id: str, competitors: str | Sequence[str] | Mapping[str, Any], *arguments: Any, **keywords: Any
 ) -> xarray.Dataset:
     """Run competitors over the same episodes, the environment's own by their names.
 
     Args:
         id: environment id.
-        competitors: names; or by name what :func:`.evaluation.evaluate.evaluate` takes, or a name.
+        competitors: a name, or names; or by name what :func:`.evaluation.evaluate.evaluate` takes, or a name.
         *arguments: of that function.
         **keywords: likewise.
 
     Raises:
         ValueError: for an unknown name, and whatever that function refuses.
     """
+    if isinstance(competitors, str):
+        competitors = [competitors]
     named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
     objects = {
         name: own_competitor(id, entry) if isinstance(entry, str) else entry for name, entry in named.items()

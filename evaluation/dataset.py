@@ -7,13 +7,37 @@ remains in words: see the functions of this module for what they mean.
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy
 import xarray
 
+from .files import whole_file
+
+MOST_BYTES = 2**31 - 1
+"""Of one variable in NetCDF's classic format, as SciPy writes it."""
 MOST_WHOLE = 2**31 - 1
 """Largest whole number of an attribute in NetCDF's classic format."""
+
+
+def fits_classic(dataset: xarray.Dataset) -> bool:
+    """Whether NetCDF's classic format, which needs nothing but SciPy, has room for every variable."""
+    return all(variable.nbytes <= MOST_BYTES for variable in dataset.variables.values())
+
+
+def write_dataset(path: Path, dataset: xarray.Dataset) -> None:
+    """Write an evaluation in NetCDF's classic format with 64-bit offsets, which R, MATLAB and most others open.
+
+    Raises:
+        ValueError: if a variable is too large for it, or the file cannot be written.
+    """
+    if not fits_classic(dataset):
+        raise ValueError(
+            f"a variable is larger than {MOST_BYTES:,} bytes, what NetCDF's classic format takes"
+        )
+    with whole_file(path) as partial:
+        dataset.to_netcdf(partial, engine="scipy", format="NETCDF3_64BIT")
 
 
 def windows_of(dataset: xarray.Dataset) -> dict[str, tuple[int, int]]:

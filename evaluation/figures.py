@@ -68,7 +68,7 @@ def _in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
         from matplotlib import rc_context
 
         size = FONT_SIZES[check_columns(columns)]
-        settings = {
+        settings: Any = {
             "font.family": "sans-serif",
             "font.size": size,
             "axes.labelsize": size,
@@ -837,6 +837,6 @@ def save(figure: Any, path: Path) -> None:
     # Without the time of writing.
     metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(written)
     # Type 42: TrueType as it is, which journals take; Type 3, the default, many refuse.
-    settings = {"svg.fonttype": "none", "svg.hashsalt": "filtergym", "pdf.fonttype": 42}
+    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "filtergym", "pdf.fonttype": 42}
     with whole_file(path) as partial, rc_context(settings):
         figure.savefig(partial, format=written, dpi=DOTS_PER_INCH, metadata=metadata)

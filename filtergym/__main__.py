@@ -64,7 +64,6 @@ def application() -> Any:
     app = typer.Typer(
         callback=_general,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
         result_callback=close_output,
@@ -88,7 +87,8 @@ def main() -> None:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            application()([word for word in sys.argv[1:] if word != "--debug"])
+            # Under one name, however it was started: the shell asks for completions of that.
+            application()([word for word in sys.argv[1:] if word != "--debug"], prog_name="filtergym")
     except Exception as error:
         if debug:
             raise

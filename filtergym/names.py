@@ -1,6 +1,7 @@
 """Every name that a user gives, and what it stands for: the one place where names become objects."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -25,20 +26,28 @@ GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
 
 
-def competitor(env: str, name: str, *, trust: bool = False) -> Any:
+def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
     """Return what makes a policy, estimator, reference or bound for a task.
 
     Args:
         env: environment id.
         name: one of the environment's own, ``NAME-tuned``, a shipped agent, a file (``.safetensors``, or the
             ``.zip`` of a Stable-Baselines3 model), the folder of a training run, ``module:Class`` of a user's, or
-            ``gated:NAME`` of a policy: that one where something is wrong, elsewhere the paper's algorithm.
+            ``gated:NAME`` of a policy: that one where something is wrong, elsewhere the paper's algorithm. A path is
+            that of a file or folder, whatever else has its name.
         trust: load a ``.zip``, which can execute code.
 
     Raises:
         ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
     id = task_class(env).id
+    if isinstance(name, Path):
+        found = learned_policy(id, str(name.absolute()), trust)
+        if found is None:
+            raise ValueError(
+                f"cannot load policy {str(name)!r}: it is neither a .safetensors, a .zip, nor a folder"
+            )
+        return found
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return gated(inner, competitor(env, inner, trust=trust))
@@ -69,7 +78,7 @@ def is_learned(env: str, name: str) -> bool:
 
 def evaluate(
     env: str,
-    competitors: Sequence[str] | Mapping[str, Any],
+    competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
     scenario: Any = None,
     episodes: int = 500,
     seed: int = 0,
@@ -84,11 +93,12 @@ def evaluate(
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        competitors: names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
+        competitors: a name, names, or a mapping from a name to a name, a class, or an object: with a method ``predict``
             (:class:`~filtergym.evaluation.competitors.Policy`), or with ``start`` and ``update``
             (:class:`~filtergym.evaluation.competitors.Estimator`); see :func:`competitor` for what a name can be. A
             model of Stable-Baselines3 is shown observations as its ``VecNormalize`` normalises them, if it holds one.
-        scenario: name of a scenario or a trajectory; default: the environment's training distribution.
+        scenario: name of a scenario, path of flights or of a recording, or a trajectory; default: the environment's
+            training distribution.
         episodes: Monte Carlo runs M.
         seed: number of the experiment.
         split: "test" (default), "validation" or "train"; splits share no episode.
@@ -105,13 +115,17 @@ def evaluate(
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
             an estimator that does not answer with mean and covariance.
     """
-    named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
+    if isinstance(competitors, str | Path):
+        competitors = [competitors]
+    named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     id = task_class(env).id
     for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
         if named[name] not in (name, competitor(id, name)):
             raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
     objects = {
-        name: competitor(env, entry, trust=trust) if isinstance(entry, str) else with_normalisation(entry)
+        name: competitor(env, entry, trust=trust)
+        if isinstance(entry, str | Path)
+        else with_normalisation(entry)
         for name, entry in named.items()
     }
     return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
@@ -134,7 +148,7 @@ def make_policy(
     Args:
         env: an environment, single or native vector, in which the policy acts; or the id of one, which is then made
             with ``gymnasium.make(id, **made.keywords)``.
-        policy: a name, see :func:`competitor`, or an object or a class as in :func:`evaluate`.
+        policy: a name or a path, see :func:`competitor`, or an object or a class as in :func:`evaluate`.
         control: for an id: demand this control; by default the policy's own.
         scenario: for an id: of the environment.
         trust: load a model's zip, which can execute code.
@@ -151,8 +165,9 @@ def make_policy(
         if control is not None or scenario is not None or keywords:
             raise ValueError("control, scenario and parameters are the environment's own: leave them out")
         control = task.control
-    name = policy if isinstance(policy, str) else type(policy).__name__
-    maker = competitor(cls.id, policy, trust=trust) if isinstance(policy, str) else with_normalisation(policy)
+    name = str(policy) if isinstance(policy, str | Path) else type(policy).__name__
+    named = isinstance(policy, str | Path)
+    maker = competitor(cls.id, policy, trust=trust) if named else with_normalisation(policy)
     kind = kind_of(maker)
     if kind != "policy":
         raise ValueError(f"{name!r} does not act: of kind {kind}, it can be evaluated only")

@@ -100,7 +100,8 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     assert {r["seed"] for r in records} == {1}
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {
-        "records.json", "rmse_over_time.png", "error_distribution.png", "consistency.png", "mode_probabilities.png",
+        "records.json", "records.csv", "table.tex", "results.nc",
+        "rmse_over_time.png", "error_distribution.png", "consistency.png", "mode_probabilities.png",
     }  # fmt: skip
 
 

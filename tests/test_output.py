@@ -46,7 +46,9 @@ def dataset():
 def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("filtergym.commands.measure.evaluate", lambda *_, **__: dataset)
-    monkeypatch.setattr("filtergym.commands.measure.evaluation_figures", lambda *_, **__: [("figure", Drawn())])
+    monkeypatch.setattr(
+        "filtergym.commands.measure.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
+    )
 
     def command(*words, output=None):
         if output is not None:

@@ -106,8 +106,8 @@ def its_command(paper: str, episodes: int | None) -> str:
     return f"filtergym reproduce {paper}{runs} --out DIR"
 
 
-def as_markdown(result: Reproduction) -> str:
-    """Claims, tables and figures as one page."""
+def as_markdown(result: Reproduction, suffix: str = "png") -> str:
+    """Claims, tables and figures as one page, which shows files of figures that end in a suffix."""
     lines = [f"# {result.title}", ""]
     if result.command:
         lines += [f"Made by `{result.command}`.", ""]
@@ -119,7 +119,7 @@ def as_markdown(result: Reproduction) -> str:
     for table in result.tables:
         lines += ["", f"## {table.title}", "", *markdown_table(table.header, table.rows)]
     for name, (_, caption) in result.figures.items():
-        lines += ["", f"![{caption}]({name}.png)", "", caption]
+        lines += ["", f"![{caption}]({name}.{suffix})", "", caption]
     return "\n".join(lines) + "\n"
 
 
@@ -132,9 +132,12 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list
     ]
 
 
-def save_reproduction(result: Reproduction, folder: Path) -> None:
-    """Write ``report.md`` and the figures into an existing folder, all of them or none."""
+def save_reproduction(result: Reproduction, folder: Path, formats: Sequence[str] = ("png",)) -> None:
+    """Write ``report.md`` and the figures into an existing folder, all of them or none; the report shows those of the
+    first format.
+    """
     with whole_files(folder) as waiting:
         for name, (figure, _) in result.figures.items():
-            save(figure, waiting / f"{name}.png")
-        write_text(waiting / "report.md", as_markdown(result))
+            for suffix in formats:
+                save(figure, waiting / f"{name}.{suffix}")
+        write_text(waiting / "report.md", as_markdown(result, formats[0]))

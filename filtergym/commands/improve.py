@@ -16,12 +16,21 @@ from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation.files import writable_file
 from ..reports import standing
 from ..reports.tables import tuned_table
-from .terminal import Backend, Environment, TrainingScenario, Trust, console, progress_bar, whole_numbers
+from .terminal import (
+    Backend,
+    Environment,
+    TrainingScenario,
+    Trust,
+    complete_policy,
+    console,
+    progress_bar,
+    whole_numbers,
+)
 
 
 def tune_policy(
     environment: Environment,
-    policy: Annotated[str, typer.Option(help="Policy to tune.")],
+    policy: Annotated[str, typer.Option(help="Policy to tune.", autocompletion=complete_policy)],
     budget: Annotated[int, typer.Option(help="Environment steps to spend.")] = 4_000_000,
     scenario: TrainingScenario = None,
     seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,

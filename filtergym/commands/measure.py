@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import xarray
 
+from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..envs.catalogue import catalogue, check_names, make_task, read_recording, short_name, task_class
 from ..envs.flights import names_flights, read_flights
@@ -12,18 +14,20 @@ from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
-from ..evaluation.dataset import notes_of
+from ..evaluation.dataset import fits_classic, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import check_columns, check_formats, evaluation_figures, save
-from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder
+from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import flight_records
 from ..evaluation.recording import record
 from ..names import competitor, evaluate, is_learned, tidy_records
-from ..reports.benchmark import RESULTS, Cell, run_benchmark
+from ..reports.benchmark import RESULTS, Cell, all_records, result_of, run_benchmark
+from ..reports.export import latex_table, records_as_csv
+from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
-from ..reports.results import Result, settings_of
-from ..reports.tables import flights_table, recorded_table
+from ..reports.results import Result, read_results, settings_of, write_results
+from ..reports.tables import flights_table, recorded_table, results_tables
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -36,6 +40,9 @@ from .terminal import (
     Split,
     Threads,
     Trust,
+    command_line,
+    complete_environment,
+    complete_policy,
     console,
     pair,
     parsed_settings,
@@ -49,7 +56,10 @@ MOST_RECORDINGS = 40
 def list_environments(
     environment: Annotated[
         list[str] | None,
-        typer.Argument(help="Environment ids, default all; module:id for one that a module registers."),
+        typer.Argument(
+            help="Environment ids, default all; module:id for one that a module registers.",
+            autocompletion=complete_environment,
+        ),
     ] = None,
 ) -> None:
     """List environments with their papers, controls, scenarios, policies, references and bounds.
@@ -68,14 +78,16 @@ def evaluate_policies(
         str | None,
         typer.Argument(
             help="Environment id; `filtergym list` shows them. module:id for one that a module registers. A recording "
-            "names its own."
+            "names its own.",
+            autocompletion=complete_environment,
         ),
     ] = None,
     policy: Annotated[
         list[str] | None,
         typer.Option(
             help="Policy, estimator, reference or bound; repeat for several. Also a file, the folder of a "
-            "training run, or module:Class."
+            "training run, or module:Class.",
+            autocompletion=complete_policy,
         ),
     ] = None,
     scenario: ScenarioName = None,
@@ -183,6 +195,7 @@ def evaluate_policies(
             progress=lambda done: bar.update(line, advance=done),
             trust=trust,
             tracks=estimates is not None,
+            drawn_episodes=int(out is not None and estimates is None),
             backend=backend,
             threads=threads,
             **keywords,
@@ -195,24 +208,39 @@ def evaluate_policies(
     if each and dataset.attrs["recorded"]:
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
     of_flights = flight_records(dataset) if each else []
+    tables = [flights_table(dataset, of_flights, records)] if of_flights else []
+    tables += results_tables(records, console.width) if judged else [recorded_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
+            records_as_csv(waiting / "records.csv", [*records, *of_flights])
+            write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
+            if fits_classic(dataset):
+                write_dataset(waiting / "results.nc", dataset)
             for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
-    if of_flights:
-        console.print(flights_table(dataset, of_flights, records))
-    if judged:
-        print_results(records)
-    else:
-        console.print(recorded_table(records))
+            if judged:
+                write_results(
+                    waiting / RESULTS, [result_of(dataset, learned)[0]], settings_of(command_line())
+                )
+    for table in tables:
+        console.print(table)
     for note in notes_of(dataset):
         console.print(note, highlight=False, soft_wrap=True)
     if out is not None:
-        console.print(f"figures and records in {out}" if judged else f"records in {out}")
+        console.print(
+            f"figures, records and {RESULTS} in {out}" if judged else f"figures and records in {out}"
+        )
+        if judged:
+            make_report(*read_results(out / RESULTS), out / REPORT)
+        if not fits_classic(dataset):
+            console.print(
+                "results.nc is left out: it is too large for NetCDF's classic format. From Python, "
+                "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
+            )
     if estimates is not None:
         console.print(f"estimates in {estimates}", soft_wrap=True)
 
@@ -264,22 +292,29 @@ def benchmark(
     ] = False,
     out: Annotated[Path, typer.Option(help="Folder for results, report and figures.")] = Path("results"),
     seed: Experiment = 0,
-    environment: Annotated[list[str] | None, typer.Option(help="Only this environment; repeatable.")] = None,
+    environment: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this environment; repeatable.", autocompletion=complete_environment),
+    ] = None,
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")
     ] = "test",
     details: Annotated[
         bool, typer.Option("--details", help="Print the table of every environment and scenario.")
     ] = False,
+    format: Formats = None,
+    columns: Columns = 2,
     backend: Backend = "auto",
     threads: Threads = 1,
 ) -> None:
     """Run every environment with its competitors; quick by default, resumes after an interruption.
 
+    Figures are in the report; --format writes them as files, too.
+
     Example: filtergym benchmark --full --environment filtergym/ManeuveringTarget-v0 --split validation
     """
-    words = ["--full"] * full + [f"--environment {name}" for name in environment or ()]
-    command = " ".join(["filtergym benchmark", *words, f"--seed {seed} --split {split}"])
+    formats = check_formats(format or [])
+    check_columns(columns)
     with progress_bar() as bar:
 
         def started(cell: Cell, total: int) -> Any:
@@ -290,6 +325,16 @@ def benchmark(
             if details:
                 print_results(result.records)
 
+        def drawn(cell: Cell, curves: xarray.Dataset) -> None:
+            figures = (
+                evaluation_figures(curves, columns, learned=shipped_agents(cell.environment))
+                if formats
+                else ()
+            )
+            for name, figure in figures:
+                for suffix in formats:
+                    save(figure, out / f"{cell.name}.{name}.{suffix}")
+
         results = run_benchmark(
             out,
             full,
@@ -298,18 +343,26 @@ def benchmark(
             split,
             started,
             finished,
+            drawn,
             backend=backend,
             threads=threads,
-            command=command,
+            command=command_line(),
         )
+    tables = [headline_table(results)]
+    tables += [table for result in results for table in results_tables(result.records, console.width)]
+    with whole_files(out) as waiting:
+        records_as_csv(waiting / "records.csv", all_records(results))
+        write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
     print_verdict(results)
-    console.print(f"results in {out / RESULTS}", soft_wrap=True)
-    make_report(results, settings_of(command), out / REPORT)
+    console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
+    make_report(results, settings_of(command_line()), out / REPORT)
 
 
 def animate(
     environment: Environment,
-    policy: Annotated[list[str], typer.Option(help="Policy; repeat for several.")],
+    policy: Annotated[
+        list[str], typer.Option(help="Policy; repeat for several.", autocompletion=complete_policy)
+    ],
     out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
     scenario: ScenarioName = None,
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,

@@ -8,7 +8,7 @@ import typer
 
 from ..baselines.reproduction import paper_module, papers, save_reproduction
 from ..envs.catalogue import find_scenario, importable_name, short_name, task_class
-from ..evaluation.figures import save
+from ..evaluation.figures import check_columns, check_formats, save
 from ..evaluation.files import whole_files, writable_file, writable_folder
 from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
@@ -18,7 +18,20 @@ from ..reports.results import read_all_results
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table
 from .shown import REPORT, make_report, print_results, print_verdict
-from .terminal import Environment, Episodes, Experiment, Split, Trust, console, progress_bar
+from .terminal import (
+    Columns,
+    Environment,
+    Episodes,
+    Experiment,
+    Formats,
+    Split,
+    Trust,
+    complete_policy,
+    complete_scenario,
+    console,
+    one_of,
+    progress_bar,
+)
 
 
 def make(
@@ -46,23 +59,28 @@ def comparison_page(
         Path | None,
         typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
     ] = None,
+    format: Formats = None,
+    columns: Columns = 2,
 ) -> None:
     """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
 
     Example: filtergym comparison results/results.json --into docs/comparison.md
     """
+    formats = check_formats(format or ["png"])
+    check_columns(columns)
     found = comparison.read_benchmark(records)
     markers = {id: f"comparison {short_name(id)}" for id in found}
     overview = "comparison of all"
     if into is not None:
         check_markers(into, markers.values())
-    compared = {id: comparison.compare_environment(own) for id, own in found.items()}
+    compared = {id: comparison.compare_environment(own, columns) for id, own in found.items()}
     if into is not None:
         texts = {}
         with whole_files(into.parent / "images") as images:
             for id, own in found.items():
-                picture = f"comparison_{short_name(id)}.png"
-                save(compared[id].figure, images / picture)
+                for suffix in formats:
+                    save(compared[id].figure, images / f"comparison_{short_name(id)}.{suffix}")
+                picture = f"comparison_{short_name(id)}.{formats[0]}"
                 command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
                 texts[markers[id]] = comparison.comparison_markdown(
                     compared[id], own, f"images/{picture}", command
@@ -117,16 +135,20 @@ def page(
 
 
 def reproduce(
-    paper: Annotated[str, typer.Argument(help=f"One of: {', '.join(papers())}.")],
+    paper: Annotated[
+        str, typer.Argument(help=f"One of: {', '.join(papers())}.", autocompletion=one_of(*papers()))
+    ],
     out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,
     episodes: Annotated[
         int | None, typer.Option(help="Monte Carlo runs instead of the module's own.")
     ] = None,
+    format: Formats = None,
 ) -> None:
     """Run a paper's experiments again and give a verdict on each of its claims.
 
     Example: filtergym reproduce imm-alpha-beta --out results/imm-alpha-beta
     """
+    formats = check_formats(format or ["png"])
     module = paper_module(paper)
     if out is not None:
         writable_folder(out)
@@ -134,7 +156,7 @@ def reproduce(
         line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
         result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
     if out is not None:
-        save_reproduction(result, out)
+        save_reproduction(result, out, formats)
     console.print(claims_table(result))
     if out is not None:
         console.print(f"report and figures in {out}")
@@ -143,18 +165,25 @@ def reproduce(
 def seeds(
     runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
     scenario: Annotated[
-        list[str] | None, typer.Option(help="Scenario; repeatable. Default: the training distribution.")
+        list[str] | None,
+        typer.Option(
+            help="Scenario; repeatable. Default: the training distribution.", autocompletion=complete_scenario
+        ),
     ] = None,
     policy: Annotated[
         list[str] | None,
-        typer.Option(help="Opponent; repeatable. Default: tunable policies, tuned ones and references."),
+        typer.Option(
+            help="Opponent; repeatable. Default: tunable policies, tuned ones and references.",
+            autocompletion=complete_policy,
+        ),
     ] = None,
     episodes: Episodes = 2000,
     seed: Experiment = 0,
     split: Split = "test",
     out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
     into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
-    curves: Annotated[Path | None, typer.Option(help="PNG file for the learning curves.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
+    columns: Columns = 2,
     trust: Trust = False,
 ) -> None:
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
@@ -164,6 +193,9 @@ def seeds(
 
     Example: filtergym seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
     """
+    check_columns(columns)
+    if curves is not None:
+        check_formats([curves.suffix.removeprefix(".").lower()])
     found = training_seeds.load_runs(runs, trust)
     cls = task_class(found[0].run.environment)
     scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
@@ -176,7 +208,7 @@ def seeds(
     if into is not None:
         check_markers(into, [marker])
     if curves is not None:
-        save(training_seeds.learning_curves(found), curves)
+        save(training_seeds.learning_curves(found, columns), curves)
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         records, grids = training_seeds.compare_scenarios(

@@ -3,27 +3,100 @@
 import ast
 import io
 import os
+import shlex
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+# --- what a shell completes; imports wait until it asks
+
+
+def complete_environment(incomplete: str) -> list[str]:
+    """Environment ids; without ``filtergym/`` where that is how a word begins."""
+    from ..envs.catalogue import catalogue
+
+    ids = list(catalogue())
+    found = [id for id in ids if id.startswith(incomplete)]
+    return found or [short for id in ids if (short := id.removeprefix("filtergym/")).startswith(incomplete)]
+
+
+def _environments_of(ctx: typer.Context) -> list[str]:
+    """Ids of the environment that the words so far name, or of all if they name none."""
+    from ..envs.catalogue import catalogue, task_class
+
+    named = ctx.params.get("environment")
+    # An option that still lacks its value keeps click from telling the arguments: then the words as shells give them.
+    words = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
+    for word in [named] if isinstance(named, str) else words.split():
+        if ":" in word:  # a module, which is a program: nobody asked to run it
+            continue
+        with suppress(ValueError):
+            return [task_class(word).id]
+    return list(catalogue())
+
+
+def complete_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Names of the environment's scenarios."""
+    from ..envs.catalogue import catalogue
+
+    names = dict.fromkeys(name for id in _environments_of(ctx) for name in catalogue()[id].scenarios)
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Names of the environment's scenarios that agents may be trained on."""
+    from ..envs.catalogue import catalogue
+
+    scenarios = [own for id in _environments_of(ctx) for own in catalogue()[id].scenarios.values()]
+    names = dict.fromkeys(own.name for own in scenarios if own.training)
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Names of the environment's policies, estimators, references and bounds, tuned ones, and shipped agents."""
+    from ..agents.named_policies import shipped_agents
+    from ..baselines.names import own_names
+
+    ids = _environments_of(ctx)
+    names = dict.fromkeys(name for id in ids for name in [*own_names(id), *shipped_agents(id)])
+    return [name for name in names if name.startswith(incomplete)]
+
+
+def one_of(*words: str) -> Callable[[str], list[str]]:
+    """Return what completes one of a few words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in words if word.startswith(incomplete)]
+
+    return complete
+
+
 Environment = Annotated[
     str,
     typer.Argument(
-        help="Environment id; `filtergym list` shows them. module:id for one that a module registers."
+        help="Environment id; `filtergym list` shows them. module:id for one that a module registers.",
+        autocompletion=complete_environment,
     ),
 ]
 ScenarioName = Annotated[
     str | None,
     typer.Option(
         help="Scenario; or flights of your own: a file (CSV, NetCDF, Parquet), a folder, or a pattern in quotes; "
-        "default: the training distribution."
+        "default: the training distribution.",
+        autocompletion=complete_scenario,
     ),
 ]
-TrainingScenario = Annotated[str | None, typer.Option(help="A training scenario; held-out ones are refused.")]
+TrainingScenario = Annotated[
+    str | None,
+    typer.Option(
+        help="A training scenario; held-out ones are refused.", autocompletion=complete_training_scenario
+    ),
+]
 Episodes = Annotated[int, typer.Option(help="Monte Carlo runs.")]
 Experiment = Annotated[int, typer.Option(help="Number of the experiment.")]
 Trust = Annotated[
@@ -33,19 +106,28 @@ Trust = Annotated[
     ),
 ]
 Backend = Annotated[
-    str, typer.Option(help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.")
+    str,
+    typer.Option(
+        help="What computes the steps: auto, compiled (with filtergym[fast]) or numpy.",
+        autocompletion=one_of("auto", "compiled", "numpy"),
+    ),
 ]
 Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
 Formats = Annotated[
     list[str] | None,
     typer.Option(
-        "--format", help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several."
+        "--format",
+        help="Of figures: png, svg (text stays text) or pdf (fonts embedded); repeat for several.",
+        autocompletion=one_of("png", "svg", "pdf"),
     ),
 ]
 Columns = Annotated[
     int, typer.Option(help="Width of figures, in columns of a paper: 1 (3.5 in) or 2 (7.16 in).")
 ]
-Split = Annotated[str, typer.Option(help="test, validation or train.")]
+Split = Annotated[
+    str,
+    typer.Option(help="test, validation or train.", autocompletion=one_of("test", "validation", "train")),
+]
 
 
 class Output(Console):
@@ -133,6 +215,11 @@ def whole_numbers(option: str, text: str) -> list[int]:
             raise ValueError(f"{option} needs whole numbers such as 0-4 or 0,3,5-7, got {text!r}")
         found += [number for number in numbers if number not in found]
     return found
+
+
+def command_line() -> str:
+    """Return the command that runs, as one would type it again."""
+    return shlex.join(["filtergym", *sys.argv[1:]])
 
 
 def parsed_settings(settings: list[str]) -> dict[str, Any]:

@@ -141,8 +141,12 @@ def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
 
 
-def compare_environment(records: Sequence[Record]) -> Comparison:
+def compare_environment(records: Sequence[Record], width: int = 2) -> Comparison:
     """Tables of one environment: cost against the paper's algorithm, and the physical error.
+
+    Args:
+        records: of the environment.
+        width: of the figure, 1 or 2 columns of a paper.
 
     Raises:
         ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
@@ -225,7 +229,7 @@ def compare_environment(records: Sequence[Record]) -> Comparison:
             if len(percent) == 3:
                 row[name] = percent
     unranked = [name for name in others if kinds[name] not in RANKED]
-    figure = draw_differences(differences, others, learned, unranked, cls.id, paper)
+    figure = draw_differences(differences, others, learned, unranked, cls.id, paper, columns=width)
     return Comparison(cls.id, grids, figure)
 
 

@@ -163,8 +163,8 @@ def _algorithm(run: TrainingRun) -> str:
     return run.algorithm + around + (" gated" if run.gated else "")
 
 
-def learning_curves(runs: Sequence[SeedRun]) -> Any:
-    """Picture of every run's validations; a dot marks its best agent."""
+def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
+    """Picture of every run's validations, 1 or 2 columns of a paper wide; a dot marks its best agent."""
     first = runs[0].run
     paper = paper_of(first.environment)
     for member in runs:
@@ -177,7 +177,7 @@ def learning_curves(runs: Sequence[SeedRun]) -> Any:
         values = [entry["relative_cost_difference"][0] for entry in member.run.validation]
         curves.setdefault(member.algorithm, []).append((steps, values))
     title = f"{first.environment}, scenario {first.scenario}; dots: best agents"
-    return draw_learning_curves(curves, title, paper)
+    return draw_learning_curves(curves, title, paper, columns=columns)
 
 
 def default_opponents(id: str) -> list[str]:

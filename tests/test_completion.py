@@ -1,0 +1,108 @@
+"""Completion by the shell: through ``main``, with the words of the environment named so far, and without torch."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.names import own_names
+from filtergym.envs.catalogue import catalogue
+
+from filtergym.__main__ import main
+
+TARGET = "filtergym/ManeuveringTarget-v0"
+
+
+@pytest.fixture
+def complete(monkeypatch, capsys):
+    """What bash is offered for words, of which the last is completed."""
+
+    def offered(*words):
+        monkeypatch.setattr(sys, "argv", ["/somewhere/bin/filtergym"])
+        monkeypatch.setenv("_FILTERGYM_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", " ".join(["filtergym", *words]))
+        monkeypatch.setenv("COMP_CWORD", str(len(words)))
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 0
+        shown = capsys.readouterr()
+        assert shown.err == ""
+        return shown.out.split()
+
+    return offered
+
+
+def test_commands(complete):
+    assert complete("ev") == ["evaluate"]
+
+
+def test_environments(complete):
+    assert complete("evaluate", "") == list(catalogue())
+    assert complete("list", "filtergym/M") == [TARGET]
+    assert complete("train", "Uav") == ["UavAutopilot-v0"]
+    assert complete("benchmark", "--environment", "filtergym/R") == ["filtergym/RadarEsmTracking-v0"]
+
+
+def test_scenarios_of_the_environment(complete):
+    assert complete("evaluate", TARGET, "--scenario", "") == list(catalogue()[TARGET].scenarios)
+    training = [s.name for s in catalogue()[TARGET].scenarios.values() if s.training]
+    assert complete("train", TARGET, "--scenario", "") == training
+    assert training != list(catalogue()[TARGET].scenarios)
+    # Before anybody has named the environment, those of all.
+    assert {"cruise", "silent"} <= set(complete("evaluate", "--scenario", ""))
+
+
+@pytest.mark.parametrize("command", ["evaluate", "animate", "tune"])
+def test_policies_of_the_environment(complete, command):
+    expected = {name for name in [*own_names(TARGET), *shipped_agents(TARGET)] if name.startswith("k")}
+    assert set(complete(command, TARGET, "--policy", "k")) == expected
+    assert "kalman-imm" in expected
+    assert complete(command, "ManeuveringTarget", "--policy", "imm", "--policy", "known-t") == ["known-turn"]
+
+
+def test_few_words_and_nothing(complete):
+    assert complete("evaluate", TARGET, "--format", "p") == ["png", "pdf"]
+    assert complete("evaluate", TARGET, "--backend", "") == ["auto", "compiled", "numpy"]
+    assert complete("reproduce", "imm") == ["imm-alpha-beta"]
+    assert complete("evaluate", TARGET, "--policy", "nobody") == []
+    # A module is a program, and nobody has asked to run it.
+    assert complete("evaluate", "no_module:mine/Own-v0", "--scenario", "paper")[:1] == ["paper"]
+
+
+def test_the_script_for_a_shell():
+    """Asked for by name, as where the shell cannot be told from the processes."""
+    run = subprocess.run(
+        [sys.executable, "-m", "filtergym", "--show-completion", "zsh"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
+    )
+    assert run.returncode == 0, run.stderr
+    assert "#compdef filtergym" in run.stdout
+    assert "_FILTERGYM_COMPLETE=complete_zsh" in run.stdout
+
+
+def test_other_shells(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["filtergym"])
+    monkeypatch.setenv("_FILTERGYM_COMPLETE", "complete_zsh")
+    monkeypatch.setenv("_TYPER_COMPLETE_ARGS", f"filtergym evaluate {TARGET} --scenario c")
+    with pytest.raises(SystemExit):
+        main()
+    shown = capsys.readouterr().out
+    assert "cruise" in shown
+    assert "crowded" not in shown  # of another environment
+
+
+def test_completion_imports_no_torch_and_takes_no_time():
+    code = (
+        "import sys, os; os.environ.update(_FILTERGYM_COMPLETE='complete_bash', COMP_CWORD='3', "
+        f"COMP_WORDS='filtergym evaluate {TARGET} --policy p'); sys.argv = ['filtergym']\n"
+        "from filtergym.__main__ import main\n"
+        "try:\n    main()\nfinally:\n"
+        "    heavy = {'torch', 'stable_baselines3', 'matplotlib.pyplot', 'plotly'} & set(sys.modules)\n"
+        "    print(sorted(heavy), file=sys.stderr)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.stderr.strip() == "[]"

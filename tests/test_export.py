@@ -1,0 +1,190 @@
+"""Records as CSV, tables for LaTeX, and what an evaluation writes into its folder."""
+
+import csv
+import re
+import shutil
+import subprocess
+
+import pytest
+import xarray
+from filtergym.baselines.reproduction import Grid
+from filtergym.evaluation.metrics import flight_records
+from rich.table import Table
+from rich.text import Text
+
+from filtergym import evaluate, record, tidy_records
+from filtergym.__main__ import main
+from filtergym.reports.export import latex_table, latex_text, records_as_csv
+from filtergym.reports.tables import flights_table, grid_table, recorded_table, results_table
+
+ENV = "filtergym/ManeuveringTarget-v0"
+NASTY = '50 % of $a_b$ & {c} ~ ^ # \\ < > | " ± 3 m², σ ≤ ∞, λ, 日, Müller'
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return evaluate(ENV, ["imm", "adaptive", "known-turn", "known-input-bound"], "paper", 6, horizon=20)
+
+
+@pytest.fixture(scope="module")
+def tables(dataset):
+    records = tidy_records(dataset)
+    flights = evaluate(ENV, ["imm", "adaptive"], record(ENV, "paper", 3, horizon=15))
+    nasty = Table(title=NASTY, caption=f"{NASTY}\n[second] line")
+    nasty.add_column(NASTY)
+    nasty.add_column("two\nlines [m]", justify="right")
+    nasty.add_row("[1, 2]", "-5.3 [-7, -1e-3]\n[4]")
+    nasty.add_row(Text("*", style="bold"), NASTY, end_section=True)
+    nasty.add_row("", "")
+    return {
+        "results": results_table(records),
+        "recorded": recorded_table(tidy_records(flights)),
+        "flights": flights_table(flights, flight_records(flights), tidy_records(flights)),
+        "grid": grid_table(Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]])),
+        "nasty": nasty,
+    }
+
+
+def test_records_as_csv_hold_every_field(dataset, tmp_path):
+    records = tidy_records(dataset)
+    records_as_csv(tmp_path / "a.csv", records)
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(records[0]._fields)
+    assert len(rows) == len(records)
+    for row, expected in zip(rows, records, strict=True):
+        for name, value in expected._asdict().items():
+            if value is None:
+                assert row[name] == ""
+            else:
+                assert type(value)(row[name]) == value  # to the last digit
+    records_as_csv(tmp_path / "none.csv", [])
+    assert (tmp_path / "none.csv").read_text().startswith("environment,control,scenario,policy,kind,metric")
+
+
+def cells_of(table):
+    """What the terminal shows, row by row."""
+    columns = [[getattr(cell, "plain", cell) for cell in column.cells] for column in table.columns]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def without_commands(text):
+    """What a reader sees of a line of LaTeX; only for texts without characters that LaTeX spells."""
+    return re.sub(r"\\([%&_#${}])", r"\1", text.replace("$-$", "-").replace("{}", ""))
+
+
+@pytest.mark.parametrize("name", ["results", "recorded", "flights", "grid", "nasty"])
+def test_tables_are_well_formed(tables, name):
+    table = tables[name]
+    text = latex_table(table)
+    begun = re.findall(r"\\begin\{([\w*]+)\}", text)
+    ended = re.findall(r"\\end\{([\w*]+)\}", text)
+    assert sorted(begun) == sorted(ended)
+    assert begun[:2] == ["table*" if len(table.columns) > 4 else "table", "tabular"]
+    bare = re.sub(r"\\.", "", text)
+    assert bare.count("{") == bare.count("}")
+    assert bare.count("$") % 2 == 0
+    body = text.partition("\\toprule")[2].partition("\\bottomrule")[0]
+    rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+    assert len(rows) == 1 + len(table.rows)
+    assert {len(re.findall(r"(?<!\\)&", row)) for row in rows} == {len(table.columns) - 1}
+    assert not re.search(r"(?<!\\)[%#]", body)
+    letters = re.search(r"\\begin\{tabular\}\{(\w+)\}", text).group(1)
+    assert letters == "".join("r" if column.justify == "right" else "l" for column in table.columns)
+    assert text.count("\\caption{") == 1
+
+
+@pytest.mark.parametrize("name", ["results", "recorded", "flights"])
+def test_cells_are_those_of_the_terminal(tables, name):
+    table = tables[name]
+    body = latex_table(table).partition("\\toprule")[2].partition("\\bottomrule")[0]
+    rows = [line.removesuffix(r" \\") for line in body.splitlines() if line.endswith(r"\\")][1:]
+    found = [[without_commands(cell) for cell in re.split(r"(?<!\\) & ", row)] for row in rows]
+    assert found == cells_of(table)
+
+
+def test_what_latex_takes_for_commands_is_escaped():
+    assert latex_text("a_b & 50 %") == r"a\_b \& 50 \%"
+    assert latex_text("-5.3 [-7, -.1] 1e-3 plain-white a-1") == "$-$5.3 [$-$7, $-$.1] 1e-3 plain-white a-1"
+    assert latex_text("σ λ ± 日 é") == r"$\sigma$ $\lambda$ $\pm$ [U+65E5] é"
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed")
+def test_tables_compile(tables, tmp_path):
+    body = "\n".join(map(latex_table, tables.values()))
+    (tmp_path / "paper.tex").write_text(
+        "\\documentclass{article}\n\\usepackage{booktabs,graphicx}\n\\begin{document}\n"
+        + body
+        + "\\end{document}\n",
+        encoding="utf-8",
+    )
+    run = subprocess.run(
+        ["pdflatex", "-halt-on-error", "-interaction=nonstopmode", "paper.tex"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout[-2000:]
+    assert (tmp_path / "paper.pdf").stat().st_size > 10_000
+    log = (tmp_path / "paper.log").read_text(encoding="latin-1")
+    assert "Missing character" not in log
+    # Wide tables shrink to the line; the nasty title may not break.
+    assert not re.search(r"Overfull \\hbox \((\d{3,})", log)
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return ended.value.code
+
+
+def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    words = (
+        "evaluate",
+        ENV,
+        "--scenario",
+        "paper",
+        "--policy",
+        "imm",
+        "--policy",
+        "adaptive",
+        "--episodes",
+        4,
+    )
+    options = ("--format", "svg", "--format", "pdf", "--columns", 1)
+    assert run(monkeypatch, *words, "--set", "horizon=20", "--out", out, *options) == 0
+    figures = ["rmse_over_time", "error_distribution", "consistency", "mode_probabilities"]
+    expected = {"records.json", "records.csv", "table.tex", "results.nc"}
+    expected |= {f"{name}.{suffix}" for name in figures for suffix in ("svg", "pdf")}
+    assert {path.name for path in out.iterdir()} == expected
+    assert re.search(r'width="252(\.0)?pt"', (out / "rmse_over_time.svg").read_text())
+    assert "imm & weights" in (out / "table.tex").read_text()
+    dataset = evaluate(ENV, ["imm", "adaptive"], "paper", 4, horizon=20)
+    with xarray.open_dataset(out / "results.nc", engine="scipy") as read:
+        xarray.testing.assert_identical(read.load(), dataset)
+    assert (out / "results.nc").read_bytes()[:4] == b"CDF\x02"  # the classic format, which R and MATLAB open
+
+    def spoilt(*_, **__):
+        raise ValueError("no ink")
+
+    monkeypatch.setattr("filtergym.commands.measure.save", spoilt)
+    assert run(monkeypatch, *words, "--out", tmp_path / "none") == 2
+    assert list((tmp_path / "none").iterdir()) == []
+    capsys.readouterr()
+    for wrong in (("--format", "gif"), ("--columns", 3)):
+        assert run(monkeypatch, *words, "--out", tmp_path / "refused", *wrong) == 2
+        assert not (tmp_path / "refused").exists()
+    assert "got 'gif'" in capsys.readouterr().err
+
+
+def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("filtergym.evaluation.dataset.MOST_BYTES", 1000)
+    words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
+    assert run(monkeypatch, *words) == 0
+    assert not (tmp_path / "results.nc").exists()
+    assert (tmp_path / "records.csv").exists()
+    assert "results.nc is left out" in capsys.readouterr().out

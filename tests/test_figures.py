@@ -1,0 +1,241 @@
+"""Figures of an evaluation: who is told apart, how kinds look, what the files hold, and what stands on the axes."""
+
+import dataclasses
+import itertools
+import re
+
+import numpy as np
+import pytest
+import xarray
+from filtergym.evaluation.curves import curves_of
+from filtergym.evaluation.figures import (
+    COLOURS,
+    MOST_HIGHLIGHTED,
+    WIDTHS,
+    by_cost,
+    draw_differences,
+    draw_error_over_time,
+    draw_learning_curves,
+    evaluation_figures,
+    highlighted,
+    joined,
+    looks,
+    merged,
+    save,
+    sensible_limits,
+)
+from matplotlib.colors import to_hex
+
+from filtergym import evaluate, record
+
+ENV = "filtergym/ManeuveringTarget-v0"
+NAMES = [
+    "fixed-low",
+    "adaptive",
+    "imm",
+    "zero",  # the IMM by another control: the same line
+    "known-turn",
+    "known-input-bound",
+    "kalman-imm",
+    "fixed-high",
+    "hard-imm",
+    "bptt",
+]
+
+
+@pytest.fixture(scope="module")
+def curves() -> xarray.Dataset:
+    return curves_of(evaluate(ENV, NAMES, "paper", 12, horizon=80))
+
+
+def lines(axis):
+    """Lines drawn in data coordinates, by label; grey ones have none."""
+    return [
+        line for line in axis.lines if line.get_transform() == axis.transData and len(line.get_xdata()) > 2
+    ]
+
+
+def named(axis):
+    return {line.get_label(): line for line in lines(axis) if not line.get_label().startswith("_")}
+
+
+def texts(figure):
+    return [text.get_text() for axis in figure.axes for text in axis.texts]
+
+
+def test_six_lines_are_told_apart_the_most_important_first(curves):
+    chosen = highlighted(curves, learned=["bptt"])
+    assert len(chosen) == MOST_HIGHLIGHTED
+    assert chosen[:4] == ["imm", "known-turn", "known-input-bound", "bptt"]
+    ranked = by_cost(curves)
+    classical = [name for name in ranked if name not in ("imm", "zero", "bptt")]
+    assert chosen[4] == classical[0]
+    assert "zero" not in chosen  # it is the IMM's line
+    cost = curves["mean_cost"].sel(policy=ranked).values
+    assert (np.diff(cost) >= 0.0).all()
+    assert "known-turn" not in ranked
+    figure = draw_error_over_time(curves, looks(curves, learned=["bptt"]))
+    for axis in figure.axes[:2]:
+        told = named(axis)
+        assert len(told) == MOST_HIGHLIGHTED
+        grey = [line for line in lines(axis) if to_hex(line.get_color()) == to_hex("0.72")]
+        # Every line once, and fewer than there are policies, since two are the same; all but six grey, without a name.
+        different = len(np.unique(curves["rmse"].values.reshape(len(NAMES), -1).round(6), axis=0))
+        assert MOST_HIGHLIGHTED < different < len(NAMES)
+        assert len(lines(axis)) == different
+        assert len(grey) == different - MOST_HIGHLIGHTED
+        assert all(line.get_label().startswith("_") for line in grey)
+    assert "grey: others" in figure.get_suptitle()
+
+
+def test_lines_that_are_the_same_share_a_name_and_are_drawn_once(curves):
+    figure = draw_error_over_time(curves)
+    assert "imm = zero" in named(figure.axes[0])
+    assert "imm = zero" in texts(figure)
+    assert joined(["a", "b", "c", "d"]) == "a = b = 2 more"
+    nan = np.full(3, np.nan)
+    values = {"a": np.ones(3), "b": np.ones(3) * 1.001, "c": np.ones(3), "d": nan, "e": nan}
+    assert merged("abcde", values) == {"a": ["a", "c"], "b": ["b"], "d": ["d"], "e": ["e"]}
+
+
+def test_kinds_always_look_the_same(curves):
+    dashes = {"imm": "-", "kalman-imm": "-", "bptt": "-", "known-turn": "--", "known-input-bound": ":"}
+    look = looks(curves, list(dashes), ["bptt"])
+    assert {name: style["linestyle"] for name, style in look.items()} == dashes
+    colours = [style["color"] for style in look.values()]
+    assert len({*zip(colours, dashes.values(), strict=True)}) == len(dashes)
+    assert look["imm"]["color"] == COLOURS[0]
+    assert look["bptt"]["linewidth"] > look["imm"]["linewidth"]
+    # Whoever else is there, the paper's algorithm, references and bounds keep their looks.
+    for other in (["adaptive", "known-turn", "imm"], ["known-input-bound", "imm", "hard-imm"]):
+        assert all(
+            looks(curves, other)[name][key] == look[name][key]
+            for name in set(other) & set(look)
+            for key in ("color", "linestyle")
+        )
+    for _, figure in evaluation_figures(curves, highlight=list(dashes)):
+        for axis in figure.axes:
+            for label, line in named(axis).items():
+                name = label.partition(" = ")[0]
+                if name in dashes:
+                    assert line.get_linestyle() == dashes[name]
+
+
+def test_who_is_told_apart_may_be_asked_for(curves):
+    assert highlighted(curves, ["adaptive", "imm"]) == ["adaptive", "imm"]
+    with pytest.raises(ValueError, match="cannot highlight 'mine': there are fixed-low"):
+        highlighted(curves, ["mine"])
+    with pytest.raises(ValueError, match="at most 6 lines can be told apart, got 7"):
+        highlighted(curves, NAMES[:7])
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+def test_figures_are_as_wide_as_columns_and_legible(curves, columns):
+    figures = dict(evaluation_figures(curves, columns))
+    assert list(figures) == ["rmse_over_time", "error_distribution", "consistency", "mode_probabilities"]
+    for figure in figures.values():
+        assert figure.get_figwidth() == WIDTHS[columns]
+        figure.draw_without_rendering()
+        box = figure.get_tightbbox().padded(-0.05)
+        assert box.x0 >= -0.01
+        assert box.x1 <= WIDTHS[columns] + 0.01
+        for axis in figure.axes:
+            labels = [axis.xaxis.label, axis.yaxis.label, *axis.get_xticklabels()]
+            assert min(label.get_fontsize() for label in labels) >= 6.0
+    with pytest.raises(ValueError, match="1 or 2 columns wide, got 3"):
+        dict(evaluation_figures(curves, 3))
+
+
+def test_seconds_below_and_measurements_above(curves):
+    figure = draw_error_over_time(curves)
+    assert figure.axes[1].get_xlabel() == "time, s"
+    line = next(iter(named(figure.axes[0]).values()))
+    np.testing.assert_allclose(line.get_xdata(), 6.0 * np.arange(1, 81))
+    above = figure.axes[0].child_axes[0]
+    assert above.get_xlabel() == "measurement"
+    figure.draw_without_rendering()
+    assert np.ptp(above.get_xlim()) == pytest.approx(np.ptp(figure.axes[0].get_xlim()) / 6.0)
+    figure = draw_error_over_time(curves.drop_vars("elapsed"))
+    assert figure.axes[1].get_xlabel() == "measurement"
+    assert not figure.axes[0].child_axes
+    np.testing.assert_array_equal(next(iter(named(figure.axes[0]).values())).get_xdata(), np.arange(1, 81))
+
+
+def test_labels_stand_at_the_ends_of_lines_and_never_on_each_other(curves):
+    figure = draw_error_over_time(curves)
+    figure.draw_without_rendering()
+    renderer = figure.canvas.get_renderer()
+    for axis in figure.axes[:2]:
+        told = named(axis)
+        boxes = {t.get_text(): t.get_window_extent(renderer) for t in axis.texts if t.get_text() in told}
+        assert set(boxes) == set(told)
+        ordered = sorted(boxes.values(), key=lambda box: box.y0)
+        assert all(low.y1 <= high.y0 + 0.5 for low, high in itertools.pairwise(ordered))
+        for text in axis.texts:
+            if text.get_text() in told:
+                assert text.get_color() == told[text.get_text()].get_color()
+    # Long names leave too little of a narrow figure: a legend then, and nothing beside the lines.
+    long = curves.assign_coords(policy=[f"{name}-with-very-much-to-tell" for name in curves["policy"].values])
+    figure = draw_error_over_time(long, columns=1)
+    assert not [t for t in texts(figure) if "tell" in t]
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert labels[-1] == "others"
+    assert labels.count("others") == 1
+    assert len(labels) == MOST_HIGHLIGHTED + 1
+
+
+def test_one_line_cannot_squash_the_others(curves):
+    good = [np.full(50, value) for value in (1.0, 2.0, 3.0)]
+    low, high = sensible_limits([*good, np.full(50, 1e6)])
+    assert low < 1.0
+    assert 3.0 < high < 30.0
+    assert sensible_limits([*good, np.full(50, 1e6)], [np.full(50, 1e6)])[1] > 1e6
+    assert sensible_limits([np.full(5, np.nan)]) == (0.1, 10.0)
+    wild = curves.copy(deep=True)
+    wild["rmse"].loc[{"policy": "kalman-imm"}] = 1e9
+    for band in ("rmse_low", "rmse_high"):
+        wild[band].loc[{"policy": "adaptive"}] = {"rmse_low": 1e-9, "rmse_high": 1e9}[band]
+    look = looks(curves, ["imm", "adaptive", "kalman-imm", "known-turn"])
+    figure = draw_error_over_time(wild, look)
+    assert figure.axes[0].get_ylim()[1] < 1e4
+    assert "none where they fill the axis" in figure.get_suptitle().replace("\n", " ")
+    assert len(figure.axes[0].collections) < len(draw_error_over_time(curves, look).axes[0].collections)
+
+
+def test_what_does_not_vary_has_no_figure(curves):
+    still = curves.copy(deep=True)
+    still["mode_probability"][:] = np.where(np.isnan(still["mode_probability"]), np.nan, 0.5)
+    assert "mode_probabilities" not in dict(evaluation_figures(still))
+    assert "mode_probabilities" in dict(evaluation_figures(curves))
+
+
+def test_svg_holds_text_and_pdf_its_fonts(curves, tmp_path):
+    for name in ("a.svg", "b.svg", "a.pdf", "b.pdf", "a.png"):
+        save(draw_error_over_time(curves), tmp_path / name)
+    text = (tmp_path / "a.svg").read_text()
+    assert re.search(r"<text[^>]*font-family: [^>]*sans-serif[^>]*>known-turn</text>", text)
+    assert "imm = zero</text>" in text
+    pdf = (tmp_path / "a.pdf").read_bytes()
+    assert b"/FontFile2" in pdf
+    assert b"/Type3" not in pdf.replace(b" ", b"")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    for suffix in ("svg", "pdf"):
+        assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+    with pytest.raises(ValueError, match="written as png, svg or pdf, got 'gif'"):
+        save(draw_error_over_time(curves), tmp_path / "a.gif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.pdf", "a.png", "a.svg", "b.pdf", "b.svg"]
+
+
+def test_other_figures_are_as_wide(tmp_path):
+    curve = {"ppo": [([0.0, 1e6], [1.0, -0.1])]}
+    differences = {"paper": {"ppo": (-10.0, -12.0, -8.0)}}
+    for columns in (1, 2):
+        learning = draw_learning_curves(curve, "title", "imm", columns=columns)
+        compared = draw_differences(differences, ["ppo"], ["ppo"], [], "title", "imm", columns=columns)
+        assert learning.get_figwidth() == compared.get_figwidth() == WIDTHS[columns]
+
+
+def test_recordings_without_truth_have_figures_too():
+    recording = dataclasses.replace(record(ENV, "paper", 3, horizon=40), truth=None)
+    found = curves_of(evaluate(ENV, ["imm", "adaptive"], recording))
+    assert list(dict(evaluation_figures(found))) == ["consistency", "mode_probabilities"]
