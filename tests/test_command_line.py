@@ -7,9 +7,11 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from made_results import results_of
 
 from filtergym.__main__ import COMMANDS, main
 from filtergym.commands.terminal import progress_bar
+from filtergym.reports.results import read_results, settings_of, write_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -100,7 +102,7 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     assert {r["seed"] for r in records} == {1}
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {
-        "records.json", "records.csv", "table.tex", "results.nc",
+        "records.json", "records.csv", "table.tex", "results.nc", "results.json", "report.html",
         "rmse_over_time.png", "error_distribution.png", "consistency.png", "mode_probabilities.png",
     }  # fmt: skip
 
@@ -138,7 +140,8 @@ def test_a_table_says_what_its_references_know(run):
         (("tune", ENV, "--policy", "random"), "unknown tunable policy"),
         (("reproduce", "imm"), "unknown paper"),
         (("benchmark", "--environment", "Nothing"), "unknown environment"),
-        (("comparison", "missing.json"), "cannot read the records of a benchmark"),
+        (("comparison", "missing.json"), "cannot read the results"),
+        (("report", "missing.json"), "cannot read the results"),
     ],
 )
 def test_a_mistake_gets_one_clear_sentence(tmp_path, run, arguments, expected):
@@ -175,11 +178,13 @@ def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark, "run_cell", run_cell)
     with pytest.raises(KeyboardInterrupt):
         benchmark.run_benchmark(tmp_path, full=False, seed=0)
-    assert not (tmp_path / "benchmark.json").exists()
-    records = benchmark.run_benchmark(tmp_path, full=False, seed=0)
+    assert not (tmp_path / "results.json").exists()
+    results = benchmark.run_benchmark(tmp_path, full=False, seed=0)
     assert ran == ["paper", "random", "random"]
-    assert {r.scenario for r in records} == {"paper", "random"}
-    assert len(json.loads((tmp_path / "benchmark.json").read_text())) == len(records)
+    assert [result.scenario for result in results] == ["paper", "random"]
+    read, settings = read_results(tmp_path)
+    assert [result.records for result in read] == [result.records for result in results]
+    assert settings.command == "filtergym benchmark"
     assert not (tmp_path / "unfinished").exists()
 
 
@@ -188,14 +193,15 @@ def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
 
     cell = benchmark.Cell(ENV, "paper", 20, ("imm",))
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])
-    monkeypatch.setattr(benchmark, "run_cell", lambda *_: [])
+    found = results_of(ENV, ["imm"], "paper", 2)
+    monkeypatch.setattr(benchmark, "run_cell", lambda *_: (found, found.curves))
     waiting = tmp_path / "unfinished"
     others = {"thesis.tex", "ManeuveringTarget-v0.paper.20.test1.json", "folder"}
     (waiting / "folder").mkdir(parents=True)
     for name in others - {"folder"}:
         (waiting / name).write_text("mine")
     benchmark.run_benchmark(tmp_path, full=False, seed=0)
-    assert (tmp_path / "benchmark.json").exists()
+    assert (tmp_path / "results.json").exists()
     assert {path.name for path in waiting.iterdir()} == others
 
 
@@ -218,15 +224,14 @@ def mean_cost(records, name):
 
 
 def test_comparison_shows_what_the_records_say(tmp_path, run):
-    from filtergym import evaluate, tidy_records
     from filtergym.reports import comparison
-    from filtergym.reports.ranking import verdict
-    from filtergym.reports.records import write_records
+    from filtergym.reports.ranking import who_is_best
 
     names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]
-    records = tidy_records(evaluate(ENV, names, episodes=10, split="validation"))
-    write_records(tmp_path / "benchmark.json", records)
-    found = comparison.read_benchmark(tmp_path / "benchmark.json")
+    result = results_of(ENV, names, None, 10, split="validation")
+    records = result.records
+    write_results(tmp_path / "results.json", [result], settings_of("filtergym benchmark"))
+    found = comparison.read_benchmark([tmp_path / "results.json"])
     assert found == {ENV: records}
     cost, error, typical, consistent = comparison.compare_environment(records).grids
     classical = sorted(["imm-tuned", "adaptive-rearm"], key=lambda name: mean_cost(records, name))
@@ -238,7 +243,7 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
         == consistent.header
         == ["scenario", *first, "`imm` (paper)", "`known-turn` (reference)"]
     )
-    assert cost.rows[0][1] == verdict(records)
+    assert cost.rows[0][1] == who_is_best(records)
     assert typical.rows[0][4] == "+0.0<br>50"
     [anees] = [r.value for r in records if (r.policy, r.metric, r.window) == ("ppo", "anees", "all")]
     assert consistent.rows[0][1].startswith(f"{anees:.3g}")
@@ -262,7 +267,7 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
         "\n<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
     )
-    assert run("comparison", "benchmark.json", "--into", "page.md").returncode == 0
+    assert run("comparison", "results.json", "--into", "page.md").returncode == 0
     assert "`ppo` (learned)" in page.read_text()
     assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000

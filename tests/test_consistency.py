@@ -9,7 +9,7 @@ from filtergym.filters import alpha_beta
 from scipy.stats import chi2
 
 from filtergym import evaluate, tidy_records
-from filtergym.reports.ranking import ranking, ranking_sentence, verdict
+from filtergym.reports.ranking import ranking, ranking_sentence, who_is_best
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -131,7 +131,7 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
         kept = [record for record in records if record.policy in names]
         if low is not None:
             kept = [r._replace(low=low) if r.metric == "behind_best" else r for r in kept]
-        return verdict(kept)
+        return who_is_best(kept)
 
     everyone = [place.name for place in ranking(records)]
     classical = [name for name in everyone if name not in learned]
@@ -145,7 +145,7 @@ def test_verdict_follows_from_the_paired_difference_to_the_best(dataset):
         r._replace(value=1e-9) if (r.policy, r.metric) == (classical[0], "cost") else r for r in records
     ]
     beaten = [r._replace(low=0.01) if (r.policy, r.metric) == ("bptt", "behind_best") else r for r in swapped]
-    assert verdict(beaten) == "classical best"
+    assert who_is_best(beaten) == "classical best"
 
 
 def test_tracks_hold_what_a_track_is_drawn_from(dataset):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.baselines.catalogue import baselines_of
+from made_results import results_of
 from scipy.io import netcdf_file
 
-from filtergym import evaluate, tidy_records
 from filtergym.__main__ import main
-from filtergym.reports.records import write_records
+from filtergym.reports.results import settings_of, write_results
 
 ID = "filtergym/ManeuveringTarget-v0"
 WHOLE = 10
@@ -160,15 +160,18 @@ def test_trajectories(suffix, tmp_path, command):
         command("evaluate", ID, "--scenario", file, "--policy", "imm", *episodes(i), "--set", "horizon=10")
 
 
-def test_records_of_a_benchmark(tmp_path, command):
-    rng, file = random.Random(3), tmp_path / "benchmark.json"
-    records = tidy_records(evaluate(ID, ["imm", "imm-tuned"], episodes=2, horizon=5))
-    write_records(file, [r for r in records if r.window == "all" and "cost" in r.metric + r.component])
+def test_results(tmp_path, command):
+    rng, file = random.Random(3), tmp_path / "results.json"
+    found = results_of(ID, ["imm", "imm-tuned"], None, 2, horizon=5)
+    records = [r for r in found.records if r.window == "all" and "cost" in r.metric + r.component]
+    write_results(file, [found._replace(records=records)], settings_of("filtergym benchmark"))
     whole = file.read_bytes()
-    for _ in range(30):
+    for i in range(30):
         file.write_bytes(whole)
         file.write_bytes(broken_json(file, rng))
         command("comparison", file)
+        if i % 3 == 0:
+            command("report", file, "--out", tmp_path / "report.html")
 
 
 def test_records_of_training(tmp_path, command):

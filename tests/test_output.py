@@ -89,13 +89,18 @@ def test_work_goes_on_after_a_print_that_failed(run, dataset, tmp_path, monkeypa
     records = tidy_records(dataset)
     cells = [benchmark.Cell("ManeuveringTarget", name, 4, ("imm",)) for name in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
-    monkeypatch.setattr(
-        benchmark, "run_cell", lambda cell, *_: [r._replace(scenario=cell.scenario) for r in records]
-    )
+    found = benchmark.result_of(dataset, [])[0]
+
+    def run_cell(cell, *_):
+        own = [r._replace(scenario=cell.scenario) for r in records]
+        return found._replace(scenario=cell.scenario, records=own), found.curves
+
+    monkeypatch.setattr(benchmark, "run_cell", run_cell)
     with closed_pipe() as output:
         assert run("benchmark", "--out", "out", output=output) == (0, "")
-    kept = json.loads((tmp_path / "out" / "benchmark.json").read_text())
-    assert {record["scenario"] for record in kept} == {"paper", "random"}
+    kept = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert [result["scenario"] for result in kept["results"]] == ["paper", "random"]
+    assert "<html" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_what_has_no_character_is_escaped(run):
@@ -117,7 +122,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
     monkeypatch.setattr("filtergym.reports.benchmark.run_cell", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
-    for name in ("folder.png", "out/benchmark.json", "values/ManeuveringTarget-v0.json"):
+    for name in ("folder.png", "out/results.json", "values/ManeuveringTarget-v0.json"):
         (tmp_path / name).mkdir(parents=True)
     best.mkdir(parents=True)
     shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")

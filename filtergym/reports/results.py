@@ -33,6 +33,10 @@ DIGITS = 4
 """Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
 
 
+NEEDED = {"curves": ("policy", "time"), "track": ("policy", "time", "component", "unit", "estimate", "sigma")}
+"""What a report cannot be made without."""
+
+
 class Settings(NamedTuple):
     """How results were made."""
 
@@ -265,6 +269,12 @@ def _restored(fields: Any) -> Result:
     result = restored(Result, {**fields, "records": records, **datasets})
     if not records:
         raise ValueError("a result holds no records")
+    for part, found in datasets.items():
+        missing = [] if found is None else [name for name in NEEDED[part] if name not in found.variables]
+        if missing:
+            raise ValueError(f"the {part} of a result lack {', '.join(missing)}")
+    if result.curves is not None and "rmse" in result.curves and not result.curves.sizes.get("quantity"):
+        raise ValueError("the curves of a result hold errors of nothing")
     if any((r.environment, r.scenario) != (result.environment, result.scenario) for r in records):
         raise ValueError("a result holds records of another environment or scenario")
     return result

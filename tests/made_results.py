@@ -1,0 +1,12 @@
+"""Results as a benchmark makes them, of a few episodes."""
+
+from filtergym.agents.named_policies import shipped_agents
+
+import filtergym
+from filtergym.reports.benchmark import result_of
+
+
+def results_of(id, names, scenario, episodes, **options):
+    """Return the result of some competitors; shipped agents among them count as learned."""
+    dataset = filtergym.evaluate(id, names, scenario, episodes, drawn_episodes=1, **options)
+    return result_of(dataset, shipped_agents(id))[0]

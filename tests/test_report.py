@@ -1,0 +1,268 @@
+"""The report: what its file of results keeps, what its page says, and that nothing of it is executed."""
+
+import base64
+import gzip
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from made_results import results_of
+
+from filtergym.reports.headline import consistency_word, headline_table
+from filtergym.reports.html_report import report_html
+from filtergym.reports.ranking import best_of_origins, verdict
+from filtergym.reports.results import (
+    MOST_SHOWN,
+    MOST_TIMES,
+    Settings,
+    read_all_results,
+    read_results,
+    settings_of,
+    shown_competitors,
+    spread,
+    write_results,
+)
+from filtergym.reports.tables import results_tables
+
+ENV = "filtergym/ManeuveringTarget-v0"
+NAMES = ["imm", "adaptive-rearm-tuned", "kalman-imm-tuned", "ppo", "known-turn", "known-input-bound"]
+HOSTILE = (
+    "</script><script>window.stolen=1</script><img src=x onerror='window.stolen=2'>\"'`${window.stolen=3}"
+)
+SETTINGS = Settings("filtergym benchmark", {"filtergym": "0.1.0"})
+
+
+@pytest.fixture(scope="module")
+def result():
+    return results_of(ENV, NAMES, None, 12)
+
+
+def hostile(result, text=HOSTILE):
+    """A result in which every name and word is an attack."""
+    renamed = {name: f"{name}{text}" for name in {record.policy for record in result.records}}
+    records = [
+        r._replace(
+            policy=renamed[r.policy], environment=text, scenario=text, control=text, unit=text, split=text,
+            component=r.component and r.component + text, kind=r.kind,
+        )
+        for r in result.records
+    ]  # fmt: skip
+    curves, track = (
+        data.assign_coords(policy=[renamed[name] for name in data["policy"].values.tolist()])
+        for data in (result.curves, result.track)
+    )
+    curves = curves.assign_coords(
+        quantity=[f"{name}{text}" for name in curves["quantity"].values.tolist()],
+        unit=("quantity", [text] * curves.sizes["quantity"]),
+    )
+    return result._replace(
+        environment=text,
+        scenario=text,
+        description=text,
+        paper=renamed[result.paper],
+        reference=renamed[result.reference],
+        learned=[renamed[name] for name in result.learned],
+        knows=dict.fromkeys(renamed.values(), text),
+        notes=[text],
+        records=records,
+        curves=curves,
+        track=track.assign_attrs(seed=text),
+    )
+
+
+class Page(HTMLParser):
+    """Elements of a page that could run something, and its packed data."""
+
+    def __init__(self, html):
+        super().__init__(convert_charrefs=True)
+        self.scripts, self.handlers, self.addresses, self.packed, self.inside = [], [], [], [], None
+        self.feed(html)
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.handlers += [name for name in given if name.startswith("on")]
+        self.addresses += [
+            given[name] for name in ("src", "href", "action", "data", "srcset") if name in given
+        ]
+        if tag in ("script", "iframe", "object", "embed", "form", "base", "link"):
+            self.inside = given.get("type", "")
+            self.scripts.append(self.inside if tag == "script" else tag)
+            if self.inside == "text/plain":
+                self.packed.append("")
+
+    def handle_data(self, data):
+        if self.inside == "text/plain":
+            self.packed[-1] += data.strip()
+
+    def handle_endtag(self, tag):
+        if tag == "script":
+            self.inside = None
+
+
+def unpacked(text):
+    return gzip.decompress(base64.b64decode(text)).decode()
+
+
+def test_results_are_read_as_they_were_written(result, tmp_path):
+    write_results(tmp_path / "results.json", [result], SETTINGS)
+    [read], settings = read_results(tmp_path)
+    assert settings == SETTINGS
+    assert read._replace(curves=None, track=None) == result._replace(curves=None, track=None)
+    for name, tolerance in (("curves", 5e-4), ("track", 1e-3)):
+        before, after = getattr(result, name), getattr(read, name)
+        assert set(before.variables) == set(after.variables)
+        for key, values in before.data_vars.items():
+            # Four significant digits, seven of positions.
+            np.testing.assert_allclose(after[key].values, values.values, rtol=tolerance, atol=1e-12)
+
+
+def test_a_file_of_results_is_bounded(result):
+    assert result.curves.sizes["policy"] <= MOST_SHOWN
+    assert result.curves.sizes["time"] <= MOST_TIMES
+    assert spread(6000, 100)[[0, -1]].tolist() == [0, 5999]
+    assert spread(3, 100).tolist() == [0, 1, 2]
+
+
+def test_what_tells_most_is_shown(result):
+    names = shown_competitors(result.records, "imm", "known-turn", ["ppo"])
+    assert names[:2] == ["imm", "known-turn"]
+    assert set(names) == set(NAMES)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: {**d, "format": 99}, "no file of results"),
+        (lambda d: [], "no file of results"),
+        (lambda d: {**d, "settings": None}, "fields of a Settings"),
+        (lambda d: {**d, "results": None}, "no list of results"),
+        (lambda d: {**d, "results": [{**d["results"][0], "records": []}]}, "no records"),
+        (lambda d: {**d, "results": [{**d["results"][0], "scenario": "x"}]}, "another environment or scenario"),
+        (lambda d: {**d, "results": [{**d["results"][0], "learned": 3}]}, "learned must be"),
+        (lambda d: {**d, "results": [{**d["results"][0], "curves": {"coords": {}}}]}, "expected coords"),
+        (
+            lambda d: {**d, "results": [{**d["results"][0], "track": {"coords": {}, "variables": {}, "attrs": {}}}]},
+            "lack policy",
+        ),
+    ],
+)  # fmt: skip
+def test_a_file_of_something_else_is_refused(change, message, result, tmp_path):
+    write_results(tmp_path / "results.json", [result], SETTINGS)
+    values = json.loads((tmp_path / "results.json").read_text())
+    (tmp_path / "results.json").write_text(json.dumps(change(values)))
+    with pytest.raises(ValueError, match=message):
+        read_results(tmp_path)
+
+
+def test_several_files_make_one_report_but_no_scenario_twice(result, tmp_path):
+    other = result._replace(
+        scenario="other", records=[r._replace(scenario="other") for r in result.records], default=False
+    )
+    for name, found in (("a", result), ("b", other)):
+        write_results(tmp_path / f"{name}.json", [found], settings_of(f"filtergym {name}"))
+    results, settings = read_all_results([tmp_path / "a.json", tmp_path / "b.json"])
+    assert [found.scenario for found in results] == ["random", "other"]
+    assert settings.command == "filtergym a\nfiltergym b"
+    with pytest.raises(ValueError, match="more than once"):
+        read_all_results([tmp_path / "a.json"] * 2)
+
+
+def test_headline_fits_a_narrow_terminal(result, command_console):
+    text = command_console(80, headline_table([result]))
+    assert max(map(len, text.splitlines())) <= 80
+    for origin, name in best_of_origins(result):
+        assert re.search(rf"{origin}\s+{name}\s", text)
+    assert "…" not in text
+
+
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_no_number_is_cut_at_any_width(width, result, command_console):
+    tables = results_tables(result.records, width)
+    text = command_console(width, *tables)
+    assert "…" not in text
+    assert max(map(len, text.splitlines())) <= width
+    for name in ("rmse", "relative_cost_difference"):
+        for r in result.records:
+            if (r.metric, r.window, r.policy) == (name, "all", "ppo") and r.component in ("", "position"):
+                shown = f"{r.value * (100.0 if name != 'rmse' else 1.0):#.3g}".rstrip(".")
+                assert shown in text
+    assert len(tables) == (1 if width == 200 else len(tables))
+
+
+@pytest.fixture
+def command_console():
+    def shown(width, *tables):
+        import io
+
+        from rich.console import Console
+
+        stream = io.StringIO()
+        console = Console(width=width, file=stream)
+        for table in tables:
+            console.print(table)
+        return stream.getvalue()
+
+    return shown
+
+
+def test_consistency_in_a_word():
+    assert [consistency_word(x) for x in (0.4, 0.5, 2.0, 2.1, None)] == [
+        "cautious", "consistent", "consistent", "overconfident", "says nothing",
+    ]  # fmt: skip
+
+
+def test_verdict_follows_from_the_numbers(result):
+    def changed(metric, **values):
+        records = [
+            r._replace(**values) if (r.metric, r.policy) == (metric, "ppo") else r for r in result.records
+        ]
+        return verdict([result._replace(records=records)])
+
+    helped = changed("relative_cost_difference", value=-0.5, low=-0.6, high=-0.4)
+    assert any("in 0 of 1 cases" in sentence for sentence in helped)
+    harmed = changed("relative_cost_difference", value=0.5, low=0.4, high=0.6)
+    assert any("in 1 of 1 cases" in sentence and "`ppo`" in sentence for sentence in harmed)
+    alone = verdict([result._replace(learned=[])])
+    assert any("no learned agent takes part" in sentence for sentence in alone)
+
+
+def test_page_holds_what_the_file_says(result):
+    html = report_html([result], SETTINGS)
+    page = Page(html)
+    assert len(html) < 10e6
+    data, plotly = map(unpacked, page.packed)
+    assert plotly.startswith("/**\n* plotly.js")
+    cell = json.loads(data)
+    assert cell["curves"]["coords"]["policy"][1] == result.curves["policy"].values.tolist()
+    assert [line["name"] for line in cell["lines"]] == cell["curves"]["coords"]["policy"][1]
+    for name in NAMES:
+        assert f'data-sort="{name}"' in html
+    assert "filtergym benchmark" in html
+    # Every figure says in words what it shows.
+    assert html.count('role="img"') == html.count('<div class="plot"') == 6
+    assert not [address for address in page.addresses if not address.startswith("#")]
+
+
+def test_nothing_of_a_hostile_file_becomes_markup(result, tmp_path):
+    write_results(tmp_path / "results.json", [hostile(result)], Settings(HOSTILE, {HOSTILE: HOSTILE}))
+    own, attacked = Page(report_html([result], SETTINGS)), Page(report_html(*read_results(tmp_path)))
+    assert attacked.scripts == own.scripts == ["text/plain", "text/plain", ""]
+    assert not attacked.handlers
+    assert not [address for address in attacked.addresses if not address.startswith("#")]
+
+
+def test_figures_that_plotly_draws_are_valid(result):
+    """The page's own script builds them; what it is given is complete: a number for every competitor and time."""
+    cell = json.loads(unpacked(Page(report_html([result], SETTINGS)).packed[0]))
+    for part in ("curves", "track"):
+        sizes = {}
+        for name, (dims, values) in {**cell[part]["coords"], **cell[part]["variables"]}.items():
+            shape = values["shape"] if isinstance(values, dict) else np.shape(values)
+            assert len(shape) == len(dims), name
+            for dim, size in zip(dims, shape, strict=True):
+                assert sizes.setdefault(dim, size) == size
+            if isinstance(values, dict):
+                assert len(values["numbers"]) == np.prod(shape)
+    assert {"truth", "estimate", "seen", "sigma", "correlation"} <= set(cell["track"]["variables"])
