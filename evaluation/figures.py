@@ -324,7 +324,9 @@ def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
 
 
 def sensible_limits(
-    lines: Sequence[numpy.ndarray], always: Sequence[numpy.ndarray] = ()
+    lines: Sequence[numpy.ndarray],
+    always: Sequence[numpy.ndarray] = (),
+    bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
     """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
 
@@ -334,6 +336,7 @@ def sensible_limits(
     Args:
         lines: positive; NaN where there is none.
         always: lines that are shown whatever they are.
+        bounds: lines that may be far below what anybody reaches: they take a factor of six below the others at most.
     """
     ends = numpy.array([numpy.percentile(own, [5.0, 100.0]) for line in lines if len(own := _positive(line))])
     if not len(ends):
@@ -342,6 +345,9 @@ def sensible_limits(
     for line in always:
         if len(own := _positive(line)):
             low, high = min(low, numpy.percentile(own, 5.0)), max(high, own.max())
+    for line in bounds:
+        if len(own := _positive(line)):
+            low, high = min(low, max(numpy.percentile(own, 5.0), low / 6.0)), max(high, own.min())
     margin = max((high / low) ** 0.06, 1.02)
     return float(low / margin), float(high * margin)
 
@@ -428,6 +434,8 @@ def _over_time(
     figure, axes = _axes(len(panels), columns)
     x = _abscissa(curves)
     wide = False
+    if columns == 1:
+        look = {name: {**style, "linewidth": 0.75 * style["linewidth"]} for name, style in look.items()}
     for axis, panel in zip(axes, panels, strict=True):
         _shade_windows(axis, curves)
         for name in others:
@@ -524,9 +532,11 @@ def draw_error_over_time(
 
     def finish(axis: Any, panel: Panel) -> None:
         axis.set_yscale("log")
-        lines = [panel.values.sel(policy=name).values for name in look]
+        kinds = {name: str(curves["kind"].sel(policy=name).values) for name in look}
+        bounds = [panel.values.sel(policy=name).values for name in look if kinds[name] == "bound"]
+        lines = [panel.values.sel(policy=name).values for name in look if kinds[name] != "bound"]
         paper = [panel.values.sel(policy=n).values for n in [curves.attrs["paper"]] if n in look]
-        axis.set_ylim(*sensible_limits(lines, paper))
+        axis.set_ylim(*sensible_limits(lines or bounds, paper, bounds))
         _logarithmic(axis.yaxis)
 
     return _over_time(curves, panels, look, f"{_title(curves)}, 95 % bands", columns, finish)

@@ -191,6 +191,8 @@ def test_one_line_cannot_squash_the_others(curves):
     assert 3.0 < high < 30.0
     assert sensible_limits([*good, np.full(50, 1e6)], [np.full(50, 1e6)])[1] > 1e6
     assert sensible_limits([np.full(5, np.nan)]) == (0.1, 10.0)
+    assert 0.1 < sensible_limits(good, bounds=[np.full(50, 1e-6)])[0] < 1.0 / 6.0
+    assert 0.4 < sensible_limits(good, bounds=[np.full(50, 0.5)])[0] < 0.5
     wild = curves.copy(deep=True)
     wild["rmse"].loc[{"policy": "kalman-imm"}] = 1e9
     for band in ("rmse_low", "rmse_high"):
