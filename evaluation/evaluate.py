@@ -209,6 +209,7 @@ def evaluate(
     for name, task in tasks.items():
         check_shown(task, competitors[name], name)
     first = next(iter(tasks.values()))
+    group_of_each([c.name for c in first.components], first.groups)  # refused now, not when all is done
     if chosen.recording is not None:
         _check_told(kinds, chosen.name)
         episodes = len(first.flights)  # nothing is random: each once

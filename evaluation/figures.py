@@ -285,16 +285,25 @@ def _abscissa(curves: xarray.Dataset) -> numpy.ndarray:
     return found
 
 
+def _bound_abscissa(axis: Any, x: numpy.ndarray) -> None:
+    """From just before the first measurement to the last; about the only one, if there is no other."""
+    first, last = float(x[0]), float(x[-1])
+    axis.set_xlim(*((first - 0.01 * (last - first), last) if last > first else (0.5 * first, 1.5 * first)))
+
+
 def _name_abscissa(curves: xarray.Dataset, axes: Sequence[Any]) -> None:
     """Seconds below and measurements above, where they come regularly; else measurements below."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     if "elapsed" not in curves.coords:
         axes[-1].set_xlabel("measurement")
+        for axis in axes:
+            axis.xaxis.get_major_locator().set_params(integer=True)
         return
     interval = float(curves["elapsed"].values[0] / curves["time"].values[0])
     above = axes[0].secondary_xaxis("top", functions=(lambda t: t / interval, lambda k: k * interval))
     above.set_xlabel("measurement")
+    above.xaxis.get_major_locator().set_params(integer=True)
     axes[-1].set_xlabel("time, s")
 
 
@@ -324,7 +333,9 @@ def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
 
 
 def sensible_limits(
-    lines: Sequence[numpy.ndarray], always: Sequence[numpy.ndarray] = ()
+    lines: Sequence[numpy.ndarray],
+    always: Sequence[numpy.ndarray] = (),
+    bounds: Sequence[numpy.ndarray] = (),
 ) -> tuple[float, float]:
     """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
 
@@ -334,6 +345,7 @@ def sensible_limits(
     Args:
         lines: positive; NaN where there is none.
         always: lines that are shown whatever they are.
+        bounds: lines that may be far below what anybody reaches: they take a factor of six below the others at most.
     """
     ends = numpy.array([numpy.percentile(own, [5.0, 100.0]) for line in lines if len(own := _positive(line))])
     if not len(ends):
@@ -342,6 +354,9 @@ def sensible_limits(
     for line in always:
         if len(own := _positive(line)):
             low, high = min(low, numpy.percentile(own, 5.0)), max(high, own.max())
+    for line in bounds:
+        if len(own := _positive(line)):
+            low, high = min(low, max(numpy.percentile(own, 5.0), low / 6.0)), max(high, own.min())
     margin = max((high / low) ** 0.06, 1.02)
     return float(low / margin), float(high * margin)
 
@@ -428,6 +443,8 @@ def _over_time(
     figure, axes = _axes(len(panels), columns)
     x = _abscissa(curves)
     wide = False
+    if columns == 1:
+        look = {name: {**style, "linewidth": 0.75 * style["linewidth"]} for name, style in look.items()}
     for axis, panel in zip(axes, panels, strict=True):
         _shade_windows(axis, curves)
         for name in others:
@@ -443,7 +460,7 @@ def _over_time(
             axis.plot(x, line, label=label, **look[name])
             last = int(numpy.flatnonzero(numpy.isfinite(line))[-1])
             ends[label] = (x[last], line[last], look[name]["color"])
-        axis.set_xlim(x[0] - 0.01 * (x[-1] - x[0]), x[-1])
+        _bound_abscissa(axis, x)
         axis.set_ylabel(panel.label)
         axis.grid(alpha=0.25, which="both", lw=0.4)
         finish(axis, panel)
@@ -499,7 +516,8 @@ def _draw_bands(
 
 def _title(curves: xarray.Dataset) -> str:
     attrs = curves.attrs
-    return f"{attrs['environment']}, scenario {attrs['scenario']}: {attrs['episodes']} episodes"
+    plural = "s" if attrs["episodes"] != 1 else ""
+    return f"{attrs['environment']}, scenario {attrs['scenario']}: {attrs['episodes']} episode{plural}"
 
 
 @_in_print
@@ -523,10 +541,14 @@ def draw_error_over_time(
     ]
 
     def finish(axis: Any, panel: Panel) -> None:
+        if not len(_positive(panel.values.values)):
+            return  # of who is told the truth; a logarithmic axis has no zero
         axis.set_yscale("log")
-        lines = [panel.values.sel(policy=name).values for name in look]
+        kinds = {name: str(curves["kind"].sel(policy=name).values) for name in look}
+        bounds = [panel.values.sel(policy=name).values for name in look if kinds[name] == "bound"]
+        lines = [panel.values.sel(policy=name).values for name in look if kinds[name] != "bound"]
         paper = [panel.values.sel(policy=n).values for n in [curves.attrs["paper"]] if n in look]
-        axis.set_ylim(*sensible_limits(lines, paper))
+        axis.set_ylim(*sensible_limits(lines or bounds, paper, bounds))
         _logarithmic(axis.yaxis)
 
     return _over_time(curves, panels, look, f"{_title(curves)}, 95 % bands", columns, finish)
@@ -588,9 +610,15 @@ def draw_error_distribution(
         for name in groups:
             style = look[name] if name in told else {"color": GREY, "linewidth": 0.6, "zorder": 1.5}
             axis.plot(exceeded.sel(policy=name, quantity=quantity), shares, **style)
-        axis.set_xscale("log")
         axis.set_yscale("log")
+        axis.set_ylim(min(max(float(supported.min()), 1e-4), 0.5), 1.0)
+        axis.set_xlabel(f"error of {quantity.replace('_', ' ')}, {unit}")
+        axis.set_ylabel("share of\nmeasurements above")
+        axis.grid(alpha=0.25, which="both", lw=0.4)
         told_values = exceeded.sel(policy=list(told or there), quantity=quantity).values
+        if not len(_positive(told_values)):
+            continue
+        axis.set_xscale("log")
         # From what nine of ten measurements exceed to the largest errors, of which one line's are not all there is.
         most = int(numpy.argmin(numpy.abs(shares - 0.9)))
         smallest = _positive(told_values[:, most])
@@ -600,10 +628,6 @@ def draw_error_distribution(
             low = numpy.median(smallest) / 2.0
             axis.set_xlim(low, max(high, 4.0 * low) * 1.05)
         _logarithmic(axis.xaxis)
-        axis.set_ylim(max(float(supported.min()), 1e-4), 1.0)
-        axis.set_xlabel(f"error of {quantity.replace('_', ' ')}, {unit}")
-        axis.set_ylabel("share of\nmeasurements above")
-        axis.grid(alpha=0.25, which="both", lw=0.4)
     handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()]
     if len(groups) > len(told):
         handles.append(Line2D([], [], color=GREY, linewidth=0.6, label="others"))
@@ -656,7 +680,7 @@ def draw_mode_probabilities(
             if len(present):
                 ends[named[mode]] = (x[present[-1]], line[present[-1]], style["color"])
         axis.set_ylim(-0.02, 1.02)
-        axis.set_xlim(x[0] - 0.01 * (x[-1] - x[0]), x[-1])
+        _bound_abscissa(axis, x)
         axis.set_ylabel("\n".join(["probability", *textwrap.wrap(joined(same), 24)]))
         axis.grid(alpha=0.25, lw=0.4)
         if beside:

@@ -292,6 +292,11 @@ def run_competitor(
         series[name].append(numpy.moveaxis(kept.copy() if counts[name] < len(seeds) else kept, -1, 0))
 
     def keep_all(found: dict[str, numpy.ndarray]) -> None:
+        if actions and "action" in found:
+            raise ValueError(
+                f"{task.id} records something under the name 'action', under which an evaluation keeps what was "
+                "applied: call it something else"
+            )
         for name, values in found.items():
             keep(name, values)
 

@@ -212,5 +212,23 @@ def test_what_it_says_of_itself(dataset, curves, tmp_path):
     dataset.to_netcdf(tmp_path / "x.nc", engine="scipy")
     with xarray.open_dataset(tmp_path / "x.nc", engine="scipy") as read:
         xarray.testing.assert_identical(curves_of(read.load()), curves)
+    curves.to_netcdf(tmp_path / "curves.nc", engine="scipy")
+    with xarray.open_dataset(tmp_path / "curves.nc", engine="scipy") as read:
+        xarray.testing.assert_identical(read.load(), curves)
     alone = curves_of(dataset.sel(policy=["imm"]))
     np.testing.assert_array_equal(alone["rmse"].values[0], curves["rmse"].values[0])
+
+
+def test_names_that_an_evaluation_keeps_are_refused(monkeypatch):
+    cls = type(make_task(TARGET))
+    records = cls.records
+    monkeypatch.setattr(
+        cls, "records", lambda self, episode: {**records(self, episode), "action": episode.truth[0]}
+    )
+    with pytest.raises(ValueError, match="records something under the name 'action'"):
+        evaluate(TARGET, "imm", "paper", 2, horizon=3, backend="numpy")
+    monkeypatch.setattr(cls, "groups", {"here": ("position_x",), "there": ("position_x",)})
+    with pytest.raises(ValueError, match="'position_x' belongs to several groups: here, there"):
+        evaluate(
+            TARGET, "imm", "paper", 2, progress=lambda _: pytest.fail("episodes ran before it was refused")
+        )

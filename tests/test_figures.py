@@ -28,7 +28,7 @@ from matplotlib.colors import to_hex
 
 from filtergym import evaluate, record
 
-ENV = "filtergym/ManeuveringTarget-v0"
+ENV, UAV = "filtergym/ManeuveringTarget-v0", "filtergym/UavAutopilot-v0"
 NAMES = [
     "fixed-low",
     "adaptive",
@@ -191,6 +191,8 @@ def test_one_line_cannot_squash_the_others(curves):
     assert 3.0 < high < 30.0
     assert sensible_limits([*good, np.full(50, 1e6)], [np.full(50, 1e6)])[1] > 1e6
     assert sensible_limits([np.full(5, np.nan)]) == (0.1, 10.0)
+    assert 0.1 < sensible_limits(good, bounds=[np.full(50, 1e-6)])[0] < 1.0 / 6.0
+    assert 0.4 < sensible_limits(good, bounds=[np.full(50, 0.5)])[0] < 0.5
     wild = curves.copy(deep=True)
     wild["rmse"].loc[{"policy": "kalman-imm"}] = 1e9
     for band in ("rmse_low", "rmse_high"):
@@ -239,3 +241,21 @@ def test_recordings_without_truth_have_figures_too():
     recording = dataclasses.replace(record(ENV, "paper", 3, horizon=40), truth=None)
     found = curves_of(evaluate(ENV, ["imm", "adaptive"], recording))
     assert list(dict(evaluation_figures(found))) == ["consistency", "mode_probabilities"]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("env", "names", "length"),
+    [(ENV, ["imm", "known-input-bound"], 1), (ENV, ["known-input-bound"], 2), (UAV, ["true-state"], 3)],
+)
+def test_little_to_draw_is_drawn(env, names, length, tmp_path):
+    """One measurement of one episode, bounds alone, and errors of zero, which a logarithmic axis does not have."""
+    found = curves_of(evaluate(env, names, episodes=1, horizon=length))
+    figures = dict(evaluation_figures(found, 1))
+    assert "rmse_over_time" in figures
+    assert "1 episode" in figures["rmse_over_time"].get_suptitle()
+    assert "1 episodes" not in figures["rmse_over_time"].get_suptitle()
+    for name, figure in figures.items():
+        save(figure, tmp_path / f"{name}.png")
+        for axis in figure.axes:
+            assert np.isfinite([*axis.get_xlim(), *axis.get_ylim()]).all()

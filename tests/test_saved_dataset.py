@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -22,6 +23,7 @@ from filtergym.evaluation.dataset import (
 
 import filtergym
 from filtergym import evaluate, record, tidy_records
+from filtergym.__main__ import main
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 CASES = {
@@ -139,3 +141,31 @@ def test_a_component_of_two_groups_is_refused():
     assert group_of_each(["a", "b", "c"], {"g": ("a", "c")}) == ["g", "", "g"]
     with pytest.raises(ValueError, match="'a' belongs to several groups: g, h"):
         group_of_each(["a", "b"], {"g": ("a",), "h": ("b", "a")})
+
+
+# --- the page
+
+
+def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
+    """What is written by a command is read by xarray alone, and drawn."""
+    page = (Path(__file__).parent.parent / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    read, drawn = (
+        page.partition(f"## {title}\n")[2].partition("```python\n")[2].partition("```")[0]
+        for title in ("Files", "Figures")
+    )
+    monkeypatch.chdir(tmp_path)
+    words = ["evaluate", TARGET, "--scenario", "paper", "--policy", "imm", "--policy", "known-turn"]
+    monkeypatch.setattr("sys.argv", ["filtergym", *words, "--episodes", "8", "--out", "results/paper"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+    capsys.readouterr()
+    names = {}
+    exec(read, names)
+    dataset = evaluate(TARGET, ["imm", "known-turn"], "paper", 8)
+    square = (dataset["error"].values[0, :, 49:55, :2] ** 2).sum(axis=-1).mean(axis=0)
+    assert float(capsys.readouterr().out) == pytest.approx(np.sqrt(square.max()))
+    assert names["cost"]["imm"] == pytest.approx(dataset["cost"].values[0].mean())
+    assert names["records"] == tidy_records(dataset)
+    exec(drawn, {"dataset": dataset})
+    assert (tmp_path / "rmse_over_time.pdf").read_bytes().startswith(b"%PDF")
