@@ -245,9 +245,13 @@ def evaluate(
     if flown is not None and lengths is not None:
         there = xarray.DataArray(dataset["time"].values <= lengths[:, None], dims=("episode", "time"))
         of_drawn = there.isel(episode=slice(drawn_episodes)).rename(episode="drawn_episode")
-        dataset = dataset.map(
-            lambda values: values.where(of_drawn if "drawn_episode" in values.dims else there)
-        ).assign_coords(flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths))
+        present = {
+            name: values.where(of_drawn if "drawn_episode" in values.dims else there)
+            for name, values in dataset.data_vars.items()
+        }
+        dataset = dataset.assign(present).assign_coords(
+            flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths)
+        )
     return dataset.assign_attrs(
         paper=paper,
         reference=reference,

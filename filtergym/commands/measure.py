@@ -208,7 +208,7 @@ def evaluate_policies(
     if each and dataset.attrs["recorded"]:
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
     of_flights = flight_records(dataset) if each else []
-    tables = [flights_table(dataset, of_flights, records)] if of_flights else []
+    tables = [flights_table(dataset, of_flights, records, console.width)] if of_flights else []
     tables += results_tables(records, console.width) if judged else [recorded_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])

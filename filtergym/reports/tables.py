@@ -2,7 +2,8 @@
 
 import io
 import math
-from collections.abc import Callable, Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -14,6 +15,8 @@ from ..baselines.reproduction import Grid, Reproduction
 from ..baselines.tuning import Tuned
 from ..evaluation.competitors import RANKED
 
+NARROW = 24
+"""Columns of a name where there are few: longer ones go on below, from a hyphen on where they have one."""
 INCONSISTENT = "!"
 """Marks a covariance that is off by more than a factor of two."""
 
@@ -131,14 +134,14 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
     )
     # As many columns beside each other as fit.
     tables = [_of_competitors(names, {**costs, **errors}, True)]
-    for control, parts in (
-        (True, [costs, errors]),
-        (False, [costs, errors]),
-        (False, [costs, *_single(errors)]),
-    ):
-        if all(_widest(table) <= width for table in tables):
-            break
-        tables = [_of_competitors(names, part, control and i == 0) for i, part in enumerate(parts)]
+    if _widest(tables[0]) > width:
+        narrow = [_of_competitors(names, costs, True), _of_competitors(names, costs, False)]
+        tables = [_fitting(narrow, width) or _of_competitors(names, costs, False, compact=True)]
+        beside = _fitting(
+            [_of_competitors(names, errors, False, compact) for compact in (False, True)], width
+        )
+        each = [_of_competitors(names, {title: error}, False) for title, error in errors.items()]
+        tables += each if beside is None else [beside]
     tables[0].title = title
     known = baselines_of(first.environment)
     told = {**known.references, **known.bounds}
@@ -153,27 +156,34 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
     return tables
 
 
-def _single(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return [{title: column} for title, column in columns.items()]
+def _fitting(tables: Iterable[Table], width: int) -> Table | None:
+    """Return the first table that needs no more columns than there are."""
+    return next((table for table in tables if _widest(table) <= width), None)
 
 
 def _of_competitors(
-    names: Sequence[tuple[str, str, str]], columns: Mapping[str, Callable[[str], str]], control: bool
+    names: Sequence[tuple[str, str, str]],
+    columns: Mapping[str, Callable[[str], str]],
+    control: bool,
+    compact: bool = False,
 ) -> Table:
     """Return a table of what each competitor has in each column; references and bounds in sections of their own."""
     table = Table(title_justify="left", caption_justify="left")
+    if compact:
+        table.box, table.pad_edge = None, False
     table.add_column("policy", overflow="fold")
     if control:
         table.add_column("control")
     for title in columns:
-        table.add_column(title, justify="right")
+        table.add_column(title, justify="right", overflow="fold", no_wrap=compact)
     section = "ranked"
     for name, kind, steered in names:
         if kind not in RANKED and kind != section:
             table.add_section()
             section = kind
         told = steered if kind == "policy" else f"({kind})"
-        table.add_row(name, *([told] if control else []), *(column(name) for column in columns.values()))
+        shown = "\n".join(textwrap.wrap(name, NARROW)) if compact else name
+        table.add_row(shown, *([told] if control else []), *(column(name) for column in columns.values()))
     return table
 
 
@@ -225,36 +235,55 @@ def recorded_table(records: Sequence[Any]) -> Table:
     return table
 
 
+HEAD = 10
+"""Columns of a title over a column of short numbers."""
 SHOWN_OF_FLIGHTS = 8
 """Competitors in a table flight by flight: what fits beside each other."""
 
 
-def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any]) -> Table:
+def flights_table(
+    dataset: Any, records: Sequence[Any], over_all: Sequence[Any], width: int = 10_000
+) -> Table:
     """Compare competitors flight by flight: error of the paper's algorithm, and what the others cost against it.
 
     Args:
         dataset: from an evaluation of a set of flights.
         records: of every flight.
         over_all: records of all of them together, which rank the competitors.
+        width: columns of the terminal: of the competitors the best are shown, as many as fit.
     """
+    everything = _flights(dataset, records, over_all, SHOWN_OF_FLIGHTS, False)
+    tables = (_flights(dataset, records, over_all, shown, True) for shown in range(SHOWN_OF_FLIGHTS, 0, -1))
+    return _fitting([everything], width) or _fitting(tables, width) or everything
+
+
+def _flights(
+    dataset: Any, records: Sequence[Any], over_all: Sequence[Any], most: int, compact: bool
+) -> Table:
+    """Return the table with at most some competitors beside the one that they are compared with."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
     names = [name for name, kind, _ in ranked(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
     base = paper if paper in names else [*names, *dataset["policy"].values.tolist()][0]
-    others = [name for name in names if name != paper][:SHOWN_OF_FLIGHTS]
+    every = [name for name in names if name != paper]
+    others = every[:most]
     units = {r.component: r.unit for r in over_all if r.metric == "rmse"}
     flights, lengths = dataset["flight"].values, dataset["length"].values
     several = len(set(flights.tolist())) > 1
     what = "recording" if dataset.attrs["recorded"] else "flight"
     table = Table(title=f"{len(set(flights.tolist()))} {what}{'s' * several}", title_justify="left")
+    if compact:
+        table.box, table.pad_edge = None, False
     table.add_column(what, no_wrap=True)
     table.add_column("episodes", justify="right")
     table.add_column("measurements", justify="right")
     for component in shown:
-        table.add_column(f"RMSE {component.replace('_', ' ')} of {base}, {units[component]}", justify="right")
+        title = f"RMSE {component.replace('_', ' ')} of {base}, {units[component]}"
+        table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
     metric = "relative_cost_difference" if base == paper else "cost"
     for name in others:
-        table.add_column(f"{name}, %" if base == paper else f"cost of {name}", justify="right")
+        title = f"{name}, %" if base == paper else f"cost of {name}"
+        table.add_column("\n".join(textwrap.wrap(title, HEAD)), justify="right")
     for scenario in dict.fromkeys(r.scenario for r in records):
         flight = scenario.removeprefix(f"{dataset.attrs['scenario']}: ")
         mine = flights == flight
@@ -272,8 +301,8 @@ def flights_table(dataset: Any, records: Sequence[Any], over_all: Sequence[Any])
                 row.append(f"{record.value:.3g}")
         table.add_row(*row)
     notes = [f"%: cost against {base}."] if base == paper and others else []
-    if len(others) == SHOWN_OF_FLIGHTS:
-        notes.append(f"The {SHOWN_OF_FLIGHTS} best are shown; all stand in the records.")
+    if len(others) < len(every):
+        notes.append(f"The best {len(others)} of {len(every)} are shown; all stand in the records.")
     notes.append(
         f"Intervals of the table over all {what}s resample whole {what}s; of fewer than ten they are too narrow."
         if several
