@@ -26,6 +26,8 @@ GREY = "0.72"
 """Of lines that are not told apart."""
 MOST_HIGHLIGHTED = 6
 """Lines that a reader can tell apart."""
+MOST_BESIDE = 8
+"""Names that fit beside the lowest axes."""
 WIDTHS = {1: 3.5, 2: 7.16}
 """Inches, of one and two columns of a paper."""
 FONT_SIZES = {1: 7.0, 2: 8.0}
@@ -414,9 +416,10 @@ def _direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float
 
 
 def _room_for_labels(labels: Iterable[str], columns: int) -> bool:
-    """Whether names beside the axes leave most of the width to them."""
+    """Whether names beside the axes leave most of the width to them, and the lowest axes are high enough for them."""
+    labels = list(labels)
     width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
-    return width <= 0.3 * WIDTHS[columns]
+    return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
 
 
 def _over_time(

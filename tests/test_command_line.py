@@ -11,6 +11,7 @@ from made_results import results_of
 
 from filtergym.__main__ import COMMANDS, main
 from filtergym.commands.terminal import progress_bar
+from filtergym.names import is_learned
 from filtergym.reports.results import read_results, settings_of, write_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -271,3 +272,37 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
     assert "`ppo` (learned)" in page.read_text()
     assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000
+    again = (
+        "comparison",
+        "benchmark.json",
+        "--into",
+        "page.md",
+        "--format",
+        "svg",
+        "--format",
+        "pdf",
+        "--columns",
+        "1",
+    )
+    assert run(*again).returncode == 0
+    assert "(images/comparison_ManeuveringTarget-v0.svg)" in page.read_text()
+    assert 'width="252' in (tmp_path / "images" / "comparison_ManeuveringTarget-v0.svg").read_text()
+    assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.pdf").exists()
+
+
+def test_curves_in_a_format_that_nobody_writes_are_refused_first(run, tmp_path):
+    result = run("seeds", "nowhere", "--curves", "curves.gif")
+    assert result.returncode == 2
+    assert "written as png, svg or pdf, got 'gif'" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "learned"),
+    [
+        ("imm", False), ("imm-tuned", False), ("known-turn", False), ("bptt", True), ("gated:bptt", True),
+        ("gated:adaptive", False), ("runs/mine", True), ("mine.safetensors", True), ("module:Class", False),
+    ],
+)  # fmt: skip
+def test_what_is_learned_is_told_by_its_name(name, learned):
+    assert is_learned(ENV, name) is learned

@@ -184,6 +184,17 @@ def test_labels_stand_at_the_ends_of_lines_and_never_on_each_other(curves):
     assert len(labels) == MOST_HIGHLIGHTED + 1
 
 
+def test_many_modes_are_named_in_a_legend(curves):
+    modes = [f"m{i}" for i in range(9)]
+    several = curves.isel(mode=[0, 1] * 4 + [0]).assign_coords(mode=modes)
+    figure = dict(evaluation_figures(several))["mode_probabilities"]
+    assert not set(modes) & set(texts(figure))
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == modes
+    figure = dict(evaluation_figures(curves))["mode_probabilities"]
+    assert {"mode 1", "mode 2"} <= set(texts(figure))
+    assert not figure.legends
+
+
 def test_one_line_cannot_squash_the_others(curves):
     good = [np.full(50, value) for value in (1.0, 2.0, 3.0)]
     low, high = sensible_limits([*good, np.full(50, 1e6)])

@@ -75,6 +75,13 @@ def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path
     assert (tmp_path / "figure_2.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_figures_in_other_formats_and_the_page_that_shows_the_first(tmp_path: Path) -> None:
+    save_reproduction(example(), tmp_path, ("svg", "pdf"))
+    figures = [f"figure_{i}.{suffix}" for i in (1, 2) for suffix in ("pdf", "svg")]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [*figures, "report.md"]
+    assert "![The error.](figure_1.svg)" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
 def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     class Unpaintable:
         def savefig(self, *_: object, **__: object) -> None:
