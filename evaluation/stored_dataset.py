@@ -56,15 +56,15 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
         values = entry[1]
         if isinstance(values, dict):
             shape, numbers = values.get("shape"), values.get("numbers")
-            if (
-                not fits(shape, list[int])
-                or not fits(numbers, list[float | None])
-                or min(shape, default=0) < 0
-            ):
-                raise ValueError(f"{name!r} needs a shape and its numbers")
-            array = numpy.array(numbers, dtype=float).reshape(shape)
-        elif fits(values, list[str]) or fits(values, list[int]) or isinstance(values, str | int):
+            if not (isinstance(shape, list) and fits(shape, list[int]) and min(shape, default=0) >= 0):
+                raise ValueError(f"{name!r} needs a shape")
+            if not fits(numbers, list[float | None]):
+                raise ValueError(f"{name!r} needs its numbers")
+            array = _array(numbers, float).reshape(shape)
+        elif fits(values, list[str]) or isinstance(values, str):
             array = numpy.array(values)
+        elif fits(values, list[int]) or isinstance(values, int):
+            array = _array(values, numpy.int64)
         else:
             raise ValueError(f"{name!r} must hold numbers or words")
         if array.ndim != len(entry[0]):
@@ -77,3 +77,15 @@ def dataset_from_json(stored: Any) -> xarray.Dataset:
     if not fits(stored["attrs"], dict[str, str | int | float]):
         raise ValueError("attributes must be words or numbers")
     return xarray.Dataset(variables, coords, stored["attrs"])
+
+
+def _array(values: Any, kind: Any) -> numpy.ndarray:
+    """Return numbers as an array; NaN for None.
+
+    Raises:
+        ValueError: if one is too large.
+    """
+    try:
+        return numpy.array(values, dtype=kind)
+    except OverflowError as error:
+        raise ValueError(f"a number is too large: {error}") from error

@@ -1,5 +1,6 @@
 """Tables of results for the terminal."""
 
+import functools
 import io
 import math
 import textwrap
@@ -109,10 +110,12 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
     shown = main_components(records)
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+
+    def rmse(component: str, name: str) -> str:
+        return with_interval(found.get((name, "rmse", component, "all")))
+
     errors: dict[str, Callable[[str], str]] = {
-        f"RMSE {component.replace('_', ' ')}, {units[component]}": lambda name, component=component: (
-            with_interval(found.get((name, "rmse", component, "all")))
-        )
+        f"RMSE {component.replace('_', ' ')}, {units[component]}": functools.partial(rmse, component)
         for component in shown
     }
 
