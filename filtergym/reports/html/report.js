@@ -62,7 +62,7 @@
     return {
       paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: "system-ui, sans-serif", size: narrow ? 11 : 12, color: css("--fg") },
-      margin: { l: narrow ? 45 : 60, r: 10, t: 10, b: 45 }, height: narrow ? 430 : 440,
+      margin: { l: narrow ? 45 : 60, r: 10, t: 30, b: 45 }, height: narrow ? 430 : 440,
       hoverlabel: { namelength: -1 },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: css("--soft"), activecolor: css("--fg") },
       legend: { orientation: "h", y: -0.22, yanchor: "top", itemclick: "toggleothers", itemdoubleclick: "toggle", groupclick: "togglegroup" },
@@ -71,32 +71,51 @@
   }
   const config = { displayModeBar: window.innerWidth < 640 ? false : "hover", responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
 
-  // --- lines with bands; those that are the same are drawn once, with both names
+  // --- lines with bands; those that nobody can tell apart are drawn once, with all their names
 
-  function together(lines, of) {
-    const kept = new Map();
+  function together(lines, of, [bottom, top], log) {
+    const kept = [], at = (y) => log ? Math.log10(y) : y;
+    const apart = (a, b) => a.reduce((most, y, i) => y === b[i] ? most : Math.max(most, y === null || b[i] === null ? Infinity : Math.abs(at(y) - at(b[i]))), 0);
     for (const line of lines) {
       const values = of(line);
       if (!values || !something(values.mid)) continue;
-      const key = JSON.stringify(values.mid);
-      if (kept.has(key)) kept.get(key).names.push(line.name);
-      else kept.set(key, { line, values, names: [line.name] });
+      const same = kept.find((other) => apart(other.values.mid, values.mid) <= 0.004 * (top - bottom));
+      if (same) { same.names.push(line.name); same.exact = same.exact && apart(same.values.mid, values.mid) === 0; }
+      else kept.push({ line, values, names: [line.name], exact: true });
     }
-    return [...kept.values()];
+    return kept;
+  }
+  function named(names, exact) {
+    const sign = exact ? " = " : " \u2248 ", all = names.map(plain);
+    return { name: all.length > 2 ? `${all[0]}${sign}${all.length - 1} others` : all.join(sign), every: all.join(`${sign}<br>`) };
   }
 
-  function traces(lines, x, of, hover) {
-    const drawn = [];
+  // Of the values that are drawn, the ends of an axis: numbers, or on a logarithmic axis their logarithms.
+  function ends(lines, of, log) {
+    const all = lines.flatMap((line) => (of(line).mid || []).filter((y) => y !== null && (!log || y > 0)).map((y) => log ? Math.log10(y) : y));
+    const [low, high] = all.reduce(([l, h], y) => [Math.min(l, y), Math.max(h, y)], [Infinity, -Infinity]);
+    return [low, high > low ? high : low + 1];
+  }
+
+  // A band tells something where it is narrow on the axis; wide ones hide each other and the lines.
+  function isNarrow({ low, high }, [bottom, top], log) {
+    const at = (y) => Math.min(Math.max(log ? Math.log10(Math.max(y, 1e-30)) : y, bottom), top);
+    const widths = high.map((y, i) => y === null || low[i] === null ? 0 : at(y) - at(low[i]));
+    return widths.reduce((sum, width) => sum + width, 0) / widths.length < 0.3 * (top - bottom);
+  }
+
+  function traces(lines, x, of, hover, log = false) {
+    const drawn = [], axis = ends(lines, of, log);
     // Grey ones first: they lie below.
-    for (const { line, values, names } of together(lines, of).sort((a, b) => isGrey(b.line) - isGrey(a.line))) {
-      const style = look(line), name = names.map(plain).join(" = "), group = plain(line.name);
-      if (values.low && !isGrey(line) && !["reference", "bound"].includes(line.origin)) {
+    for (const { line, values, names, exact } of together(lines, of, axis, log).sort((a, b) => isGrey(b.line) - isGrey(a.line))) {
+      const style = look(line), { name, every } = named(names, exact), group = plain(line.name);
+      if (values.low && !isGrey(line) && !["reference", "bound"].includes(line.origin) && isNarrow(values, axis, log)) {
         const fill = faint(style.color.length === 7 ? style.color : "#888888");
         const edge = { x, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false, legendgroup: group };
         drawn.push({ ...edge, y: values.low }, { ...edge, y: values.high, fill: "tonexty", fillcolor: fill });
       }
       drawn.push({ x, y: values.mid, mode: "lines", name, legendgroup: group, line: style, customdata: hover, opacity: isGrey(line) ? 0.6 : 1,
-        hovertemplate: hover ? "%{y:.4g} at measurement %{customdata}<extra>" + name + "</extra>" : "%{y:.4g}, %{x:.4g}<extra>" + name + "</extra>" });
+        hovertemplate: hover ? "%{y:.4g} at measurement %{customdata}<extra>" + every + "</extra>" : "%{y:.4g}, %{x:.4g}<extra>" + every + "</extra>" });
     }
     return drawn;
   }
@@ -121,7 +140,12 @@
         if (last[i] - first[i] + 1 < 0.85 * all) shapes.push({ type: "rect", xref: "x", yref: "paper", x0: at(first[i]), x1: at(last[i]), y0: 0, y1: 1, line: { width: 0 }, fillcolor: css("--soft"), opacity: i % 2 ? 0.1 : 0.06, layer: "below", label: { text: words(name), textposition: "top center", font: { size: 10, color: css("--soft") } } });
       });
     }
-    return [traces(lines, curves.time, of, curves.numbers("time")), layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: title }, ...changes }, shapes })];
+    const log = changes.type === "log", drawn = traces(lines, curves.time, of, curves.numbers("time"), log);
+    if (log) {
+      const [bottom, top] = ends(lines, of, true), margin = 0.06 * (top - bottom);
+      changes = { ...changes, range: [bottom - margin, top + margin] };
+    }
+    return [drawn, layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: title }, ...changes }, shapes })];
   }
 
   const logarithmic = { type: "log", exponentformat: "none", dtick: "D2", minorloglabels: "complete" };
@@ -132,8 +156,8 @@
       overTime({ curves, ...cell }, "rmse", [i], `RMSE of ${words(name)}, ${plain(curves.words("unit")[i])}`, logarithmic)]),
     exceeded: ({ curves, lines }) => curves.words("quantity").map((name, i) => [words(name), () => {
       const names = curves.words("policy"), share = curves.numbers("share");
-      const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null);
-      for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}<extra>" + trace.name + "</extra>"];
+      const drawn = traces(lines, [], (line) => ({ mid: curves.row("error_exceeded", names.indexOf(line.name), i) }), null, true);
+      for (const trace of drawn) [trace.x, trace.y, trace.hovertemplate] = [trace.y, share, "%{y:.3g} of measurements above %{x:.4g}" + trace.hovertemplate.slice(trace.hovertemplate.indexOf("<extra>"))];
       // Tiny errors are told apart by nobody.
       const sizes = drawn.flatMap(({ x }) => x.filter((size, k) => size > 0 && share[k] < 0.9)), largest = Math.max(...drawn.flatMap(({ x }) => x));
       const range = [Math.log10(Math.min(...sizes) || 1), Math.log10(largest || 1) + 0.05];
@@ -142,19 +166,22 @@
     consistency: (cell) => ["anees", "anis"].filter((name) => cell.curves.has(name)).map((name) => [name.slice(1).toUpperCase(), () => {
       const { curves } = cell;
       const names = curves.words("policy");
-      const drawn = traces(cell.lines, curves.time, (line) => ({ mid: curves.row(name, names.indexOf(line.name)) }), curves.numbers("time"));
+      const drawn = traces(cell.lines, curves.time, (line) => ({ mid: curves.row(name, names.indexOf(line.name)) }), curves.numbers("time"), true);
       const edge = { x: curves.time, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false };
       const band = curves.has(name + "_low") ? [{ ...edge, y: curves.numbers(name + "_low") }, { ...edge, y: curves.numbers(name + "_high"), fill: "tonexty", fillcolor: "rgba(128,128,128,0.35)", name: "95 % of a consistent one", showlegend: true }] : [];
       return [[...band, ...drawn], layout({ xaxis: { title: { text: curves.clock } }, yaxis: { title: { text: `mean ${name.slice(1).toUpperCase()} over its dimension` }, ...logarithmic }, shapes: [{ type: "line", xref: "paper", x0: 0, x1: 1, y0: 1, y1: 1, line: { color: css("--fg"), width: 1 } }] })];
     }]),
     steering: (cell) => {
-      const { curves } = cell, found = [];
-      if (curves.has("true_class_probability")) found.push(["weight of the true class", () => overTime(cell, "true_class_probability", [], "weight of the true class", { range: [-0.02, 1.02] })]);
-      for (const [variable, names, title] of [["gain", "gain_name", "gain"], ["action", "action_name", "action"], ["mode_probability", "mode", "probability"]]) {
-        if (!curves.has(variable)) continue;
-        curves.words(names).forEach((name, i) => found.push([`${title}: ${words(name)}`, () => overTime(cell, variable, [i], `${title}: ${words(name)}`, variable === "mode_probability" ? { range: [-0.02, 1.02] } : {})]));
-      }
-      return found;
+      const { curves } = cell, probability = { range: [-0.02, 1.02] };
+      const kinds = [["true_class_probability", null, "weight of the true class", probability], ["gain", "gain_name", "gain", {}], ["action", "action_name", "action", {}], ["mode_probability", "mode", "probability", probability]];
+      const found = kinds.filter(([variable]) => curves.has(variable)).flatMap(([variable, names, kind, axis]) =>
+        (names === null ? [null] : curves.words(names)).map((name, i) => {
+          const title = name === null ? kind : `${kind}: ${words(name)}`, indices = name === null ? [] : [i];
+          const varies = (line) => { const values = curves.row(variable, curves.words("policy").indexOf(line.name), ...indices).filter((y) => y !== null); return values.some((y) => Math.abs(y - values[0]) > 1e-6); };
+          return { moving: cell.lines.filter(varies).length, choice: [title, () => overTime(cell, variable, indices, title, axis)] };
+        }));
+      // What nobody moves is no picture; what most of them move comes first.
+      return found.filter(({ moving }) => moving).sort((a, b) => b.moving - a.moving).map(({ choice }) => choice);
     },
   };
 
@@ -182,13 +209,13 @@
     const range = [Math.max(-100, Math.min(...values, 0) * 1.15 - 3), Math.min(200, Math.max(...values, 5) * 1.1 + 3)];
     const beyond = values.filter((x) => x > range[1]).length;
     const narrow = window.innerWidth < 640;
-    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `${narrow ? "<br>" : " "}(${beyond} beyond the right edge)` : "");
+    const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} beyond the right edge)` : "");
     const yaxis = single
       ? { automargin: true, categoryorder: "array", categoryarray: entries.map((line) => plain(line.name)).reverse(), tickfont: { size: narrow ? 9 : 11 }, dtick: 1 }
       : { tickvals: rows.map((_, i) => i), ticktext: rows.map(([scenario, role]) => `${plain(scenario)}<br><i>${plain(role)}</i>`), range: [rows.length - 0.5, -0.5], zeroline: false, tickfont: { size: narrow ? 9 : 11 } };
     const shapes = single ? [] : rows.flatMap((_, i) => i % 2 ? [] : [{ type: "rect", xref: "paper", x0: 0, x1: 1, y0: i - 0.5, y1: i + 0.5, fillcolor: css("--soft"), opacity: 0.07, line: { width: 0 }, layer: "below" }]);
-    const height = single ? Math.max(260, 70 + 19 * entries.length) : (narrow ? 270 : 170) + rows.length * Math.max(44, 11 * entries.length);
-    const legend = single ? {} : { legend: { ...layout({}).legend, y: -70 / height } };
+    const height = single ? Math.max(280, 110 + 19 * entries.length) : (narrow ? 270 : 190) + rows.length * Math.max(44, 11 * entries.length);
+    const legend = single ? {} : { legend: { ...layout({}).legend, yref: "container", y: 0, yanchor: "bottom" } };
     return [drawn, layout({ xaxis: { title: { text: title }, range, zeroline: true, zerolinewidth: 2 }, yaxis, shapes, height, ...legend })];
   }
 
@@ -311,7 +338,9 @@
     let current = 0;
     const draw = () => { const [drawn, laid] = choices[current][1](); return Plotly.react(box, drawn, laid, config); };
     if (choices.length > 1) addChoices(figure, choices.map(([name]) => name), (i) => { current = i; draw(); });
-    if (choices.length) { draw(); redraw.push(draw); }
+    if (!choices.length) return figure.remove();
+    draw();
+    return redraw.push(draw);
   }
 
   async function open(details) {
