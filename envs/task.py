@@ -651,20 +651,23 @@ class Task(ABC):
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
         return self._estimating(episode).covariance(episode.bank)
 
-    def drawn(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
-        ``(C, C, N)``, and what is ``seen`` of the components ``(C, N)``, where anything is.
-        """
-        found = {"estimate": self.mean(episode), "covariance": self.covariance(episode)}
-        if self.has_truth:
-            found["truth"] = self.world.state(episode.truth)
-        seen = self.world.seen(episode.measurement)
-        return found if seen is None else {**found, "seen": seen}
-
     def track(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from, and every array of the measurement, named ``measurement_NAME``."""
+        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
+        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
+        """
         said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
-        return {**self.drawn(episode), **said}
+        return {**self._estimated(episode), **said}
+
+    def drawn(self, episode: Episode) -> dict[str, Array]:
+        """What a picture of a track shows: as :meth:`track`, but of the measurement what is ``seen`` of the components
+        ``(C, N)``, where anything is; NaN where it says nothing.
+        """
+        seen = self.world.seen(episode.measurement)
+        return {**self._estimated(episode), **({} if seen is None else {"seen": seen})}
+
+    def _estimated(self, episode: Episode) -> dict[str, Array]:
+        true = {"truth": self.world.state(episode.truth)} if self.has_truth else {}
+        return {**true, "estimate": self.mean(episode), "covariance": self.covariance(episode)}
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""

@@ -274,7 +274,7 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000
     again = (
         "comparison",
-        "benchmark.json",
+        "results.json",
         "--into",
         "page.md",
         "--format",

@@ -136,7 +136,7 @@ def test_first_page_shows_the_result_and_the_commands_of_the_readme():
 
 def test_every_page_of_results_says_what_makes_it():
     for name, words in (
-        ("comparison.md", "filtergym comparison results/benchmark.json --into docs/comparison.md"),
+        ("comparison.md", "filtergym comparison results/results.json --into docs/comparison.md"),
         ("training_seeds.md", "--into docs/training_seeds.md"),
         ("speed.md", "python benchmarks/throughput.py"),
     ):

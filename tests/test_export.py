@@ -15,7 +15,7 @@ from rich.text import Text
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
 from filtergym.reports.export import latex_table, latex_text, records_as_csv
-from filtergym.reports.tables import flights_table, grid_table, recorded_table, results_table
+from filtergym.reports.tables import flights_table, grid_table, recorded_table, results_tables
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NASTY = '50 % of $a_b$ & {c} ~ ^ # \\ < > | " ± 3 m², σ ≤ ∞, λ, 日, Müller'
@@ -37,7 +37,7 @@ def tables(dataset):
     nasty.add_row(Text("*", style="bold"), NASTY, end_section=True)
     nasty.add_row("", "")
     return {
-        "results": results_table(records),
+        "results": results_tables(records, 150)[0],
         "recorded": recorded_table(tidy_records(flights)),
         "flights": flights_table(flights, flight_records(flights), tidy_records(flights)),
         "grid": grid_table(Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]])),
@@ -158,7 +158,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
     options = ("--format", "svg", "--format", "pdf", "--columns", 1)
     assert run(monkeypatch, *words, "--set", "horizon=20", "--out", out, *options) == 0
     figures = ["rmse_over_time", "error_distribution", "consistency", "mode_probabilities"]
-    expected = {"records.json", "records.csv", "table.tex", "results.nc"}
+    expected = {"records.json", "records.csv", "table.tex", "results.nc", "results.json", "report.html"}
     expected |= {f"{name}.{suffix}" for name in figures for suffix in ("svg", "pdf")}
     assert {path.name for path in out.iterdir()} == expected
     assert re.search(r'width="252(\.0)?pt"', (out / "rmse_over_time.svg").read_text())

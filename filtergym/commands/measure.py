@@ -212,13 +212,14 @@ def evaluate_policies(
     tables += results_tables(records, console.width) if judged else [recorded_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])
+    whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
             records_as_csv(waiting / "records.csv", [*records, *of_flights])
             write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
-            if fits_classic(dataset):
-                write_dataset(waiting / "results.nc", dataset)
+            if fits_classic(whole):
+                write_dataset(waiting / "results.nc", whole)
             for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
@@ -236,7 +237,7 @@ def evaluate_policies(
         )
         if judged:
             make_report(*read_results(out / RESULTS), out / REPORT)
-        if not fits_classic(dataset):
+        if not fits_classic(whole):
             console.print(
                 "results.nc is left out: it is too large for NetCDF's classic format. From Python, "
                 "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"

@@ -16,8 +16,8 @@ from ..baselines.reproduction import Grid, Reproduction
 from ..baselines.tuning import Tuned
 from ..evaluation.competitors import RANKED
 
-NARROW = 24
-"""Columns of a name where there are few: longer ones go on below, from a hyphen on where they have one."""
+NARROW, WIDE = 24, 44
+"""Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
 INCONSISTENT = "!"
 """Marks a covariance that is off by more than a factor of two."""
 
@@ -185,7 +185,7 @@ def _of_competitors(
             table.add_section()
             section = kind
         told = steered if kind == "policy" else f"({kind})"
-        shown = "\n".join(textwrap.wrap(name, NARROW)) if compact else name
+        shown = "\n".join(textwrap.wrap(name, NARROW if compact else WIDE))
         table.add_row(shown, *([told] if control else []), *(column(name) for column in columns.values()))
     return table
 
@@ -195,7 +195,7 @@ def _widest(table: Table) -> int:
     return Measurement.get(_MEASURING, _MEASURING.options, table).maximum
 
 
-_MEASURING = Console(width=10_000, file=io.StringIO())
+_MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False)
 
 
 def recorded_table(records: Sequence[Any]) -> Table:
