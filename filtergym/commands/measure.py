@@ -49,6 +49,8 @@ from .terminal import (
     progress_bar,
 )
 
+LARGE = 200_000_000
+"""Bytes of a file that nobody expects without having asked for it."""
 MOST_RECORDINGS = 40
 """Of which a table tells one by one."""
 
@@ -100,6 +102,13 @@ def evaluate_policies(
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for records, a table, the whole result and figures.")
+    ] = None,
+    netcdf: Annotated[
+        bool | None,
+        typer.Option(
+            "--netcdf/--no-netcdf",
+            help="With --out, write results.nc however large it is, or not at all; default: up to 200 MB.",
+        ),
     ] = None,
     format: Formats = None,
     columns: Columns = 2,
@@ -213,12 +222,13 @@ def evaluate_policies(
     if json is not None:
         write_records(json, [*records, *of_flights])
     whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
+    refusal = _unwritten(whole, netcdf)
     if out is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
             records_as_csv(waiting / "records.csv", [*records, *of_flights])
             write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
-            if fits_classic(whole):
+            if not refusal:
                 write_dataset(waiting / "results.nc", whole)
             for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
                 for suffix in formats:
@@ -237,13 +247,22 @@ def evaluate_policies(
         )
         if judged:
             make_report(*read_results(out / RESULTS), out / REPORT)
-        if not fits_classic(whole):
-            console.print(
-                "results.nc is left out: it is too large for NetCDF's classic format. From Python, "
-                "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
-            )
+        if refusal:
+            console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
     if estimates is not None:
         console.print(f"estimates in {estimates}", soft_wrap=True)
+
+
+def _unwritten(dataset: xarray.Dataset, asked: bool | None) -> str:
+    """Say why a dataset is not written as NetCDF; empty if it is."""
+    if not fits_classic(dataset):
+        return (
+            "it is too large for NetCDF's classic format. From Python, evaluate(...).to_netcdf(path, engine='h5netcdf') "
+            "writes it"
+        )
+    if asked is None and dataset.nbytes > LARGE:
+        return f"it would have {dataset.nbytes / 1e6:,.0f} MB; --netcdf writes it"
+    return "" if asked is not False else "--no-netcdf"
 
 
 def record_scenario(
