@@ -257,8 +257,8 @@ def _unwritten(dataset: xarray.Dataset, asked: bool | None) -> str:
     """Say why a dataset is not written as NetCDF; empty if it is."""
     if not fits_classic(dataset):
         return (
-            "it is too large for NetCDF's classic format. From Python, evaluate(...).to_netcdf(path, engine='h5netcdf') "
-            "writes it"
+            "it is too large for NetCDF's classic format. From Python, "
+            "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
         )
     if asked is None and dataset.nbytes > LARGE:
         return f"it would have {dataset.nbytes / 1e6:,.0f} MB; --netcdf writes it"
