@@ -7,266 +7,24 @@ are solid, references dashed, bounds dotted, in every picture.
 
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import wraps
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
-from .competitors import RANKED
 from .dataset import windows_of
-from .files import whole_file
-
-LINES = ("-", "--", "-.", ":")
-# Okabe and Ito's palette: distinguishable for colour-blind readers.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999933")
-LINES_OF_KINDS = {"policy": "-", "estimator": "-", "reference": "--", "bound": ":"}
-GREY = "0.72"
-"""Of lines that are not told apart."""
-MOST_HIGHLIGHTED = 6
-"""Lines that a reader can tell apart."""
-MOST_BESIDE = 8
-"""Names that fit beside the lowest axes."""
-WIDTHS = {1: 3.5, 2: 7.16}
-"""Inches, of one and two columns of a paper."""
-FONT_SIZES = {1: 7.0, 2: 8.0}
-"""Points, which are printed as they are: the figure has the width of its place."""
-FORMATS = ("png", "svg", "pdf")
-DOTS_PER_INCH = 200
-
-
-def styles(names: list[str]) -> dict[str, dict[str, Any]]:
-    """Colour and line style of each policy; two policies never share both."""
-    n = len(COLOURS)
-    return {
-        name: {"color": COLOURS[i % n], "linestyle": LINES[(i // n) % len(LINES)], "linewidth": 1.6}
-        for i, name in enumerate(names)
-    }
-
-
-def check_columns(columns: int) -> int:
-    """Return a number of columns, or raise ValueError if no figure is that wide."""
-    if columns not in WIDTHS:
-        raise ValueError(f"a figure is 1 or 2 columns wide, got {columns}")
-    return columns
-
-
-def check_formats(formats: Iterable[str]) -> list[str]:
-    """Return formats, each once, or raise ValueError for one in which no figure is written."""
-    for each in formats:
-        if each not in FORMATS:
-            raise ValueError(
-                f"figures are written as {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {each!r}"
-            )
-    return list(dict.fromkeys(formats))
-
-
-def _in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
-    """Draw with the sizes of print, whatever matplotlib has been told elsewhere."""
-
-    @wraps(draw)
-    def drawn(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
-        from matplotlib import rc_context
-
-        size = FONT_SIZES[check_columns(columns)]
-        settings: Any = {
-            "font.family": "sans-serif",
-            "font.size": size,
-            "axes.labelsize": size,
-            "axes.titlesize": size,
-            "figure.titlesize": size,
-            "legend.fontsize": size - 0.5,
-            "xtick.labelsize": size - 0.5,
-            "ytick.labelsize": size - 0.5,
-            "axes.linewidth": 0.6,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-        }
-        with rc_context(settings):
-            return draw(*arguments, columns=columns, **keywords)
-
-    return drawn
-
-
-def _axes(rows: int = 1, columns: int = 2, height: float | None = None) -> Any:
-    """Return an empty figure and its axes, one above the other, each of a height in inches."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    if height is None:
-        height = {1: 2.0, 2: 2.5}[columns] if rows < 4 else 1.7
-    figure = Figure(figsize=(WIDTHS[columns], height * rows + 0.35), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
-
-
-def _titled(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
-    """Return the figure with its title, and a legend, of the first axes or of handles: beside it where there is room,
-    else below.
-    """
-    width = figure.get_figwidth()
-    size = FONT_SIZES[1 if width < 5.0 else 2]
-    # Letters are half as wide as they are high, and a little.
-    letters = int(72.0 * width / (0.55 * size))
-    wrapped = "\n".join(line for part in title.split("\n") for line in textwrap.wrap(part, letters))
-    figure.suptitle(wrapped, x=0.01, ha="left")
-    figure.set_figheight(figure.get_figheight() + 1.2 * size * wrapped.count("\n") / 72.0)
-    if handles is None:
-        handles = figure.axes[0].get_legend_handles_labels()[0]
-    if handles:
-        labels = [handle.get_label() for handle in handles]
-        longest = max(map(len, labels))
-        if width >= 5.0:
-            figure.legend(handles, labels, loc="outside right upper", frameon=False)
-        else:
-            # A sample of the line, and half a letter's height for each letter.
-            columns = max(1, min(len(labels), int(72.0 * width / (0.52 * size * longest + 32.0))))
-            rows = -(-len(labels) // columns)
-            figure.set_figheight(figure.get_figheight() + (1.45 * size * rows + 6.0) / 72.0)
-            figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-    return figure
-
-
-def _logarithmic(axis: Any) -> None:
-    """Label a logarithmic axis, whose limits are set, with plain numbers: decades; 2 and 5 too within three, 3 within
-    one; round ones, a few, within less than half of one.
-    """
-    from matplotlib.ticker import MaxNLocator, NullLocator
-
-    low, high = axis.get_view_interval()
-    axis.set_major_formatter("{x:g}")
-    if high <= 4.0 * low:
-        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        axis.set_minor_locator(NullLocator())
-        return
-    digits = "235" if high <= 10.0 * low else "25" if high <= 1e3 * low else ""
-    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
-
-
-# --- who is drawn how
-
-
-def by_cost(curves: xarray.Dataset) -> list[str]:
-    """Names of what is ranked, the lowest mean cost first; without costs by the mean RMSE of the first quantity, and
-    without truth as they come.
-    """
-    names = curves["policy"].values[numpy.isin(curves["kind"].values.astype(str), RANKED)].tolist()
-    if "mean_cost" in curves:
-        worth = curves["mean_cost"]
-    elif "rmse" in curves:
-        worth = curves["rmse"].isel(quantity=0).mean("time")
-    else:
-        return [str(name) for name in names]
-    each = {name: float(worth.sel(policy=name)) for name in names}
-    return sorted(names, key=lambda name: (numpy.isnan(each[name]), each[name]))
-
-
-def highlighted(
-    curves: xarray.Dataset, highlight: Sequence[str] | None = None, learned: Sequence[str] = ()
-) -> list[str]:
-    """Names of the lines that are told apart, the most important first; of those that are the same, the first.
-
-    Args:
-        curves: of an evaluation.
-        highlight: names, in place of those that are found: the paper's algorithm, the reference, the bound, the best
-            learned and the best classical competitor, and then by cost.
-        learned: names of what has been learned.
-
-    Raises:
-        ValueError: for unknown names, or too many.
-    """
-    present = curves["policy"].values.tolist()
-    if highlight is not None:
-        for name in highlight:
-            if name not in present:
-                raise ValueError(f"cannot highlight {name!r}: there are {', '.join(present)}")
-        if len(set(highlight)) > MOST_HIGHLIGHTED:
-            raise ValueError(f"at most {MOST_HIGHLIGHTED} lines can be told apart, got {len(set(highlight))}")
-        return list(dict.fromkeys(highlight))
-    ranked = by_cost(curves)
-    kinds = dict(zip(present, curves["kind"].values.astype(str).tolist(), strict=True))
-    classical = [name for name in ranked if name not in learned and name != curves.attrs["paper"]]
-    wanted = [
-        *(name for name in (curves.attrs["paper"], curves.attrs["reference"]) if name in present),
-        *[name for name in present if kinds[name] == "bound"][:1],
-        *[name for name in ranked if name in learned][:1],
-        *classical[:1],
-        *ranked,
-        *present,
-    ]
-    chosen: list[str] = []
-    for name in dict.fromkeys(wanted):
-        same = "rmse" in curves and any(
-            _same(curves["rmse"].sel(policy=name).values, curves["rmse"].sel(policy=other).values)
-            for other in chosen
-        )
-        if not same:
-            chosen.append(name)
-    return chosen[:MOST_HIGHLIGHTED]
-
-
-def _same(one: numpy.ndarray, other: numpy.ndarray) -> bool:
-    """Whether two lines lie on each other; what is missing from both says nothing."""
-    missing = numpy.isnan(one).all() and numpy.isnan(other).all()
-    return not missing and bool(numpy.allclose(one, other, rtol=1e-6, atol=0.0, equal_nan=True))
-
-
-def looks(
-    curves: xarray.Dataset, highlight: Sequence[str] | None = None, learned: Sequence[str] = ()
-) -> dict[str, dict[str, Any]]:
-    """Colour, line style and width of the lines that are told apart, in the order of the legend.
-
-    Args:
-        curves: of an evaluation.
-        highlight: as of :func:`highlighted`.
-        learned: likewise; their lines are thicker.
-    """
-    chosen = highlighted(curves, highlight, learned)
-    kinds = {name: str(curves["kind"].sel(policy=name).values) for name in chosen}
-    colours = {name: COLOURS[6] for name in chosen if kinds[name] not in RANKED}
-    if curves.attrs["paper"] in chosen:
-        colours[curves.attrs["paper"]] = COLOURS[0]
-    free = [colour for colour in COLOURS[1:6] if colour not in colours.values()]
-    if curves.attrs["paper"] not in chosen:
-        free.insert(0, COLOURS[0])
-    rest = iter(free)
-    for name in chosen:
-        if name not in colours:
-            colours[name] = next(rest)
-    # A second reference, or bound, is told from the first by its grey.
-    for kind in ("reference", "bound"):
-        for name, shade in zip(
-            [n for n in chosen if kinds[n] == kind], ("#000000", "0.4", "0.6") * 2, strict=False
-        ):
-            colours[name] = shade
-    return {
-        name: {
-            "color": colours[name],
-            "linestyle": LINES_OF_KINDS.get(kinds[name], "-"),
-            "linewidth": 1.6 if name in learned else 1.1,
-            "zorder": 3.0 - 0.01 * i,
-        }
-        for i, name in enumerate(chosen)
-    }
-
-
-def merged(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
-    """Names whose lines lie on each other, by the first of them, in the order of ``names``."""
-    found: dict[str, list[str]] = {}
-    for name in names:
-        twin = next((first for first in found if _same(values[first], values[name])), name)
-        found.setdefault(twin, []).append(name)
-    return found
-
-
-def joined(names: Sequence[str], most: int = 2) -> str:
-    """Name of a line that several share: ``imm = hard-imm``, or of more than ``most`` ``imm = hard-imm = 3 more``."""
-    few = len(names) <= most
-    return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])
-
-
-# --- lines over time
+from .looks import GREY, joined, looks, merged, styles
+from .print_layout import (
+    direct_labels,
+    figure_with_axes,
+    in_print,
+    logarithmic,
+    positive,
+    room_for_labels,
+    sensible_limits,
+    titled,
+    wrapped,
+)
 
 
 class Panel(NamedTuple):
@@ -334,94 +92,6 @@ def _shade_windows(axis: Any, curves: xarray.Dataset) -> None:
         )
 
 
-def sensible_limits(
-    lines: Sequence[numpy.ndarray],
-    always: Sequence[numpy.ndarray] = (),
-    bounds: Sequence[numpy.ndarray] = (),
-) -> tuple[float, float]:
-    """Limits of a logarithmic axis on which one line, or a transient, cannot squash all others.
-
-    A line takes the room from its 5th percentile, so that it need not begin at zero, to its largest value, but not more
-    than a factor of six above what half of the lines take.
-
-    Args:
-        lines: positive; NaN where there is none.
-        always: lines that are shown whatever they are.
-        bounds: lines that may be far below what anybody reaches: they take a factor of six below the others at most.
-    """
-    ends = numpy.array([numpy.percentile(own, [5.0, 100.0]) for line in lines if len(own := _positive(line))])
-    if not len(ends):
-        return 0.1, 10.0
-    low, high = ends[:, 0].min(), min(ends[:, 1].max(), numpy.median(ends[:, 1]) * 6.0)
-    for line in always:
-        if len(own := _positive(line)):
-            low, high = min(low, numpy.percentile(own, 5.0)), max(high, own.max())
-    for line in bounds:
-        if len(own := _positive(line)):
-            low, high = min(low, max(numpy.percentile(own, 5.0), low / 6.0)), max(high, own.min())
-    margin = max((high / low) ** 0.06, 1.02)
-    return float(low / margin), float(high * margin)
-
-
-def _positive(values: numpy.ndarray) -> numpy.ndarray:
-    found: numpy.ndarray = values[numpy.isfinite(values) & (values > 0.0)]
-    return found
-
-
-def _spread(wanted: Sequence[float], gap: float) -> list[float]:
-    """Places as near to the wanted ones as a gap between them allows, within 0 and 1."""
-    order = numpy.argsort(wanted, kind="stable")
-    places = numpy.clip(numpy.asarray(wanted, dtype=float)[order], 0.0, 1.0)
-    for _ in range(200):
-        close = numpy.diff(places) < gap - 1e-9
-        if not close.any():
-            break
-        for i in numpy.flatnonzero(close):
-            middle = 0.5 * (places[i] + places[i + 1])
-            places[i], places[i + 1] = middle - 0.5 * gap, middle + 0.5 * gap
-        places = numpy.clip(
-            places, gap * numpy.arange(len(places)), 1.0 - gap * numpy.arange(len(places))[::-1]
-        )
-    found = numpy.empty(len(places))
-    found[order] = places
-    return found.tolist()
-
-
-def _direct_labels(figure: Any, axis: Any, ends: Mapping[str, tuple[float, float, Any]], rows: int) -> None:
-    """Name lines at their right end.
-
-    Args:
-        figure: that the axes are in.
-        axis: whose limits and scales are set.
-        ends: label -> where its line ends, and its colour.
-        rows: axes above each other in the figure.
-    """
-    size = FONT_SIZES[1 if figure.get_figwidth() < 5.0 else 2] - 0.5
-    height = 72.0 * (figure.get_figheight() - 0.7) / rows * 0.85  # of the axes, points; about
-    to_fraction = axis.transData + axis.transAxes.inverted()
-    wanted = [float(to_fraction.transform(end[:2])[1]) for end in ends.values()]
-    for (label, (_, _, colour)), at, place in zip(
-        ends.items(), wanted, _spread(wanted, 1.15 * size / height), strict=True
-    ):
-        start = min(max(at, 0.0), 1.0)
-        axis.plot(
-            [1.0, 1.012, 1.02],
-            [start, place, place],
-            transform=axis.transAxes,
-            color=colour,
-            lw=0.5,
-            clip_on=False,
-        )
-        axis.text(1.026, place, label, transform=axis.transAxes, va="center", color=colour, fontsize=size)
-
-
-def _room_for_labels(labels: Iterable[str], columns: int) -> bool:
-    """Whether names beside the axes leave most of the width to them, and the lowest axes are high enough for them."""
-    labels = list(labels)
-    width = 0.5 * (FONT_SIZES[columns] - 0.5) * max(map(len, labels), default=0) / 72.0
-    return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
-
-
 def _over_time(
     curves: xarray.Dataset,
     panels: Sequence[Panel],
@@ -442,8 +112,8 @@ def _over_time(
     groups = merged([*(n for n in look if n in there), *(n for n in there if n not in look)], values)
     told = {first: joined(same) for first, same in groups.items() if first in look}
     others = [first for first in groups if first not in look]
-    beside = _room_for_labels(told.values(), columns)
-    figure, axes = _axes(len(panels), columns)
+    beside = room_for_labels(told.values(), columns)
+    figure, axes = figure_with_axes(len(panels), columns)
     x = _abscissa(curves)
     wide = False
     if columns == 1:
@@ -469,7 +139,7 @@ def _over_time(
         finish(axis, panel)
         wide |= _draw_bands(axis, x, panel, here, look)
         if beside:
-            _direct_labels(figure, axis, ends, len(panels))
+            direct_labels(figure, axis, ends, len(panels))
     if wide:
         title += " (none where they fill the axis)"
     _name_abscissa(curves, axes)
@@ -480,7 +150,7 @@ def _over_time(
         # One word needs no legend of its own.
         title += "; grey: others"
         handles = []
-    return _titled(figure, title, handles)
+    return titled(figure, title, handles)
 
 
 def _draw_bands(
@@ -523,7 +193,7 @@ def _title(curves: xarray.Dataset) -> str:
     return f"{attrs['environment']}, scenario {attrs['scenario']}: {attrs['episodes']} episode{plural}"
 
 
-@_in_print
+@in_print
 def draw_error_over_time(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -537,14 +207,14 @@ def draw_error_over_time(
     look = looks(curves) if look is None else look
     panels = [
         Panel(
-            _wrapped(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
+            wrapped(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
             *(curves[f"rmse{ending}"].sel(quantity=name) for ending in ("", "_low", "_high")),
         )
         for name, unit in zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True)
     ]
 
     def finish(axis: Any, panel: Panel) -> None:
-        if not len(_positive(panel.values.values)):
+        if not len(positive(panel.values.values)):
             return  # of who is told the truth; a logarithmic axis has no zero
         axis.set_yscale("log")
         kinds = {name: str(curves["kind"].sel(policy=name).values) for name in look}
@@ -552,17 +222,12 @@ def draw_error_over_time(
         lines = [panel.values.sel(policy=name).values for name in look if kinds[name] != "bound"]
         paper = [panel.values.sel(policy=n).values for n in [curves.attrs["paper"]] if n in look]
         axis.set_ylim(*sensible_limits(lines or bounds, paper, bounds))
-        _logarithmic(axis.yaxis)
+        logarithmic(axis.yaxis)
 
     return _over_time(curves, panels, look, f"{_title(curves)}, 95 % bands", columns, finish)
 
 
-def _wrapped(label: str, columns: int) -> str:
-    """Break the name of an ordinate that is longer than a low panel is high."""
-    return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
-
-
-@_in_print
+@in_print
 def draw_consistency(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -584,13 +249,13 @@ def draw_consistency(
         axis.axhline(1.0, color="0.3", lw=0.6, zorder=1.2)
         axis.set_yscale("log")
         axis.set_ylim(*sensible_limits([panel.values.sel(policy=name).values for name in look], [low, high]))
-        _logarithmic(axis.yaxis)
+        logarithmic(axis.yaxis)
 
     title = f"{_title(curves)}; consistent in the dark band (95 %, chi-square); light: a factor of two"
     return _over_time(curves, panels, look, title, columns, finish)
 
 
-@_in_print
+@in_print
 def draw_error_distribution(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -606,7 +271,7 @@ def draw_error_distribution(
     values = {name: exceeded.sel(policy=name).values for name in there}
     groups = merged([*(n for n in look if n in there), *(n for n in there if n not in look)], values)
     told = {first: joined(same) for first, same in groups.items() if first in look}
-    figure, axes = _axes(curves.sizes["quantity"], columns)
+    figure, axes = figure_with_axes(curves.sizes["quantity"], columns)
     units = dict(zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True))
     supported = shares[~numpy.isnan(exceeded.values).all(axis=(0, 1))]
     for axis, (quantity, unit) in zip(axes, units.items(), strict=True):
@@ -619,22 +284,22 @@ def draw_error_distribution(
         axis.set_ylabel("share of\nmeasurements above")
         axis.grid(alpha=0.25, which="both", lw=0.4)
         told_values = exceeded.sel(policy=list(told or there), quantity=quantity).values
-        if not len(_positive(told_values)):
+        if not len(positive(told_values)):
             continue
         axis.set_xscale("log")
         # From what nine of ten measurements exceed to the largest errors, of which one line's are not all there is.
         most = int(numpy.argmin(numpy.abs(shares - 0.9)))
-        smallest = _positive(told_values[:, most])
-        largest = _positive(numpy.nanmax(told_values, axis=1))
+        smallest = positive(told_values[:, most])
+        largest = positive(numpy.nanmax(told_values, axis=1))
         if len(smallest) and len(largest):
             high = min(largest.max(), 10.0 * numpy.median(largest))
             low = numpy.median(smallest) / 2.0
             axis.set_xlim(low, max(high, 4.0 * low) * 1.05)
-        _logarithmic(axis.xaxis)
+        logarithmic(axis.xaxis)
     handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()]
     if len(groups) > len(told):
         handles.append(Line2D([], [], color=GREY, linewidth=0.6, label="others"))
-    return _titled(figure, f"{_title(curves)}, distribution of errors", handles)
+    return titled(figure, f"{_title(curves)}, distribution of errors", handles)
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
@@ -649,7 +314,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
     return merged(found, found)
 
 
-@_in_print
+@in_print
 def draw_mode_probabilities(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -661,9 +326,9 @@ def draw_mode_probabilities(
     groups = varying_modes(curves, look)
     modes = curves["mode"].values.tolist()
     named = {mode: mode.replace("_", " ") for mode in modes}
-    figure, axes = _axes(len(groups), columns, 1.5)
+    figure, axes = figure_with_axes(len(groups), columns, 1.5)
     x = _abscissa(curves)
-    beside = _room_for_labels(named.values(), columns)
+    beside = room_for_labels(named.values(), columns)
     for axis, (name, same) in zip(axes, groups.items(), strict=True):
         _shade_windows(axis, curves)
         ends = {}
@@ -687,13 +352,13 @@ def draw_mode_probabilities(
         axis.set_ylabel("\n".join(["probability", *textwrap.wrap(joined(same), 24)]))
         axis.grid(alpha=0.25, lw=0.4)
         if beside:
-            _direct_labels(figure, axis, ends, len(groups))
+            direct_labels(figure, axis, ends, len(groups))
     _name_abscissa(curves, axes)
     title = f"{_title(curves)}, mode probabilities, 95 % bands"
-    return _titled(figure, title, [] if beside else None)
+    return titled(figure, title, [] if beside else None)
 
 
-@_in_print
+@in_print
 def draw_true_class_probability(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -711,7 +376,7 @@ def draw_true_class_probability(
     return _over_time(curves, [panel], look, f"{_title(curves)}, 95 % bands", columns, finish)
 
 
-@_in_print
+@in_print
 def draw_learning_curves(
     curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]],
     title: str,
@@ -727,7 +392,7 @@ def draw_learning_curves(
         paper: name of the paper's algorithm, whose line is at zero.
         columns: of a paper, as wide as which it is.
     """
-    figure, axes = _axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
+    figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
     axis = axes[0]
     for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
         for i, (steps, differences) in enumerate(runs):
@@ -748,10 +413,10 @@ def draw_learning_curves(
     axis.set_xlabel("environment steps, millions")
     axis.set_ylabel(f"validation cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4)
-    return _titled(figure, title)
+    return titled(figure, title)
 
 
-@_in_print
+@in_print
 def draw_differences(
     differences: Mapping[str, Mapping[str, Sequence[float]]],
     names: Sequence[str],
@@ -774,7 +439,7 @@ def draw_differences(
         columns: of a paper, as wide as which it is.
     """
     height = 0.8 + len(differences) * (0.25 + 0.07 * len(names))
-    figure, axes = _axes(columns=columns, height=height)
+    figure, axes = figure_with_axes(columns=columns, height=height)
     axis = axes[0]
     gap = 0.8 / len(names)
     ranked = styles([name for name in names if name not in unranked])
@@ -816,7 +481,7 @@ def draw_differences(
     axis.set_ylim(len(differences) - 0.5, -0.5)
     axis.set_xlabel(f"cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4, axis="x")
-    return _titled(figure, title)
+    return titled(figure, title)
 
 
 def evaluation_figures(
@@ -848,22 +513,3 @@ def evaluation_figures(
         yield "true_class_probability", draw_true_class_probability(curves, look, columns=columns)
     elif "mode_probability" in curves and varying_modes(curves, look):
         yield "mode_probabilities", draw_mode_probabilities(curves, look, columns=columns)
-
-
-def save(figure: Any, path: Path) -> None:
-    """Save a figure as its suffix says, whole or not at all: ``.png``; ``.svg``, whose text stays text; ``.pdf``, which
-    holds the fonts it takes. The same figure gives the same file.
-
-    Raises:
-        ValueError: for another suffix, or if it cannot be written.
-    """
-    from matplotlib import rc_context
-
-    written = path.suffix.removeprefix(".").lower()
-    check_formats([written])
-    # Without the time of writing.
-    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(written)
-    # Type 42: TrueType as it is, which journals take; Type 3, the default, many refuse.
-    settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "filtergym", "pdf.fonttype": 42}
-    with whole_file(path) as partial, rc_context(settings):
-        figure.savefig(partial, format=written, dpi=DOTS_PER_INCH, metadata=metadata)

@@ -9,21 +9,13 @@ import pytest
 import xarray
 from filtergym.evaluation.curves import curves_of
 from filtergym.evaluation.figures import (
-    COLOURS,
-    MOST_HIGHLIGHTED,
-    WIDTHS,
-    by_cost,
     draw_differences,
     draw_error_over_time,
     draw_learning_curves,
     evaluation_figures,
-    highlighted,
-    joined,
-    looks,
-    merged,
-    save,
-    sensible_limits,
 )
+from filtergym.evaluation.looks import COLOURS, MOST_HIGHLIGHTED, by_cost, highlighted, joined, looks, merged
+from filtergym.evaluation.print_layout import WIDTHS, save, sensible_limits
 from matplotlib.colors import to_hex
 
 from filtergym import evaluate, record

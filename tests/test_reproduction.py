@@ -18,7 +18,7 @@ from filtergym.baselines.reproduction import (
     verdict_of,
 )
 from filtergym.baselines.reproduction.measured import Measured, mean, means, measured
-from filtergym.evaluation.figures import save
+from filtergym.evaluation.print_layout import save
 from matplotlib.figure import Figure
 
 

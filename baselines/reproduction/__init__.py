@@ -17,8 +17,8 @@ from types import ModuleType
 from typing import Any, Literal
 
 from ...envs.catalogue import nearest
-from ...evaluation.figures import save
 from ...evaluation.files import whole_files, write_text
+from ...evaluation.print_layout import save
 from ..catalogue import packages
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]

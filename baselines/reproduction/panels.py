@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 
-from ...evaluation.figures import LINES, styles
+from ...evaluation.looks import LINES, styles
 from .measured import band
 
 

@@ -16,9 +16,10 @@ from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import fits_classic, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
-from ..evaluation.figures import check_columns, check_formats, evaluation_figures, save
+from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import flight_records
+from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..names import competitor, evaluate, is_learned, tidy_records
 from ..reports.benchmark import RESULTS, Cell, all_records, result_of, run_benchmark

@@ -8,8 +8,8 @@ import typer
 
 from ..baselines.reproduction import paper_module, papers, save_reproduction
 from ..envs.catalogue import find_scenario, importable_name, short_name, task_class
-from ..evaluation.figures import check_columns, check_formats, save
 from ..evaluation.files import whole_files, writable_file, writable_folder
+from ..evaluation.print_layout import check_columns, check_formats, save
 from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
 from ..reports.pages import check_markers, insert_between_markers, markers_of

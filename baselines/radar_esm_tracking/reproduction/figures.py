@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy
 
-from ....evaluation.figures import styles
+from ....evaluation.looks import styles
 from ...reproduction.measured import means
 from ...reproduction.panels import draw, finish, legend_outside, looks, panels
 from ..metrics import SURE

@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 
 from ....envs.tightly_coupled_navigation.parameters import HYPOTHESES
-from ....evaluation.figures import styles
+from ....evaluation.looks import styles
 from ...reproduction.measured import means
 from ...reproduction.panels import draw, finish, legend_outside, looks, panels, shade
 from .claims import BAND, COORDINATE_LOSS, matched_ratios

@@ -5,7 +5,7 @@ from typing import Any
 import numpy
 
 from ....envs.uav_autopilot.task import UavAutopilot
-from ....evaluation.figures import COLOURS
+from ....evaluation.looks import COLOURS
 from ...reproduction.panels import finish, legend_outside, looks, panels
 from ..theory import stationary
 from .experiment import (
