@@ -36,6 +36,9 @@ FULL_SECONDS = 5.0
 """Time per policy and cell that the full benchmark, of ten times as many measurements, does not go beyond."""
 FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
 """Of fewer the intervals are too narrow; where episodes are long, the quick benchmark takes no more."""
+LONG = 2000
+"""Measurements of an episode, beyond which the quick benchmark leaves out who was tuned: few episodes side by side cost
+as much as many."""
 RESULTS = "results.json"
 
 
@@ -63,14 +66,20 @@ def _horizon(id: str, scenario: str) -> int:
     return cls.Parameters(**cls.scenarios[scenario].parameters).horizon
 
 
-def benchmark_policies(id: str, full: bool) -> tuple[str, ...]:
+def benchmark_policies(id: str, full: bool, horizon: int = 0) -> tuple[str, ...]:
     """Names that a cell compares, the paper's algorithm first.
 
-    Quick: the telling ones, tuned where they can be; shipped agents. Full: every policy and estimator as it is, those
-    that were tuned, shipped agents, references, bounds.
+    Quick: the telling ones, tuned where they can be and episodes are not long; shipped agents. Full: every policy and
+    estimator as it is, those that were tuned, shipped agents, references, bounds.
+
+    Args:
+        id: environment id.
+        full: everything.
+        horizon: measurements of an episode.
     """
     known = baselines_of(id)
-    tuned, learned = tuned_names(id), shipped_agents(id)
+    tuned = tuned_names(id) if full or horizon <= LONG else []
+    learned = shipped_agents(id)
     if full:
         everything = (*known.policies, *known.estimators, *tuned, *learned, *known.references, *known.bounds)
     else:
@@ -98,7 +107,7 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
                 affordable = int(FULL_SECONDS / baselines_of(id).measurement_seconds)
                 measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
             episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
-            wanted.append(Cell(cls.id, name, episodes, benchmark_policies(id, full)))
+            wanted.append(Cell(cls.id, name, episodes, benchmark_policies(id, full, horizon)))
     return wanted
 
 
