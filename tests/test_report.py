@@ -266,3 +266,14 @@ def test_figures_that_plotly_draws_are_valid(result):
             if isinstance(values, dict):
                 assert len(values["numbers"]) == np.prod(shape)
     assert {"truth", "estimate", "seen", "sigma", "correlation"} <= set(cell["track"]["variables"])
+
+
+def test_an_environment_without_a_paper_or_a_track_has_a_report_too(result, command_console):
+    compared = ("relative_cost_difference", "median_cost_ratio", "win_rate", "score", "behind_best")
+    records = [r for r in result.records if r.metric not in compared]
+    alone = result._replace(paper="", reference="", learned=[], records=records, track=None, curves=None)
+    html = report_html([alone], SETTINGS)
+    assert 'data-kind="ranking"' not in html
+    assert 'data-kind="track"' not in html
+    assert "On <code>random</code> <code>" in html
+    assert "kalman-imm-tuned" in command_console(80, headline_table([alone]))

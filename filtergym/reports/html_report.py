@@ -240,14 +240,16 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 parts.append(f"{name} {record.value:.3g}{'' if record.unit == '1' else ' ' + record.unit}")
         return ", ".join(parts)
 
-    figures = [
-        {
-            "kind": "ranking",
-            "title": f"Cost against {result.paper or 'the paper'}",
-            "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
-            "alternative": "The table above holds these numbers.",
-        }
-    ]
+    figures = []
+    if _differences(result):
+        figures.append(
+            {
+                "kind": "ranking",
+                "title": f"Cost against {result.paper or 'the paper'}",
+                "text": "Difference of the mean cost, with its paired 95 % interval; left of zero is better.",
+                "alternative": "The table above holds these numbers.",
+            }
+        )
     if result.curves is not None and "rmse" in result.curves:
         component = str(result.curves["quantity"].values[0])
         figures += [
