@@ -75,8 +75,11 @@ def test_page_names_every_field(id):
 
 @pytest.mark.parametrize("name", AUDIENCES)
 def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch):
-    """One block after the other in an empty folder, with a short training; a block that names its file becomes it."""
-    text = (DOCS / name).read_text(encoding="utf-8")
+    """One block after the other in an empty folder; a block that names its file becomes it.
+
+    With a short training and few episodes: numbers on the page are not tested.
+    """
+    text = re.sub(r"(episodes[= ])\d+", r"\g<1>12", (DOCS / name).read_text(encoding="utf-8"))
     blocks = re.findall(r"```(python|sh)\n(.*?)```", text, re.S)
     assert {language for language, _ in blocks} == {"python", "sh"}
     if "filtergym train" in text:
@@ -92,7 +95,7 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
             assert "print(" not in block or capsys.readouterr().out.strip()
         else:
             for line in block.replace("\\\n", "").splitlines():
-                _, *words = shlex.split(re.sub(r"--steps \d+", "--steps 12800", line))
+                _, *words = shlex.split(re.sub(r"--steps \d+", "--steps 12800 --no-compare", line))
                 code, shown, errors = command(*words)
                 assert (code, bool(shown)) == (0, True), errors
 
