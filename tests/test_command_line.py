@@ -107,7 +107,8 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     report = {"report.html"} if importlib.util.find_spec("plotly") else set()
     assert report or "no report: it needs more packages, pip install 'filtergym[report]'" in result.stdout
     assert made == report | {
-        "records.json", "records.csv", "table.tex", "results.nc", "results.json", "rmse_over_time.png", "error_distribution.png", "consistency.png", "mode_probabilities.png",
+        "records.json", "records.csv", "table.tex", "results.nc", "results.json", "rmse_over_time.png",
+        "error_distribution.png", "consistency.png", "mode_probabilities.png",
     }  # fmt: skip
 
 
