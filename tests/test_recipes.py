@@ -16,7 +16,8 @@ import filtergym
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "docs" / "recipes"
 RECIPES = sorted(file.name for file in FOLDER.glob("with_*"))
-LIBRARIES = {"a_loop_of_ones_own": "torch", "rllib": "ray"}
+# Ray alone is not RLlib, which takes dm-tree, too.
+LIBRARIES = {"a_loop_of_ones_own": "torch", "rllib": "tree"}
 """What a recipe imports, where that is not its name."""
 TINY = {"STEPS": 2_000, "UPDATES": 1, "RECORDED": 2, "EPISODES": 8}
 

@@ -200,7 +200,7 @@ def test_light_and_dark(wide):
 
 def test_a_hostile_file_runs_nothing(results, tmp_path):
     page = tmp_path / "report.html"
-    page.write_text(report_html([hostile(result) for result in results], SETTINGS), encoding="utf-8")
+    page.write_text(report_html([hostile(results[0])], SETTINGS), encoding="utf-8")
     with browser.opened(page, 1400) as driver:
         opened_whole(driver)
         for select in driver.find_elements("css selector", "select"):
