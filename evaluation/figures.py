@@ -13,7 +13,7 @@ import numpy
 import xarray
 
 from .dataset import windows_of
-from .looks import GREY, joined, looks, merged, styles
+from .looks import GREY, joined, looks, merged, styles, told_apart
 from .print_layout import (
     direct_labels,
     figure_with_axes,
@@ -108,10 +108,7 @@ def _over_time(
     values = {
         name: numpy.concatenate([panel.values.sel(policy=name).values for panel in panels]) for name in there
     }
-    # Whoever lies on a line that is told apart is named with it.
-    groups = merged([*(n for n in look if n in there), *(n for n in there if n not in look)], values)
-    told = {first: joined(same) for first, same in groups.items() if first in look}
-    others = [first for first in groups if first not in look]
+    told, others = told_apart(look, values)
     beside = room_for_labels(told.values(), columns)
     figure, axes = figure_with_axes(len(panels), columns)
     x = _abscissa(curves)
@@ -269,13 +266,12 @@ def draw_error_distribution(
     exceeded, shares = curves["error_exceeded"], curves["share"].values
     there = [n for n in curves["policy"].values.tolist() if not numpy.isnan(exceeded.sel(policy=n)).all()]
     values = {name: exceeded.sel(policy=name).values for name in there}
-    groups = merged([*(n for n in look if n in there), *(n for n in there if n not in look)], values)
-    told = {first: joined(same) for first, same in groups.items() if first in look}
+    told, others = told_apart(look, values)
     figure, axes = figure_with_axes(curves.sizes["quantity"], columns)
     units = dict(zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True))
     supported = shares[~numpy.isnan(exceeded.values).all(axis=(0, 1))]
     for axis, (quantity, unit) in zip(axes, units.items(), strict=True):
-        for name in groups:
+        for name in [*told, *others]:
             style = look[name] if name in told else {"color": GREY, "linewidth": 0.6, "zorder": 1.5}
             axis.plot(exceeded.sel(policy=name, quantity=quantity), shares, **style)
         axis.set_yscale("log")
@@ -297,7 +293,7 @@ def draw_error_distribution(
             axis.set_xlim(low, max(high, 4.0 * low) * 1.05)
         logarithmic(axis.xaxis)
     handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()]
-    if len(groups) > len(told):
+    if others:
         handles.append(Line2D([], [], color=GREY, linewidth=0.6, label="others"))
     return titled(figure, f"{_title(curves)}, distribution of errors", handles)
 

@@ -140,10 +140,20 @@ def merged(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[st
     return found
 
 
+def told_apart(look: Iterable[str], values: Mapping[str, numpy.ndarray]) -> tuple[dict[str, str], list[str]]:
+    """Lines that are told apart, with their labels, and the others; whoever lies on one of them is named with it.
+
+    Args:
+        look: names of those that are told apart, in the order of the legend.
+        values: line of each name.
+    """
+    chosen = list(look)
+    groups = merged([*(n for n in chosen if n in values), *(n for n in values if n not in chosen)], values)
+    told = {first: joined(same) for first, same in groups.items() if first in chosen}
+    return told, [first for first in groups if first not in chosen]
+
+
 def joined(names: Sequence[str], most: int = 2) -> str:
     """Name of a line that several share: ``imm = hard-imm``, or of more than ``most`` ``imm = hard-imm = 3 more``."""
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])
-
-
-# --- lines over time

@@ -119,9 +119,6 @@ def logarithmic(axis: Any) -> None:
     axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:.0e}"[0] in digits else "")
 
 
-# --- who is drawn how
-
-
 def sensible_limits(
     lines: Sequence[numpy.ndarray],
     always: Sequence[numpy.ndarray] = (),

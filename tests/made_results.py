@@ -1,6 +1,7 @@
 """Results as a benchmark makes them, of a few episodes."""
 
 from filtergym.agents.named_policies import shipped_agents
+from filtergym.evaluation.curves import curves_of
 
 import filtergym
 from filtergym.reports.benchmark import result_of
@@ -9,4 +10,5 @@ from filtergym.reports.benchmark import result_of
 def results_of(id, names, scenario, episodes, **options):
     """Return the result of some competitors; shipped agents among them count as learned."""
     dataset = filtergym.evaluate(id, names, scenario, episodes, drawn_episodes=1, **options)
-    return result_of(dataset, shipped_agents(id))[0]
+    records, curves = filtergym.tidy_records(dataset), curves_of(dataset)
+    return result_of(dataset, records, curves, shipped_agents(id))

@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.evaluation.curves import curves_of
 
 from filtergym import evaluate, tidy_records
 from filtergym.__main__ import main
@@ -89,7 +90,7 @@ def test_work_goes_on_after_a_print_that_failed(run, dataset, tmp_path, monkeypa
     records = tidy_records(dataset)
     cells = [benchmark.Cell("ManeuveringTarget", name, 4, ("imm",)) for name in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
-    found = benchmark.result_of(dataset, [])[0]
+    found = benchmark.result_of(dataset, records, curves_of(dataset), [])
 
     def run_cell(cell, *_):
         own = [r._replace(scenario=cell.scenario) for r in records]

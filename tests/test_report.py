@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from made_results import results_of
 
-from filtergym.reports.headline import consistency_word, headline_table
+from filtergym.reports.headline import headline_table
 from filtergym.reports.html_report import report_html
 from filtergym.reports.ranking import best_of_origins, verdict
 from filtergym.reports.results import (
@@ -24,7 +24,7 @@ from filtergym.reports.results import (
     spread,
     write_results,
 )
-from filtergym.reports.tables import results_tables
+from filtergym.reports.tables import consistency_word, results_tables
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NAMES = ["imm", "adaptive-rearm-tuned", "kalman-imm-tuned", "ppo", "known-turn", "known-input-bound"]

@@ -22,12 +22,12 @@ from ..evaluation.metrics import flight_records
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..names import competitor, evaluate, is_learned, tidy_records
-from ..reports.benchmark import RESULTS, Cell, all_records, result_of, run_benchmark
+from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
-from ..reports.results import Result, read_results, settings_of, write_results
+from ..reports.results import RESULTS, Result, settings_of, write_results
 from ..reports.tables import flights_table, recorded_table, results_tables
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
@@ -231,13 +231,13 @@ def evaluate_policies(
             write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
             if not refusal:
                 write_dataset(waiting / "results.nc", whole)
-            for name, figure in evaluation_figures(curves_of(dataset), columns, learned=learned):
+            curves = curves_of(dataset)
+            for name, figure in evaluation_figures(curves, columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
             if judged:
-                write_results(
-                    waiting / RESULTS, [result_of(dataset, learned)[0]], settings_of(command_line())
-                )
+                result, made = result_of(dataset, records, curves, learned), settings_of(command_line())
+                write_results(waiting / RESULTS, [result], made)
     for table in tables:
         console.print(table)
     for note in notes_of(dataset):
@@ -247,7 +247,7 @@ def evaluate_policies(
             f"figures, records and {RESULTS} in {out}" if judged else f"figures and records in {out}"
         )
         if judged:
-            make_report(*read_results(out / RESULTS), out / REPORT)
+            make_report([result], made, out / REPORT)
         if refusal:
             console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
     if estimates is not None:

@@ -15,11 +15,12 @@ from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
 from ..evaluation.curves import curves_of
-from ..evaluation.dataset import groups_of
+from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..names import evaluate, tidy_records
 from .results import (
+    RESULTS,
     Result,
     drawn_components,
     read_results,
@@ -39,7 +40,6 @@ FEWEST_EPISODES, FEWEST_EPISODES_FULL = 10, 20
 LONG = 2000
 """Measurements of an episode, beyond which the quick benchmark leaves out who was tuned: few episodes side by side cost
 as much as many."""
-RESULTS = "results.json"
 
 
 class Cell(NamedTuple):
@@ -132,29 +132,30 @@ def run_cell(
         backend=backend,
         threads=threads,
     )
-    return result_of(dataset, shipped_agents(cell.environment))
+    curves = curves_of(dataset)
+    return result_of(dataset, tidy_records(dataset), curves, shipped_agents(cell.environment)), curves
 
 
-def result_of(dataset: xarray.Dataset, learned: Sequence[str]) -> tuple[Result, xarray.Dataset]:
+def result_of(
+    dataset: xarray.Dataset, records: list[Record], curves: xarray.Dataset, learned: Sequence[str]
+) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
     Args:
         dataset: from an evaluation; with ``drawn_episodes`` there is a track.
-        learned: names of those of its competitors that were learned.
-
-    Returns:
-        The result, with curves of what is shown, and the curves of everything.
+        records: of it, tidy.
+        curves: of it; those of what is shown are kept.
+        learned: names that stand for something learned, those of competitors among them.
     """
     id, scenario = dataset.attrs["environment"], dataset.attrs["scenario"]
     cls, known = task_class(id), baselines_of(id)
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
-    records, curves = tidy_records(dataset), curves_of(dataset)
     names = dataset["policy"].values.tolist()
-    shown = shown_competitors(records, paper, reference, [name for name in learned if name in names])
+    shown = shown_competitors(records, paper, reference, learned)
     components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
     told = {**known.references, **known.bounds}
     named = cls.scenarios.get(scenario)
-    result = Result(
+    return Result(
         id,
         scenario,
         named.description if named else "",
@@ -164,12 +165,11 @@ def result_of(dataset: xarray.Dataset, learned: Sequence[str]) -> tuple[Result, 
         reference if reference in names else "",
         [name for name in names if name in learned],
         {name: told[name].knows for name in names if name in told},
-        dataset.attrs["notes"].splitlines(),
+        notes_of(dataset),
         records,
         thinned(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
     )
-    return result, curves
 
 
 def run_benchmark(

@@ -7,16 +7,7 @@ from rich.text import Text
 
 from .ranking import best_of_origins
 from .results import Result
-from .tables import with_interval
-
-
-def consistency_word(value: float | None) -> str:
-    """Say what a mean NEES over its dimension means; consistent is within a factor of two of one."""
-    if value is None:
-        return "says nothing"
-    if value > 2.0:
-        return "overconfident"
-    return "cautious" if value < 0.5 else "consistent"
+from .tables import consistency_word, with_interval
 
 
 def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, str, str, str]]]]:

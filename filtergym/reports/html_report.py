@@ -19,10 +19,10 @@ from plotly.offline import get_plotlyjs
 
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
-from .headline import consistency_word, headline
+from .headline import headline
 from .ranking import origin, ranking_sentence, verdict
 from .results import Result, Settings, stored_datasets
-from .tables import against_paper, main_components, ranked, score_text, with_interval
+from .tables import against_paper, consistency_word, main_components, ranked, score_text, with_interval
 
 HTML = Path(__file__).parent / "html"
 

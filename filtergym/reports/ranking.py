@@ -8,17 +8,12 @@ from ..baselines.catalogue import baselines_of
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .results import Result
-from .tables import with_interval
+from .tables import consistency_word, with_interval
 
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
 HARM = 0.02
 """Relative difference to the paper's algorithm beyond which, with its whole interval, a competitor does harm."""
-ORIGINS = ("paper", "classical", "estimator", "learned", "reference")
-"""Of which a summary names the best: the paper's algorithm; policies that steer an environment's filters, classical or
-learned; filters of their own, likewise; who knows the truth."""
-
-
 OUTCOMES = {
     "learned best": "A learned agent costs significantly least",
     "classical best": "A classical competitor costs significantly least",
@@ -117,7 +112,11 @@ def ranking_sentence(
 
 
 def origin(result: Result, name: str, kind: str) -> str:
-    """Return where a competitor comes from: one of ``ORIGINS``, or "bound"."""
+    """Return where a competitor comes from.
+
+    "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator", filters of
+    its own; "learned", policy or estimator; "reference", who knows the truth; or "bound".
+    """
     if name == result.paper:
         return "paper"
     if name in result.learned:
@@ -167,7 +166,7 @@ def verdict(results: Sequence[Result]) -> list[str]:
         f"`{name}` in {result.short} ({_nees(result, name):.2g})"
         for result in judged
         for name in [ranking(result.records, result.learned)[0].name]
-        if (_nees(result, name) or 0.0) > 2.0 or (_nees(result, name) or 1.0) < 0.5
+        if consistency_word(_nees(result, name)) in ("overconfident", "cautious")
     ]
     if judged:
         sentences.append(

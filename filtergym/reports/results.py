@@ -20,6 +20,8 @@ from ..evaluation.metrics import Record
 from ..evaluation.stored import read_json, restored
 from ..evaluation.stored_dataset import dataset_as_json, dataset_from_json
 
+RESULTS = "results.json"
+"""Name of the file in a folder."""
 FORMAT = 1
 LIBRARIES = ("filtergym", "numpy", "scipy", "gymnasium", "xarray", "llvmlite")
 """Whose versions a file tells."""
@@ -31,8 +33,6 @@ TRACK_TIMES = 160
 TRACK_DIGITS = {"truth": 7, "estimate": 7, "seen": 7}
 DIGITS = 4
 """Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
-
-
 NEEDED = {"curves": ("policy", "time"), "track": ("policy", "time", "component", "unit", "estimate", "sigma")}
 """What a report cannot be made without."""
 
@@ -72,11 +72,6 @@ class Result(NamedTuple):
     """See :func:`.evaluation.curves.curves_of`, of the competitors that are shown."""
     track: xarray.Dataset | None
     """Of one episode, see :func:`track_of`."""
-
-    @property
-    def name(self) -> str:
-        """Environment without its namespace and version, and scenario."""
-        return f"{self.short} {self.scenario}"
 
     @property
     def short(self) -> str:
@@ -228,7 +223,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
     Raises:
         ValueError: if it holds anything else.
     """
-    path = path / "results.json" if path.is_dir() else path
+    path = path / RESULTS if path.is_dir() else path
     try:
         values = read_json(path)
         if not isinstance(values, dict) or values.get("format") != FORMAT:

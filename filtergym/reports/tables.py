@@ -57,11 +57,22 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
     return [f"{percent:+,.{digits}f}", f"{100.0 * wins.value:.0f}"]
 
 
+def consistency_word(value: float | None) -> str:
+    """Say what a mean NEES over its dimension means; consistent is within a factor of two of one."""
+    if value is None:
+        return "says nothing"
+    if value > 2.0:
+        return "overconfident"
+    return "cautious" if value < 0.5 else "consistent"
+
+
 def consistency(record: Any) -> str:
     """Mean NEES over the dimension, marked where it is inconsistent by more than a factor of two."""
     if record is None or record.value is None:
         return "-"
-    return f"{record.value:.3g}" + ("" if 0.5 <= record.value <= 2.0 else f" {INCONSISTENT}")
+    return f"{record.value:.3g}" + (
+        "" if consistency_word(record.value) == "consistent" else f" {INCONSISTENT}"
+    )
 
 
 def score_text(record: Any) -> str:
