@@ -206,7 +206,8 @@
     });
     // Beyond three times the paper's cost a point is on the edge: near zero is where they are told apart.
     const values = drawn.flatMap((trace) => trace.x);
-    const range = [Math.max(-100, Math.min(...values, 0) * 1.15 - 3), Math.min(200, Math.max(...values, 5) * 1.1 + 3)];
+    const ends = drawn.flatMap(({ x, error_x }) => x.flatMap((value, i) => [value - error_x.arrayminus[i], value + error_x.array[i]]));
+    const range = [Math.max(-100, Math.min(...ends, 0) * 1.05 - 3), Math.min(200, Math.max(...ends, 5) * 1.05 + 3)];
     const beyond = values.filter((x) => x > range[1]).length;
     const narrow = window.innerWidth < 640;
     const title = `cost against ${plain(paper || "the paper")}, %` + (beyond ? `<br>(${beyond} beyond the right edge)` : "");
