@@ -5,18 +5,24 @@ is a product with it. So one matrix of counts serves every statistic, and those 
 paired. ``scipy.stats.bootstrap`` gives the same intervals (tested) but resamples by index for each statistic,
 which is a hundred times slower here.
 
+Of many episodes that matrix would be the largest thing in memory, so counts are kept, in as few bytes as they need, and
+products are summed over blocks of episodes, always the same ones.
+
 Episodes of one recorded flight are no independent samples of what there is to fly. Where episodes belong to flights,
 whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap Methods and their Application, 1997,
 3.8): the interval then says what other flights of the kind would give. It needs many flights: of fewer than ten it is
 too narrow.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy
 
 RESAMPLES = 1000
+BLOCK = 2048
+"""Episodes that are weighted at a time; or resamples, of which one 64th."""
 CONFIDENCE = 0.95
 
 
@@ -26,6 +32,24 @@ class Estimate(NamedTuple):
     value: float
     low: float
     high: float
+
+
+Sums = tuple[numpy.ndarray, numpy.ndarray | None]
+"""Weighted sums over episodes, and of whether there is a number at all; None: there always is."""
+
+
+def added(one: Sums, other: Sums) -> Sums:
+    """Add what two sets of episodes contribute to a mean."""
+    there = None if one[1] is None or other[1] is None else one[1] + other[1]
+    return one[0] + other[0], there
+
+
+def mean_of_sums(sums: Sums) -> numpy.ndarray:
+    """Means from what all episodes contribute; NaN where nobody has a number."""
+    values, there = sums
+    if there is None:
+        return values
+    return numpy.divide(values, there, out=numpy.full(values.shape, numpy.nan), where=there > 0.0)
 
 
 class Bootstrap:
@@ -42,17 +66,56 @@ class Bootstrap:
     def __init__(
         self, episodes: int, resamples: int = RESAMPLES, seed: int = 0, clusters: Sequence[Any] | None = None
     ) -> None:
+        self.episodes = episodes
         generator = numpy.random.default_rng(seed)
         self.ragged = clusters is not None
-        of = numpy.arange(episodes)
+        of = None
+        number = episodes
         if clusters is not None and len(set(clusters)) > 1:
             of = numpy.unique(numpy.asarray(clusters), return_inverse=True)[1]
-        number = int(of.max()) + 1
-        counts = generator.multinomial(number, numpy.full(number, 1.0 / number), size=resamples)[:, of]
-        observed = numpy.ones((1, episodes))
-        weights = numpy.concatenate([observed, counts])
+            number = int(of.max()) + 1
+        counts = numpy.ones((1 + resamples, number), dtype=numpy.uint8)
+        even = numpy.full(number, 1.0 / number)
+        for first in range(
+            1, 1 + resamples, 100
+        ):  # the numbers of one draw, without all of them in 64 bits at once
+            drawn = generator.multinomial(number, even, size=min(100, 1 + resamples - first))
+            if drawn.max() > numpy.iinfo(counts.dtype).max:
+                counts = counts.astype(numpy.min_scalar_type(int(drawn.max())))
+            counts[first : first + len(drawn)] = drawn
+        if of is not None:
+            counts = counts[:, of]
+        self.counts = counts
         # Clusters may differ in size: the mean is over the episodes of those that were drawn.
-        self.weights = weights / weights.sum(axis=1, keepdims=True)
+        self.totals = counts.sum(axis=1, dtype=numpy.int64)
+
+    @property
+    def weights(self) -> numpy.ndarray:
+        """Share of every episode in the data and in every resample, ``(1 + resamples, episodes)``."""
+        return self.weights_of(slice(None))
+
+    def weights_of(self, episodes: slice) -> numpy.ndarray:
+        """Share of some episodes, ``(1 + resamples, some)``."""
+        return self.counts[:, episodes] / self.totals[:, None]
+
+    def sums(self, values: numpy.ndarray, first: int = 0) -> Sums:
+        """Add up what some episodes contribute to :meth:`means`.
+
+        Args:
+            values: ``(some, ...)``, of at most ``BLOCK`` episodes.
+            first: number of the first of them.
+
+        Returns:
+            Weighted sums of the values, and of whether they are there where any is missing, ``(1 + resamples, ...)``.
+        """
+        flat = values.reshape(len(values), -1)
+        weights = self.weights_of(slice(first, first + len(values)))
+        shape = (len(weights), *values.shape[1:])
+        if self.ragged:
+            present = ~numpy.isnan(flat)
+            there = (weights @ present).reshape(shape)
+            return (weights @ numpy.where(present, flat, 0.0)).reshape(shape), there
+        return (weights @ flat).reshape(shape), None
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
         """Means over the episodes and over every resample of them.
@@ -63,15 +126,8 @@ class Bootstrap:
         Returns:
             ``(1 + resamples, ...)``; the first row is the data's own.
         """
-        flat = values.reshape(len(values), -1)
-        present = ~numpy.isnan(flat)
-        if self.ragged and not present.all():
-            sums, weights = self.weights @ numpy.where(present, flat, 0.0), self.weights @ present
-            nobody = numpy.full(sums.shape, numpy.nan)
-            means = numpy.divide(sums, weights, out=nobody, where=weights > 0.0)
-        else:
-            means = self.weights @ flat
-        return means.reshape(-1, *values.shape[1:])
+        parts = (self.sums(values[i : i + BLOCK], i) for i in range(0, len(values), BLOCK))
+        return mean_of_sums(functools.reduce(added, parts))
 
     def medians(self, values: numpy.ndarray) -> numpy.ndarray:
         """Medians over the episodes and over every resample of them, ``(1 + resamples,)``.
@@ -80,9 +136,12 @@ class Bootstrap:
             values: one for each episode, ``(episodes,)``.
         """
         order = numpy.argsort(values)
-        # The smallest value that at least half of the sample does not exceed; a little off for rounding.
-        below = numpy.cumsum(self.weights[:, order], axis=1)
-        return values[order][(below >= 0.5 - 1e-9).argmax(axis=1)]
+        found = []
+        for i in range(0, len(self.counts), BLOCK // 64):
+            # The smallest value that at least half of the sample does not exceed; a little off for rounding.
+            weights = self.counts[i : i + BLOCK // 64, order] / self.totals[i : i + BLOCK // 64, None]
+            found.append((numpy.cumsum(weights, axis=1) >= 0.5 - 1e-9).argmax(axis=1))
+        return values[order][numpy.concatenate(found)]
 
     def interval(self, statistics: numpy.ndarray) -> Estimate:
         """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""

@@ -22,6 +22,7 @@ from .metrics import (
     reported_components,
     squared_errors,
 )
+from .threads import one_thread
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
@@ -32,6 +33,7 @@ Series = tuple[tuple[str, ...], numpy.ndarray]
 """Dimensions and values of a variable."""
 
 
+@one_thread()
 def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
     """Reduce an evaluation to what its figures show.
 

@@ -21,6 +21,7 @@ from .competitors import RANKED, Kind, check_competitor, kind_of, made
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
+from .threads import one_thread
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
@@ -126,6 +127,7 @@ def _report(task: Task, tracks: bool, drawn: bool) -> Report:
     return _said_and_tracked if tracks else _said
 
 
+@one_thread()
 def evaluate(
     env: str,
     competitors: Mapping[str, Any],

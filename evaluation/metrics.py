@@ -15,6 +15,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 from .bootstrap import RESAMPLES, Bootstrap, Estimate
 from .competitors import RANKED
 from .dataset import groups_of, seed_of, windows_of, with_windows
+from .threads import one_thread
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -282,6 +283,7 @@ PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
 """Metrics that are told of every flight."""
 
 
+@one_thread()
 def tidy_records(
     dataset: xarray.Dataset, metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None = None
 ) -> list[Record]:

@@ -1,0 +1,38 @@
+"""One thread for what libraries would spread over all cores.
+
+Matrix products of many small matrices are slower on several threads than on one, most of all where other work needs the
+cores; and how a library shares a product out may change the last bit of it.
+"""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from threadpoolctl import threadpool_limits
+
+
+SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What libraries read when they are loaded."""
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let BLAS and torch use one thread each, also where they are loaded meanwhile."""
+    torch = sys.modules.get("torch")
+    threads = None if torch is None else torch.get_num_threads()
+    settings = {name: os.environ.get(name) for name in SETTINGS}
+    os.environ.update(dict.fromkeys(SETTINGS, "1"))
+    try:
+        with threadpool_limits(1):
+            if torch is not None and threads != 1:
+                torch.set_num_threads(1)
+            yield
+    finally:
+        if torch is not None and threads != 1:
+            torch.set_num_threads(threads)
+        for name, value in settings.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
