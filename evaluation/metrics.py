@@ -4,15 +4,16 @@ A record is one number with its 95 % bootstrap interval over episodes, or over f
 Differences and ratios are paired: numerator and denominator are resampled together.
 """
 
+import functools
 import math
-from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy
 import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
-from .bootstrap import RESAMPLES, Bootstrap, Estimate
+from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, Sums, added, mean_of_sums
 from .competitors import RANKED
 from .dataset import groups_of, seed_of, windows_of, with_windows
 from .threads import one_thread
@@ -75,14 +76,19 @@ def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
         values: ``(episodes, time)``.
         bootstrap: over the episodes.
     """
+    return bootstrap.estimate(_sums_of_present(values), _ratio)
+
+
+def _sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
+    """Sum over the times of every episode, and how many there are, ``(episodes, 2)``."""
     present = ~numpy.isnan(values)
-    sums = numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
+    return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
-    def ratio(means: numpy.ndarray) -> numpy.ndarray:
-        nothing = numpy.full(len(means), math.nan)
-        return numpy.divide(means[:, 0], means[:, 1], out=nothing, where=means[:, 1] > 0.0)
 
-    return bootstrap.estimate(sums, ratio)
+def _ratio(means: numpy.ndarray) -> numpy.ndarray:
+    """First over second; NaN where the second is zero."""
+    nothing = numpy.full(len(means), math.nan)
+    return numpy.divide(means[:, 0], means[:, 1], out=nothing, where=means[:, 1] > 0.0)
 
 
 def bootstrap_of(dataset: xarray.Dataset, resamples: int = RESAMPLES) -> Bootstrap:
@@ -110,51 +116,128 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
     )
 
 
-def _measures(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
-    run = dataset.sel(policy=name)
-    groups, windows = groups_of(dataset), windows_of(dataset)
+class Statistic(NamedTuple):
+    """A measure before it is averaged over episodes: what each of them contributes."""
+
+    metric: str
+    component: str
+    window: str
+    unit: str
+    values: numpy.ndarray
+    """``(episodes, ...)``; the means over episodes and over their resamples are what the measure is made of."""
+    of: Callable[[numpy.ndarray], numpy.ndarray | Estimate]
+    """From these means, ``(1 + resamples, ...)``, to the measure, ``(1 + resamples,)``."""
+
+
+Key = tuple[str, str, str, str]
+"""Metric, component, window and unit."""
+Averaged = tuple[Callable[[numpy.ndarray], numpy.ndarray | Estimate], Sums]
+
+
+class Judged(NamedTuple):
+    """What records are made of: of one competitor over some episodes, the fewer the less memory it takes."""
+
+    averaged: dict[Key, Averaged]
+    costs: numpy.ndarray | None
+    """Mean cost of every episode; None of bounds, and without truth."""
+
+    def and_of(self, later: "Judged") -> "Judged":
+        """Add the episodes that come next."""
+        averaged = dict(self.averaged)
+        for key, (of, sums) in later.averaged.items():
+            averaged[key] = of, added(averaged[key][1], sums) if key in averaged else sums
+        costs = None if self.costs is None else numpy.concatenate([self.costs, later.costs])
+        return Judged(averaged, costs)
+
+    def measures(self, bootstrap: Bootstrap) -> list[Measure]:
+        """Turn sums over all episodes into measures."""
+        found = []
+        for (metric, component, window, unit), (of, sums) in self.averaged.items():
+            value = of(mean_of_sums(sums))
+            estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
+            found.append(Measure(metric, component, window, estimate, unit))
+        return found
+
+
+def judge(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Judged:
+    """Return what some episodes of one competitor contribute to its records.
+
+    Args:
+        run: one policy's part of an evaluation.
+        bootstrap: over the episodes of the whole evaluation.
+        first: number of the run's first episode among them; a multiple of :data:`.bootstrap.BLOCK`.
+    """
+    found: Judged | None = None
+    for i in range(0, run.sizes["episode"], BLOCK):
+        part = run.isel(episode=slice(i, i + BLOCK))
+        averaged: dict[Key, Averaged] = {}
+        for s in _statistics(part, bootstrap.episodes):
+            averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first + i)
+        told = "cost" in part and str(part["kind"].values) != "bound"
+        judged = Judged(averaged, mean_over_time(part, part["cost"].values) if told else None)
+        found = judged if found is None else found.and_of(judged)
+    assert found is not None
+    return found
+
+
+def _itself(means: numpy.ndarray) -> numpy.ndarray:
+    return means
+
+
+def _minus(means: numpy.ndarray) -> numpy.ndarray:
+    return -means
+
+
+def _peak(means: numpy.ndarray) -> numpy.ndarray:
+    """Largest root over time."""
+    found: numpy.ndarray = numpy.fmax.reduce(numpy.sqrt(means), axis=1)
+    return found
+
+
+def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
+    groups, windows = groups_of(run), windows_of(run)
     is_bound = str(run["kind"].values) == "bound"
     slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
-    judged = dataset.attrs.get("truth", True)
-    for component, unit in reported_components(dataset).items() if judged else ():
+    judged = run.attrs.get("truth", True)
+    for component, unit in reported_components(run).items() if judged else ():
         squares = squared_errors(run, component, groups)
-        over_time = numpy.sqrt(bootstrap.means(squares))
         for window, times in slices.items():
-            value = bootstrap.estimate(mean_over_time(run, squares[:, times]), numpy.sqrt)
-            yield Measure("rmse", component, window, value, unit)
-        peak = bootstrap.interval(numpy.fmax.reduce(over_time, axis=1))
-        yield Measure("peak_rmse", component, "all", peak, unit)
+            yield Statistic(
+                "rmse", component, window, unit, mean_over_time(run, squares[:, times]), numpy.sqrt
+            )
+        yield Statistic("peak_rmse", component, "all", unit, squares, _peak)
         if not is_bound and component not in groups:
             signed = run["error"].sel(component=component).values
             for window, times in slices.items():
-                value = bootstrap.estimate(mean_over_time(run, signed[:, times]))
-                yield Measure("mean_error", component, window, value, unit)
-    for metric in ("nees", "nis"):
-        if metric in consistency_metrics(run):
-            for window, times in slices.items():
-                yield from _consistency(run.isel(time=times), metric, window, bootstrap)
+                values = mean_over_time(run, signed[:, times])
+                yield Statistic("mean_error", component, window, unit, values, _itself)
+    for metric in consistency_metrics(run):
+        for window, times in slices.items():
+            yield from _consistency(run.isel(time=times), metric, window, episodes)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
             probability = run["mode_probability"].sel(mode=mode).values
             for window, times in slices.items():
-                value = bootstrap.estimate(mean_over_time(run, probability[:, times]))
-                yield Measure("mean_mode_probability", mode, window, value, "1")
+                values = mean_over_time(run, probability[:, times])
+                yield Statistic("mean_mode_probability", mode, window, "1", values, _itself)
     says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
     if says or not judged:  # there is nothing else of an estimator of one's own then
         for window, times in slices.items():
-            value = mean_of_present(run["log_likelihood"].values[:, times], bootstrap) if says else NOTHING
-            yield Measure("log_likelihood", "measurement", window, value, "nat")
+            shape = (run.sizes["episode"], run.sizes["time"])
+            said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+            yield Statistic(
+                "log_likelihood", "measurement", window, "nat", _sums_of_present(said[:, times]), _ratio
+            )
     if not is_bound and judged:
         cost = run["cost"].values
         for window, times in slices.items():
-            value = bootstrap.estimate(mean_over_time(run, cost[:, times]))
-            yield Measure("cost", "", window, value, "1")
+            yield Statistic("cost", "", window, "1", mean_over_time(run, cost[:, times]), _itself)
         charge = run["charge"].values
-        total = numpy.nansum(charge, axis=1) if bootstrap.ragged else charge.sum(axis=1)
-        yield Measure("return", "", "all", bootstrap.estimate(-total), "1")
+        total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
+        yield Statistic("return", "", "all", "1", total, _minus)
 
 
-def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Bootstrap) -> Iterator[Measure]:
+def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -> Iterator[Statistic]:
     """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
 
     The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
@@ -163,22 +246,32 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, bootstrap: Boots
     component = "state" if metric == "nees" else "measurement"
     values, degrees = run[metric].values, consistency_degrees(run, metric)
     normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
-    yield Measure(f"a{metric}", component, window, mean_of_present(normalised, bootstrap), "1")
+    yield Statistic(f"a{metric}", component, window, "1", _sums_of_present(normalised), _ratio)
     low, high = chi_square_band(degrees)
     inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
-    yield Measure(f"{metric}_inside", component, window, mean_of_present(inside, bootstrap), "1")
+    yield Statistic(f"{metric}_inside", component, window, "1", _sums_of_present(inside), _ratio)
     if metric == "nis":
-        yield Measure("anis_band", component, window, _band(degrees[~numpy.isnan(normalised)]), "1")
+        there = ~numpy.isnan(normalised)
+        inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
+        sums = numpy.stack([there.sum(axis=1), inverse.sum(axis=1)], axis=1)
+        yield Statistic(
+            "anis_band", component, window, "1", sums, functools.partial(_band, episodes=episodes)
+        )
 
 
-def _band(degrees: numpy.ndarray) -> Estimate:
+def _band(means: numpy.ndarray, episodes: int) -> Estimate:
     """Where the mean of that many chi-square numbers, each over its degrees of freedom, lies with 95 %.
 
     The chi-square distribution of the same variance; the very one where all degrees are equal.
+
+    Args:
+        means: over episodes, of the count of numbers and of the sum of their inverse degrees, ``(1 + resamples, 2)``.
+        episodes: of which they are means.
     """
-    if not degrees.size:
+    count, inverse = episodes * means[0]
+    if count == 0.0:
         return NOTHING
-    total = numpy.array([degrees.size**2 / (1.0 / degrees).sum()])
+    total = numpy.array([count**2 / inverse])
     low, high = chi_square_band(total)
     return Estimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
 
@@ -214,13 +307,18 @@ def score(
     return bootstrap.interval((paper - cost) / room) if bootstrap.interval(room).low > 0.0 else NOTHING
 
 
-def best_of(dataset: xarray.Dataset) -> str:
-    """Name of the ranked competitor with the lowest mean cost; empty where none is ranked, or nobody knows costs."""
-    ranked = dataset.isel(policy=numpy.isin(dataset["kind"].values, RANKED))
-    if "cost" not in dataset or not ranked.sizes["policy"]:
-        return ""
-    costs = [mean_cost(ranked, name).mean() for name in ranked["policy"].values.tolist()]
-    return str(ranked["policy"].values[numpy.argmin(costs)])
+class Contender(NamedTuple):
+    """A competitor and all that its records are made of."""
+
+    name: str
+    kind: str
+    control: str
+    measures: list[Measure]
+    """Of itself alone."""
+    further: list[Measure]
+    """The environment's own."""
+    costs: numpy.ndarray | None
+    """Mean cost of every episode; None of bounds, and without truth."""
 
 
 def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
@@ -228,37 +326,42 @@ def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
 
-def _behind_best(dataset: xarray.Dataset, name: str, best: str, bootstrap: Bootstrap) -> Iterator[Measure]:
-    """Paired relative difference of the cost to the best one's."""
-    if not best or str(dataset["kind"].sel(policy=name).values) not in RANKED:
-        return
-    own, lowest = (bootstrap.means(mean_cost(dataset, p)) for p in (name, best))
-    yield Measure("behind_best", best, "all", bootstrap.interval(own / lowest - 1.0), "1")
+class _Against:
+    """Comparisons of every episode's cost with the paper's algorithm, the reference and the best."""
 
+    def __init__(
+        self, contenders: Sequence[Contender], paper: str, reference: str, bootstrap: Bootstrap
+    ) -> None:
+        self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
+        self.means = {name: bootstrap.means(costs) for name, costs in self.costs.items()}
+        self.paper, self.reference, self.bootstrap = paper, reference, bootstrap
+        ranked = {c.name: c.costs.mean() for c in contenders if c.kind in RANKED and c.costs is not None}
+        self.ranked = list(ranked)
+        # The first where none is a number, as of flights in which nobody was measured.
+        self.best = list(ranked)[int(numpy.argmin(list(ranked.values())))] if ranked else ""
 
-def _comparisons(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> Iterator[Measure]:
-    """Score and paired difference to the paper's algorithm, where the dataset holds what they need."""
-    paper_name, reference_name = dataset.attrs["paper"], dataset.attrs["reference"]
-    present = dataset["policy"].values.tolist()
-    if (
-        "cost" not in dataset
-        or paper_name not in present
-        or str(dataset["kind"].sel(policy=name).values) == "bound"
-    ):
-        return
-    each = {p: mean_cost(dataset, p) for p in {name, paper_name, reference_name} & set(present)}
-    cost = {p: bootstrap.means(values) for p, values in each.items()}
-    paper = cost[paper_name]
-    yield Measure("cost_difference", "", "all", bootstrap.interval(cost[name] - paper), "1")
-    yield Measure("relative_cost_difference", "", "all", bootstrap.interval(cost[name] / paper - 1.0), "1")
-    ratio = each[name] / each[paper_name]
-    yield Measure("median_cost_ratio", "", "all", bootstrap.interval(bootstrap.medians(ratio)), "1")
-    # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
-    draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
-    wins = numpy.where(draw, 0.5, ratio < 1.0)
-    yield Measure("win_rate", "", "all", bootstrap.estimate(wins), "1")
-    if reference_name in cost:
-        yield Measure("score", "", "all", score(cost[name], paper, cost[reference_name], bootstrap), "1")
+    def behind_best(self, name: str) -> Iterator[Measure]:
+        """Paired relative difference of the cost to the best one's."""
+        if name in self.ranked:
+            difference = self.means[name] / self.means[self.best] - 1.0
+            yield Measure("behind_best", self.best, "all", self.bootstrap.interval(difference), "1")
+
+    def others(self, name: str) -> Iterator[Measure]:
+        """Score and paired difference to the paper's algorithm, where there is what they need."""
+        if self.paper not in self.costs or name not in self.costs:
+            return
+        interval, cost, paper = self.bootstrap.interval, self.means[name], self.means[self.paper]
+        yield Measure("cost_difference", "", "all", interval(cost - paper), "1")
+        yield Measure("relative_cost_difference", "", "all", interval(cost / paper - 1.0), "1")
+        ratio = self.costs[name] / self.costs[self.paper]
+        yield Measure("median_cost_ratio", "", "all", interval(self.bootstrap.medians(ratio)), "1")
+        # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
+        draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
+        wins = numpy.where(draw, 0.5, ratio < 1.0)
+        yield Measure("win_rate", "", "all", self.bootstrap.estimate(wins), "1")
+        if self.reference in self.costs:
+            value = score(cost, paper, self.means[self.reference], self.bootstrap)
+            yield Measure("score", "", "all", value, "1")
 
 
 def flight_records(dataset: xarray.Dataset) -> list[Record]:
@@ -304,27 +407,62 @@ def tidy_records(
         dataset: from an evaluation.
         metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
-    bootstrap, best = bootstrap_of(dataset), best_of(dataset)
-    attrs = dataset.attrs
+    bootstrap = bootstrap_of(dataset)
+    contenders = [
+        contender(dataset.sel(policy=name), bootstrap, metrics) for name in dataset["policy"].values.tolist()
+    ]
+    return records_of(contenders, dataset, bootstrap)
+
+
+def contender(
+    run: xarray.Dataset,
+    bootstrap: Bootstrap,
+    metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None,
+    judged: Judged | None = None,
+) -> Contender:
+    """Return what the records of a competitor are made of.
+
+    Args:
+        run: its part of an evaluation.
+        bootstrap: over the episodes.
+        metrics: the environment's own.
+        judged: what its episodes come to; default: it is found from the run.
+    """
+    judged = judge(run, bootstrap) if judged is None else judged
+    # Of a recording, they would ask for more of the truth than it holds.
+    own = metrics is not None and not run.attrs.get("recorded")
+    further = metrics(run, bootstrap) if metrics is not None and own else []
+    name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
+    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.costs)
+
+
+def records_of(
+    contenders: Sequence[Contender], evaluation: xarray.Dataset, bootstrap: Bootstrap
+) -> list[Record]:
+    """Return every record, with the comparisons that take several competitors.
+
+    Args:
+        contenders: all of them.
+        evaluation: whose attributes say of what.
+        bootstrap: over the episodes.
+    """
+    attrs = evaluation.attrs
+    against = _Against(contenders, attrs["paper"], attrs["reference"], bootstrap)
 
     def finite(value: float) -> float | None:
         return float(value) if math.isfinite(value) else None
 
     records = []
-    for name in dataset["policy"].values.tolist():
-        measures: list[Any] = [*_measures(dataset, name, bootstrap), *_comparisons(dataset, name, bootstrap)]
-        measures += _behind_best(dataset, name, best, bootstrap)
-        # Of a recording, they would ask for more of the truth than it holds.
-        if metrics is not None and not attrs.get("recorded"):
-            measures += metrics(dataset.sel(policy=name), bootstrap)
+    for c in contenders:
+        measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
         for m in measures:
             records.append(
                 Record(
                     attrs["environment"],
-                    str(dataset["control"].sel(policy=name).values),
+                    c.control,
                     attrs["scenario"],
-                    name,
-                    str(dataset["kind"].sel(policy=name).values),
+                    c.name,
+                    c.kind,
                     m.metric,
                     m.component,
                     m.window,
@@ -332,8 +470,8 @@ def tidy_records(
                     finite(m.estimate.low),
                     finite(m.estimate.high),
                     m.unit,
-                    dataset.sizes["episode"],
-                    seed_of(dataset),
+                    bootstrap.episodes,
+                    seed_of(evaluation),
                     attrs["split"],
                 )
             )

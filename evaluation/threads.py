@@ -11,7 +11,6 @@ from contextlib import contextmanager
 
 from threadpoolctl import threadpool_limits
 
-
 SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries read when they are loaded."""
 
