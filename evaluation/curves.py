@@ -5,20 +5,21 @@ An Introduction to the Bootstrap, 1993, 13.3), or over flights where episodes fl
 flights what is missing is left out.
 """
 
+import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
-from .bootstrap import Bootstrap
+from .bootstrap import BLOCK, Bootstrap, Sums, added, mean_of_sums
 from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
     chi_square_band,
     consistency_degrees,
     consistency_metrics,
-    mean_cost,
+    mean_over_time,
     reported_components,
     squared_errors,
 )
@@ -63,33 +64,168 @@ def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
         paper, reference, cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
-    units = reported_components(dataset)
-    shown = list(groups_of(dataset)) or list(units)[:3]
+    names = dataset["policy"].values.tolist()
+    return joined([drawn_from(dataset.sel(policy=name), bootstrap).finished() for name in names], dataset)
+
+
+class Drawn(NamedTuple):
+    """What curves are made of: of one competitor over some episodes, or over all of them."""
+
+    sums: dict[str, Sums]
+    """Of squared errors, ``(1 + resamples, time, quantity)``, and of probabilities, ``(1 + resamples, ..., time)``."""
+    totals: dict[str, numpy.ndarray]
+    """Of NEES and NIS and their dimension, over the episodes, ``(2, time)``."""
+    kept: dict[str, numpy.ndarray]
+    """Whose distribution is drawn, ``(episodes, ...)``: errors, actions, gains, costs."""
+    actions: list[str]
+    """Names of the actions."""
+    gains: list[str]
+
+    def and_of(self, later: "Drawn") -> "Drawn":
+        """Add the episodes that come next."""
+        sums = {key: added(own, later.sums[key]) for key, own in self.sums.items()}
+        totals = {
+            key: self.totals.get(key, 0.0) + later.totals.get(key, 0.0)
+            for key in {**self.totals, **later.totals}
+        }
+        kept = {key: numpy.concatenate([own, later.kept[key]]) for key, own in self.kept.items()}
+        return self._replace(sums=sums, totals=totals, kept=kept)
+
+    def finished(self) -> "Finished":
+        """Turn what all episodes come to into curves."""
+        found: dict[str, numpy.ndarray] = {}
+        for key, sums in self.sums.items():
+            means = mean_of_sums(sums)
+            if key == "rmse":
+                means = numpy.moveaxis(numpy.sqrt(means), -1, 1)
+            found |= dict(zip((key, f"{key}_low", f"{key}_high"), _band(means), strict=True))
+        for key, (total, dimension) in self.totals.items():
+            found[f"{key}_dimension"] = dimension
+            nothing = numpy.full(len(total), numpy.nan)
+            found[key] = numpy.divide(total, dimension, out=nothing, where=dimension > 0.0)
+        for key, values in self.kept.items():
+            if key == "error_exceeded":
+                found[key] = numpy.stack([exceeded_errors(each) for each in numpy.moveaxis(values, -1, 0)])
+            elif key == "mean_cost":
+                found[key] = numpy.array(values.mean())
+            else:
+                found |= dict(zip((key, f"{key}_low", f"{key}_high"), _spread(values), strict=True))
+        return Finished(found, self.actions, self.gains)
+
+
+class Finished(NamedTuple):
+    """The curves of one competitor, and the names of its actions and gains."""
+
+    curves: dict[str, numpy.ndarray]
+    actions: list[str]
+    gains: list[str]
+
+
+def shown_quantities(dataset: xarray.Dataset) -> list[str]:
+    """Return the groups of components, where there are any, else the first three components."""
+    return list(groups_of(dataset)) or list(reported_components(dataset))[:3]
+
+
+def drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Drawn:
+    """Return what some episodes of one competitor contribute to its curves.
+
+    Args:
+        run: one policy's part of an evaluation.
+        bootstrap: over the episodes of the whole evaluation.
+        first: number of the run's first episode among them; a multiple of :data:`.bootstrap.BLOCK`.
+    """
+    blocks = range(0, run.sizes["episode"], BLOCK)
+    parts = [_drawn_from(run.isel(episode=slice(i, i + BLOCK)), bootstrap, first + i) for i in blocks]
+    return functools.reduce(Drawn.and_of, parts)
+
+
+def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
+    sums: dict[str, Sums] = {}
+    totals: dict[str, numpy.ndarray] = {}
+    kept: dict[str, numpy.ndarray] = {}
+    if run.attrs["truth"]:
+        groups = groups_of(run)
+        squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)
+        sums["rmse"] = bootstrap.sums(squares, first)
+        if str(run["kind"].values) != "bound":
+            kept["error_exceeded"] = numpy.sqrt(squares)
+            kept["mean_cost"] = mean_over_time(run, run["cost"].values)
+    for metric in consistency_metrics(run):
+        values, degrees = run[metric].values, consistency_degrees(run, metric)
+        present = ~numpy.isnan(values)
+        total = numpy.where(present, values, 0.0).sum(axis=0)
+        totals[f"a{metric}"] = numpy.stack([total, (degrees * present).sum(axis=0)])
+    for name in ("mode_probability", "true_class_probability"):
+        if name in run:
+            sums[name] = bootstrap.sums(run[name].transpose("episode", ..., "time").values, first)
+    actions: list[str] = []
+    if "action" in run:
+        values = run["action"].transpose("episode", "action_name", "time").values
+        there = ~numpy.isnan(values).all(axis=(0, 2))
+        if there.any():
+            kept["action"], actions = values[:, there], run["action_name"].values[there].tolist()
+    gains = [name for name in gains_of(run) if not numpy.isnan(run[name].values).all()]
+    if gains:
+        kept["gain"] = numpy.stack([run[name].values for name in gains], axis=1)
+    return Drawn(sums, totals, kept, actions, gains)
+
+
+DIMENSIONS = {
+    "rmse": ("quantity", "time"),
+    "error_exceeded": ("quantity", "share"),
+    "mean_cost": (),
+    "anees": ("time",),
+    "anis": ("time",),
+    "mode_probability": ("mode", "time"),
+    "true_class_probability": ("time",),
+    "action": ("action_name", "time"),
+    "gain": ("gain_name", "time"),
+}
+"""Of a curve, after the competitor."""
+
+
+def joined(found: Sequence[Finished], dataset: xarray.Dataset) -> xarray.Dataset:
+    """Put the curves of several competitors together.
+
+    Args:
+        found: in the order of the policies of the evaluation.
+        dataset: the evaluation, of whose variables none is needed.
+    """
+    units, shown = reported_components(dataset), shown_quantities(dataset)
+    names = {
+        "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
+        "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),
+    }
     variables: dict[str, Series] = {}
+    for key, dims in DIMENSIONS.items():
+        for ending in ("", "_low", "_high"):
+            own = [each.curves.get(key + ending) for each in found]
+            shapes = [values.shape for values in own if values is not None]
+            if not shapes:
+                continue
+            listed = names.get(dims[0], []) if dims else []
+            shape = (len(listed), *shapes[0][1:]) if listed else shapes[0]
+            stacked = numpy.full((len(found), *shape), numpy.nan)
+            for i, (values, each) in enumerate(zip(own, found, strict=True)):
+                if values is not None and listed:
+                    of = each.actions if key == "action" else each.gains
+                    stacked[i, [listed.index(name) for name in of]] = values
+                elif values is not None:
+                    stacked[i] = values
+            variables |= _present(key + ending, ("policy", *dims), stacked)
+    variables |= _consistency_bands(found)
     coords: dict[str, Any] = {
         name: dataset[name]
         for name in ("policy", "kind", "control", "time", "elapsed")
         if name in dataset.coords
     }
     if dataset.attrs["truth"]:
-        variables |= _errors(dataset, shown, bootstrap)
         coords |= {"quantity": shown, "unit": ("quantity", [units[name] for name in shown])}
         if "error_exceeded" in variables:
             coords["share"] = SHARES
-    variables |= _consistency(dataset)
-    for name in ("mode_probability", "true_class_probability"):
-        if name in dataset:
-            variables |= _probabilities(dataset, name, bootstrap)
     if "mode_probability" in variables:
         coords["mode"] = dataset["mode"]
-    if "action" in dataset:
-        actions = dataset["action"].transpose("policy", "episode", "action_name", "time").values
-        variables |= _spread("action", actions)
-        coords["action_name"] = dataset["action_name"]
-    gains = gains_of(dataset)
-    if gains:
-        variables |= _spread("gain", numpy.stack([dataset[name].values for name in gains], axis=2))
-        coords["gain_name"] = gains
+    coords |= {name: listed for name, listed in names.items() if listed}
     attrs = {
         name: dataset.attrs[name]
         for name in (
@@ -114,34 +250,11 @@ def gains_of(dataset: xarray.Dataset) -> list[str]:
     return [
         name
         for name in names
-        if dataset[name].dims == ("policy", "episode", "time")
+        if dataset[name].dims[-2:] == ("episode", "time")
+        and dataset[name].dims[:-2] in ((), ("policy",))
         # A rate is the same gain over the sampling interval.
         and (name == "alpha" or (name.startswith("gain") and not name.startswith("gain_rate")))
     ]
-
-
-def _errors(dataset: xarray.Dataset, shown: Sequence[str], bootstrap: Bootstrap) -> dict[str, Series]:
-    groups, names = groups_of(dataset), dataset["policy"].values.tolist()
-    shape = (len(names), len(shown))
-    rmse = numpy.full((3, *shape, dataset.sizes["time"]), numpy.nan)
-    exceeded = numpy.full((*shape, len(SHARES)), numpy.nan)
-    costs = numpy.full(len(names), numpy.nan)
-    for i, name in enumerate(names):
-        run = dataset.sel(policy=name)
-        bound = str(run["kind"].values) == "bound"
-        for j, quantity in enumerate(shown):
-            squares = squared_errors(run, quantity, groups)
-            rmse[:, i, j] = _band(numpy.sqrt(bootstrap.means(squares)))
-            if not bound:
-                exceeded[i, j] = exceeded_errors(numpy.sqrt(squares))
-        if not bound:
-            costs[i] = mean_cost(dataset, name).mean()
-    dims = ("policy", "quantity", "time")
-    return {
-        **_named("rmse", dims, rmse),
-        **_present("error_exceeded", ("policy", "quantity", "share"), exceeded),
-        **_present("mean_cost", ("policy",), costs),
-    }
 
 
 def exceeded_errors(errors: numpy.ndarray) -> numpy.ndarray:
@@ -162,46 +275,30 @@ def exceeded_errors(errors: numpy.ndarray) -> numpy.ndarray:
     return found
 
 
-def _consistency(dataset: xarray.Dataset) -> dict[str, Series]:
-    """Mean NEES and NIS over their dimension, and where that mean lies with 95 % if the filter is consistent.
+def _consistency_bands(found: Sequence[Finished]) -> dict[str, Series]:
+    """Where mean NEES and NIS over their dimension lie with 95 % if the filter is consistent.
 
     A sum of independent chi-square numbers is one, of the sum of their degrees (Bar-Shalom, Li, Kirubarajan: Estimation
     with Applications to Tracking and Navigation, 2001, 5.4).
     """
-    names, length = dataset["policy"].values.tolist(), dataset.sizes["time"]
     variables: dict[str, Series] = {}
-    for metric in consistency_metrics(dataset):
-        means = numpy.full((len(names), length), numpy.nan)
-        dimensions = []
-        for i, name in enumerate(names):
-            run = dataset.sel(policy=name)
-            values, degrees = run[metric].values, consistency_degrees(run, metric)
-            present = ~numpy.isnan(values)
-            if present.any():
-                total = numpy.where(present, values, 0.0).sum(axis=0)
-                dimension = (degrees * present).sum(axis=0)
-                numpy.divide(total, dimension, out=means[i], where=dimension > 0.0)
-                dimensions.append(dimension)
-        # Where some measurements are missing the bands differ little; the widest is told.
-        fewest = min(dimensions, key=lambda dimension: dimension.sum())
-        there = fewest > 0.0
-        ends = numpy.full((2, length), numpy.nan)
-        ends[:, there] = numpy.array(chi_square_band(fewest[there])) / fewest[there]
-        variables[f"a{metric}"] = (("policy", "time"), means)
-        variables[f"a{metric}_low"], variables[f"a{metric}_high"] = ((("time",), end) for end in ends)
+    for key in ("anees", "anis"):
+        name = f"{key}_dimension"
+        dimensions = [each.curves[name] for each in found if name in each.curves]
+        if dimensions:
+            # Where some measurements are missing the bands differ little; the widest is told.
+            fewest = min(dimensions, key=lambda dimension: dimension.sum())
+            there = fewest > 0.0
+            ends = numpy.full((2, len(fewest)), numpy.nan)
+            ends[:, there] = numpy.array(chi_square_band(fewest[there])) / fewest[there]
+            for ending, end in zip(("_low", "_high"), ends, strict=True):
+                variables[key + ending] = (("time",), end)
     return variables
 
 
-def _probabilities(dataset: xarray.Dataset, name: str, bootstrap: Bootstrap) -> dict[str, Series]:
-    values = dataset[name].transpose("policy", "episode", ..., "time").values
-    bands = numpy.stack([_band(bootstrap.means(own)) for own in values], axis=1)
-    dims = ("policy", *(["mode"] if values.ndim == 4 else []), "time")
-    return _named(name, dims, bands)
-
-
-def _spread(name: str, values: numpy.ndarray) -> dict[str, Series]:
-    """Mean and percentiles over the episodes of ``(policy, episode, name, time)``."""
-    flat = numpy.moveaxis(values, 1, 0).reshape(values.shape[1], -1)
+def _spread(values: numpy.ndarray) -> numpy.ndarray:
+    """Mean and percentiles over the episodes of ``(episodes, name, time)``: ``(3, name, time)``."""
+    flat = values.reshape(len(values), -1)
     found = numpy.full((3, flat.shape[1]), numpy.nan)
     absent = numpy.isnan(flat)
     whole, some = ~absent.any(axis=0), absent.any(axis=0) & ~absent.all(axis=0)
@@ -210,22 +307,12 @@ def _spread(name: str, values: numpy.ndarray) -> dict[str, Series]:
     found[1:, whole] = numpy.percentile(flat[:, whole], PERCENTILES, axis=0)
     found[0, some] = numpy.nanmean(flat[:, some], axis=0)
     found[1:, some] = numpy.nanpercentile(flat[:, some], PERCENTILES, axis=0)
-    shape = (3, values.shape[0], *values.shape[2:])
-    return _named(name, ("policy", f"{name}_name", "time"), found.reshape(shape))
+    return found.reshape(3, *values.shape[1:])
 
 
 def _band(series: numpy.ndarray) -> numpy.ndarray:
     """Return the first of some series, and the 95 % interval of the others, its resamples: ``(3, ...)``."""
     return numpy.stack([series[0], *numpy.percentile(series[1:], [2.5, 97.5], axis=0)])
-
-
-def _named(name: str, dims: tuple[str, ...], bands: numpy.ndarray) -> dict[str, Series]:
-    """Variables of a line and both ends of its band, ``(3, ...)``; none where there is no number."""
-    return dict(
-        entry
-        for ending, values in zip(("", "_low", "_high"), bands, strict=True)
-        for entry in _present(name + ending, dims, values).items()
-    )
 
 
 def _present(name: str, dims: tuple[str, ...], values: numpy.ndarray) -> dict[str, Series]:
