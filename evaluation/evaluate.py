@@ -5,20 +5,21 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy
 import xarray
 
 from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, make_task, nearest, opened, task_class
+from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, opened, task_class
 from ..envs.compiled import Report
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .competitors import RANKED, Kind, check_competitor, kind_of, made
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
+from .parallel import Workers
 from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
 from .threads import one_thread
@@ -144,6 +145,7 @@ def evaluate(
     reference: str = "",
     backend: str = "auto",
     threads: int = 1,
+    workers: Workers | None = None,
     **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, estimators, references and bounds over the same episodes.
@@ -167,6 +169,7 @@ def evaluate(
         reference: name of the competitor whose score is 1; kept likewise.
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
+        workers: who runs competitors and chunks of episodes; default: this process, one after the other.
         **keywords: parameters of the task.
 
     Returns:
@@ -186,6 +189,208 @@ def evaluate(
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
             the control.
     """
+    plan = _planned(
+        env,
+        competitors,
+        scenario,
+        episodes,
+        seed,
+        split,
+        control,
+        backend,
+        threads,
+        paper,
+        reference,
+        keywords,
+    )
+    if tracks and drawn_episodes:
+        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
+    workers = workers or Workers()
+    pieces = [
+        plan.piece(name, first, CHUNK, tracks, drawn_episodes, workers.alone)
+        for name in competitors
+        for first in range(0, len(plan.seeds), CHUNK)
+    ]
+    if not workers.alone:
+        _check_sendable(plan, competitors)
+    sizes = [piece.measurements for piece in pieces]
+    chunks = workers.results(run_piece, pieces, sizes, progress)
+    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
+    count = len(chunks) // len(competitors)
+    for i, name in enumerate(competitors):
+        per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
+        chunks[i * count : (i + 1) * count] = [None] * count
+    return plan.dataset(per_policy, plan.seeds, drawn_episodes)
+
+
+class Piece(NamedTuple):
+    """Some episodes of one competitor, as plain data for any process."""
+
+    environment: str
+    """Id, with the module that registers it."""
+    name: str
+    maker: Any
+    kind: Kind
+    control: str
+    scenario: Any
+    backend: str
+    threads: int
+    keywords: dict[str, Any]
+    seeds: list[int]
+    first: int
+    """Number of the first episode."""
+    horizon: int
+    tracks: bool
+    drawn_episodes: int
+    task: Task | None
+    """That was made already, in this process."""
+
+    @property
+    def measurements(self) -> int:
+        """How many there are."""
+        return len(self.seeds) * self.horizon
+
+
+def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
+    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``."""
+    task = piece.task
+    if task is None:
+        task = task_on(
+            piece.backend,
+            piece.environment,
+            piece.control,
+            piece.scenario,
+            threads=piece.threads,
+            **piece.keywords,
+        )
+    drawn = piece.drawn_episodes
+    chunks = []
+    for i in range(0, len(piece.seeds), CHUNK):
+        first = piece.first + i
+        chunks.append(
+            run_competitor(
+                task,
+                _made(piece.name, piece.maker, piece.kind, task),
+                piece.kind,
+                piece.seeds[i : i + CHUNK],
+                _report(task, piece.tracks, drawn > first),
+                tick,
+                piece.name,
+                first,
+                actions=True,
+                only={DRAWN: drawn - first},
+            )
+        )
+    return _in_one(chunks)
+
+
+def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
+    """Join what was kept of episodes; the chunks are emptied on the way, so that little is held twice."""
+    if len(chunks) == 1:
+        return chunks[0]
+    return {
+        key: numpy.concatenate([chunk.pop(key) for chunk in chunks if key in chunk])
+        for key in list(chunks[0])
+    }
+
+
+class Plan(NamedTuple):
+    """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
+
+    id: str
+    """Of the environment, with the module that registers it where that is a user's."""
+    competitors: Mapping[str, Any]
+    kinds: dict[str, Kind]
+    controls: dict[str, str]
+    tasks: dict[str, Task]
+    scenario: Any
+    chosen: Scenario
+    seeds: list[int]
+    flown: numpy.ndarray | None
+    """Number of the flight of each episode."""
+    lengths: numpy.ndarray | None
+    split: str
+    seed: int
+    backend: str
+    threads: int
+    paper: str
+    reference: str
+    keywords: dict[str, Any]
+
+    def piece(
+        self, name: str, first: int, count: int, tracks: bool, drawn_episodes: int, here: bool
+    ) -> Piece:
+        """Return some episodes of a competitor as a piece of work, with its task if it is done here."""
+        maker = self.competitors[name]
+        return Piece(
+            self.id,
+            name,
+            maker,
+            self.kinds[name],
+            self.controls[name],
+            self.scenario,
+            self.backend,
+            self.threads,
+            {**getattr(maker, "task_keywords", {}), **self.keywords},
+            self.seeds[first : first + count],
+            first,
+            self.tasks[name].horizon,
+            tracks,
+            drawn_episodes,
+            self.tasks[name] if here else None,
+        )
+
+    def dataset(
+        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int], drawn_episodes: int
+    ) -> xarray.Dataset:
+        """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
+        dataset = _dataset(
+            per_policy,
+            self.kinds,
+            self.controls,
+            self.tasks,
+            self.chosen,
+            seeds,
+            self.split,
+            self.seed,
+            self.keywords,
+        )
+        if self.flown is not None and self.lengths is not None:
+            beyond = dataset["time"].values <= self.lengths[:, None]
+            there = xarray.DataArray(beyond, dims=("episode", "time"))
+            of_drawn = there.isel(episode=slice(drawn_episodes)).rename(episode="drawn_episode")
+            present = {
+                name: values.where(of_drawn if "drawn_episode" in values.dims else there)
+                for name, values in dataset.data_vars.items()
+            }
+            dataset = dataset.assign(present).assign_coords(
+                flight=("episode", [self.chosen.flights[i] for i in self.flown]),
+                length=("episode", self.lengths),
+            )
+        return dataset.assign_attrs(
+            paper=self.paper,
+            reference=self.reference,
+            notes="\n".join(self.chosen.notes),
+            recorded=int(self.chosen.recording is not None),
+            truth=int(next(iter(self.tasks.values())).has_truth),
+        )
+
+
+def _planned(
+    env: str,
+    competitors: Mapping[str, Any],
+    scenario: Any,
+    episodes: int,
+    seed: int,
+    split: str,
+    control: str | None,
+    backend: str,
+    threads: int,
+    paper: str,
+    reference: str,
+    keywords: dict[str, Any],
+) -> Plan:
+    """Return the plan of an evaluation; arguments as of :func:`evaluate`."""
     cls = task_class(env)
     scenario = opened(cls, scenario)
     chosen = find_scenario(cls, scenario, keywords)
@@ -195,8 +400,6 @@ def evaluate(
         raise ValueError("name at least one policy")
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
-    if tracks and drawn_episodes:
-        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
@@ -218,49 +421,47 @@ def evaluate(
     flown, lengths = None, None
     if first.flights:
         seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
-        episodes = len(seeds)
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    tick = progress or (lambda _: None)
-    per_policy: dict[str, dict[str, numpy.ndarray]] = {}
-    for name, maker in competitors.items():
-        chunks = [
-            run_competitor(
-                tasks[name],
-                _made(name, maker, kinds[name], tasks[name]),
-                kinds[name],
-                seeds[i : i + CHUNK],
-                _report(tasks[name], tracks, drawn_episodes > i),
-                tick,
-                name,
-                i,
-                actions=True,
-                only={DRAWN: drawn_episodes - i},
-            )
-            for i in range(0, episodes, CHUNK)
-        ]
-        per_policy[name] = {
-            key: numpy.concatenate([chunk[key] for chunk in chunks if key in chunk]) for key in chunks[0]
-        }
-    dataset = _dataset(per_policy, kinds, controls, tasks, chosen, seeds, split, seed, keywords)
-    if flown is not None and lengths is not None:
-        there = xarray.DataArray(dataset["time"].values <= lengths[:, None], dims=("episode", "time"))
-        of_drawn = there.isel(episode=slice(drawn_episodes)).rename(episode="drawn_episode")
-        present = {
-            name: values.where(of_drawn if "drawn_episode" in values.dims else there)
-            for name, values in dataset.data_vars.items()
-        }
-        dataset = dataset.assign(present).assign_coords(
-            flight=("episode", [chosen.flights[i] for i in flown]), length=("episode", lengths)
-        )
-    return dataset.assign_attrs(
-        paper=paper,
-        reference=reference,
-        notes="\n".join(chosen.notes),
-        recorded=int(chosen.recording is not None),
-        truth=int(first.has_truth),
+    return Plan(
+        importable_name(cls),
+        competitors,
+        kinds,
+        controls,
+        tasks,
+        scenario,
+        chosen,
+        seeds,
+        flown,
+        lengths,
+        split,
+        seed,
+        backend,
+        threads,
+        paper,
+        reference,
+        keywords,
     )
+
+
+def _check_sendable(plan: Plan, competitors: Mapping[str, Any]) -> None:
+    """Raise ValueError for what another process cannot be given, or would not find."""
+    if plan.id.startswith("__main__:"):
+        raise ValueError(
+            f"{plan.id.removeprefix('__main__:')} is registered by the program that runs, which other processes do not "
+            "run: register it in a module of its own, or leave out jobs"
+        )
+    import cloudpickle
+
+    for name, maker in competitors.items():
+        try:
+            cloudpickle.dumps(maker)
+        except Exception as error:  # whatever an object raises when it is asked
+            raise ValueError(
+                f"{plan.kinds[name]} {name!r} cannot be sent to another process ({error}): give its class, or leave "
+                "out jobs"
+            ) from error
 
 
 def _check_told(kinds: Mapping[str, Kind], name: str) -> None:
@@ -383,7 +584,7 @@ def _dataset(
         stacked = numpy.full((len(names), *example.shape), numpy.nan)
         for i, name in enumerate(names):
             if key in per_policy[name]:
-                stacked[i] = per_policy[name][key]
+                stacked[i] = per_policy[name].pop(key)  # so that little is held twice
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)

@@ -1,0 +1,269 @@
+"""Work spread over processes of this machine, or over a cluster; what comes out is what one process makes.
+
+A piece of work is a function of a module and what it is called with: plain data, such as names and seeds, or objects
+that can be pickled. Pieces are run in any order, each with one thread of BLAS and torch, and nothing is drawn that the
+piece itself does not seed; so who puts the results into the order of the pieces has the same bits wherever they came
+from.
+
+On this machine joblib's processes (loky) run them, on a cluster of Dask joblib's backend for it, on a cluster of Ray
+Ray's own tasks, which are run again where a process or a machine is lost: joblib's backend for Ray is a pool of actors,
+and ends with the first of them.
+"""
+
+import os
+import pickle
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+from .rollout import Progress
+from .threads import one_thread
+
+RETRIES = 10
+"""How often a piece is begun again on a cluster that lost the process that ran it."""
+CLUSTERS = "ray, ray://HOST:PORT, dask or tcp://HOST:PORT"
+
+Function = Callable[[Any, Progress], Any]
+"""Of a module: from a piece of work, and what is told of measurements done, to its result."""
+
+
+class Place(NamedTuple):
+    """Where the modules and files are that pieces of work name."""
+
+    folder: str
+    paths: list[str]
+
+
+class Outcome(NamedTuple):
+    """What became of a piece of work."""
+
+    index: int
+    result: Any
+    error: Exception | None
+    traceback: str
+    """Of the error, where it was raised."""
+    warnings: list[tuple[str, type[Warning]]]
+
+
+class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
+    """Traceback of an error in another process."""
+
+
+def _done(function: Function, index: int, item: Any, place: Place) -> Outcome:
+    """Do a piece of work, in a process that may know nothing yet."""
+    if os.getcwd() != place.folder:
+        with suppress(OSError):  # another machine may not have it
+            os.chdir(place.folder)
+    sys.path.extend(path for path in place.paths if path not in sys.path and Path(path).is_dir())
+    with warnings.catch_warnings(record=True) as noted, one_thread():
+        try:
+            found = Outcome(index, function(item, lambda measurements: None), None, "", [])
+        except Exception as error:
+            found = Outcome(index, None, _sendable(error), traceback.format_exc(), [])
+    return found._replace(warnings=[(str(warning.message), warning.category) for warning in noted])
+
+
+def _sendable(error: Exception) -> Exception:
+    """Return an error that can be told to another process; in words if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
+    return error.with_traceback(None)
+
+
+class Workers:
+    """Who does the work; ``with Workers(4) as workers`` ends what was begun for it.
+
+    Args:
+        jobs: processes, of which one is this one; -1: as many as there are cores.
+        cluster: ``ray://HOST:PORT``, or of Dask ``tcp://HOST:PORT``; ``"ray"``: the one that runs on this machine, or
+            else a new one; ``"dask"``: a new one on this machine. A new one has ``jobs`` processes, where that is more
+            than one, or as many as there are cores. None: no cluster.
+
+    Raises:
+        ValueError: for another number or word, or where the packages of a cluster are missing.
+    """
+
+    def __init__(self, jobs: int = 1, cluster: str | None = None) -> None:
+        if jobs != -1 and jobs < 1:
+            raise ValueError(f"jobs must be at least 1, or -1 for all cores, got {jobs}")
+        self.engine = ""
+        if cluster is not None:
+            scheme, elsewhere, _ = cluster.partition("://")
+            engines = (
+                {"ray": "ray", "tcp": "dask", "tls": "dask"} if elsewhere else {"ray": "ray", "dask": "dask"}
+            )
+            if scheme not in engines:
+                raise ValueError(f"cluster must be {CLUSTERS}, got {cluster!r}")
+            self.engine = engines[scheme]
+            if elsewhere and jobs != 1:
+                raise ValueError("a cluster has as many processes as it has: leave out jobs")
+        self.jobs, self.cluster = jobs, cluster
+        self._cores = os.cpu_count() or 1 if jobs in (1, -1) else jobs
+        self._ended = ExitStack()
+        self._started = False
+
+    @property
+    def alone(self) -> bool:
+        """Whether this process does everything itself."""
+        return self.jobs == 1 and self.cluster is None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ended.close()
+
+    def run(
+        self,
+        function: Function,
+        items: Sequence[Any],
+        sizes: Sequence[int] | None = None,
+        progress: Progress | None = None,
+    ) -> Iterator[tuple[int, Any]]:
+        """Do pieces of work.
+
+        Args:
+            function: of a module, which workers import.
+            items: what it is called with.
+            sizes: measurements of each, for the progress.
+            progress: told of measurements done; of work elsewhere when a piece has come back.
+
+        Yields:
+            Number of a piece and its result, as they come.
+
+        Raises:
+            ValueError: if a process is lost for good, or the cluster is not there; and whatever the function raises.
+        """
+        tick = progress or (lambda measurements: None)
+        if self.alone:
+            for index, item in enumerate(items):
+                with one_thread():
+                    result = function(item, tick)
+                yield index, result
+            return
+        place = Place(os.getcwd(), list(sys.path))
+        calls = ((function, index, item, place) for index, item in enumerate(items))
+        spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
+        told: set[tuple[str, type[Warning]]] = set()
+        for outcome in spread(calls):
+            for text, category in outcome.warnings:
+                if (text, category) not in told:
+                    told.add((text, category))
+                    warnings.warn(text, category, stacklevel=2)
+            if outcome.error is not None:
+                raise outcome.error from Elsewhere(outcome.traceback)
+            if sizes is not None:
+                tick(sizes[outcome.index])
+            yield outcome.index, outcome.result
+
+    def results(
+        self,
+        function: Function,
+        items: Sequence[Any],
+        sizes: Sequence[int] | None = None,
+        progress: Progress | None = None,
+    ) -> list[Any]:
+        """Do pieces of work, see :meth:`run`, and return what comes out in their order."""
+        found: list[Any] = [None] * len(items)
+        for index, result in self.run(function, items, sizes, progress):
+            found[index] = result
+        return found
+
+    def _over_processes(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        import joblib
+        from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+        try:
+            with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+                # Arrays are passed whole: those that joblib maps into memory could not be written to.
+                pool = joblib.Parallel(
+                    self.jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None
+                )
+                yield from pool(joblib.delayed(_done)(*call) for call in calls)
+        except TerminatedWorkerError as error:
+            raise ValueError(
+                "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
+                "fewer jobs, or go on from here by the same command where it keeps what is done"
+            ) from error
+
+    def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        import joblib
+
+        try:
+            from distributed import Client, KilledWorker
+        except ImportError as error:
+            raise _missing(error) from error
+        if not self._started:
+            try:
+                if self.cluster == "dask":
+                    client = Client(
+                        n_workers=self._cores, threads_per_worker=1, processes=True, dashboard_address=None
+                    )
+                else:
+                    client = Client(self.cluster, timeout=30)
+            except (OSError, ValueError) as error:
+                raise ValueError(f"there is no cluster of Dask at {self.cluster}: {error}") from error
+            self._ended.callback(client.close)
+            self._started = True
+        try:
+            with joblib.parallel_config(backend="dask", wait_for_workers_timeout=60):
+                pool = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+                yield from pool(joblib.delayed(_done)(*call) for call in calls)
+        except KilledWorker as error:
+            raise ValueError(
+                f"the cluster has lost every process that took a piece of work: {error}"
+            ) from error
+
+    def _over_ray(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to tell others
+        try:
+            import ray
+        except ImportError as error:
+            raise _missing(error) from error
+        if not ray.is_initialized():
+            try:
+                self._begin_ray(ray)
+            except (ConnectionError, OSError, ValueError, RuntimeError) as error:
+                raise ValueError(f"there is no cluster of Ray at {self.cluster}: {error}") from error
+            self._ended.callback(ray.shutdown)
+        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_done)
+        pending: list[Any] = []
+        more = True
+        while pending or more:
+            # The cluster may grow meanwhile; two pieces for each core keep it busy.
+            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
+            while more and len(pending) < most:
+                call = next(calls, None)
+                more = call is not None
+                if call is not None:
+                    pending.append(remote.remote(*call))
+            if pending:
+                ready, pending = ray.wait(pending, num_returns=1)
+                try:
+                    yield from ray.get(ready)
+                except ray.exceptions.RayError as error:
+                    said = str(error).strip().splitlines()[0]
+                    raise ValueError(f"the cluster has lost a piece of work for good: {said}") from error
+
+    def _begin_ray(self, ray: Any) -> None:
+        quiet = {"log_to_driver": False, "logging_level": "error"}
+        if self.cluster != "ray":
+            ray.init(self.cluster, **quiet)
+            return
+        try:
+            ray.init("auto", **quiet)
+        except ConnectionError:
+            ray.init(num_cpus=self._cores, include_dashboard=False, **quiet)
+
+
+def _missing(error: ImportError) -> ValueError:
+    return ValueError(f"a cluster needs more packages: pip install 'filtergym[cluster]' ({error})")
