@@ -14,6 +14,7 @@ whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap M
 too narrow.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -88,6 +89,12 @@ class Bootstrap:
         self.counts = counts
         # Clusters may differ in size: the mean is over the episodes of those that were drawn.
         self.totals = counts.sum(axis=1, dtype=numpy.int64)
+
+    def fewer(self, resamples: int) -> "Bootstrap":
+        """Return the first of the resamples: what a bootstrap of no more would have drawn."""
+        found = copy.copy(self)
+        found.counts, found.totals = self.counts[: 1 + resamples], self.totals[: 1 + resamples]
+        return found
 
     @property
     def weights(self) -> numpy.ndarray:

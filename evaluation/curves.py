@@ -65,18 +65,22 @@ def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
     """
     bootstrap = bootstrap_of(dataset, resamples)
     names = dataset["policy"].values.tolist()
-    return joined([drawn_from(dataset.sel(policy=name), bootstrap).finished() for name in names], dataset)
+    return joined(
+        [drawn_from(dataset.sel(policy=name), bootstrap).finished() for name in names],
+        dataset,
+        bootstrap.episodes,
+    )
 
 
 class Drawn(NamedTuple):
-    """What curves are made of: of one competitor over some episodes, or over all of them."""
+    """What curves are made of: of one competitor over some episodes, or over all of them; finished once."""
 
     sums: dict[str, Sums]
     """Of squared errors, ``(1 + resamples, time, quantity)``, and of probabilities, ``(1 + resamples, ..., time)``."""
     totals: dict[str, numpy.ndarray]
     """Of NEES and NIS and their dimension, over the episodes, ``(2, time)``."""
-    kept: dict[str, numpy.ndarray]
-    """Whose distribution is drawn, ``(episodes, ...)``: errors, actions, gains, costs."""
+    kept: dict[str, list[numpy.ndarray]]
+    """Whose distribution is drawn, ``(episodes, ...)``, piece by piece: errors, actions, gains, costs."""
     actions: list[str]
     """Names of the actions."""
     gains: list[str]
@@ -88,7 +92,7 @@ class Drawn(NamedTuple):
             key: self.totals.get(key, 0.0) + later.totals.get(key, 0.0)
             for key in {**self.totals, **later.totals}
         }
-        kept = {key: numpy.concatenate([own, later.kept[key]]) for key, own in self.kept.items()}
+        kept = {key: own + later.kept[key] for key, own in self.kept.items()}
         return self._replace(sums=sums, totals=totals, kept=kept)
 
     def finished(self) -> "Finished":
@@ -103,7 +107,9 @@ class Drawn(NamedTuple):
             found[f"{key}_dimension"] = dimension
             nothing = numpy.full(len(total), numpy.nan)
             found[key] = numpy.divide(total, dimension, out=nothing, where=dimension > 0.0)
-        for key, values in self.kept.items():
+        for key, pieces in self.kept.items():
+            values = numpy.concatenate(pieces)
+            pieces.clear()  # so that little is held twice
             if key == "error_exceeded":
                 found[key] = numpy.stack([exceeded_errors(each) for each in numpy.moveaxis(values, -1, 0)])
             elif key == "mean_cost":
@@ -142,14 +148,14 @@ def drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Dra
 def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
     sums: dict[str, Sums] = {}
     totals: dict[str, numpy.ndarray] = {}
-    kept: dict[str, numpy.ndarray] = {}
+    kept: dict[str, list[numpy.ndarray]] = {}
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)
         sums["rmse"] = bootstrap.sums(squares, first)
         if str(run["kind"].values) != "bound":
-            kept["error_exceeded"] = numpy.sqrt(squares)
-            kept["mean_cost"] = mean_over_time(run, run["cost"].values)
+            kept["error_exceeded"] = [numpy.sqrt(squares)]
+            kept["mean_cost"] = [mean_over_time(run, run["cost"].values)]
     for metric in consistency_metrics(run):
         values, degrees = run[metric].values, consistency_degrees(run, metric)
         present = ~numpy.isnan(values)
@@ -163,10 +169,10 @@ def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
         values = run["action"].transpose("episode", "action_name", "time").values
         there = ~numpy.isnan(values).all(axis=(0, 2))
         if there.any():
-            kept["action"], actions = values[:, there], run["action_name"].values[there].tolist()
+            kept["action"], actions = [values[:, there]], run["action_name"].values[there].tolist()
     gains = [name for name in gains_of(run) if not numpy.isnan(run[name].values).all()]
     if gains:
-        kept["gain"] = numpy.stack([run[name].values for name in gains], axis=1)
+        kept["gain"] = [numpy.stack([run[name].values for name in gains], axis=1)]
     return Drawn(sums, totals, kept, actions, gains)
 
 
@@ -184,12 +190,13 @@ DIMENSIONS = {
 """Of a curve, after the competitor."""
 
 
-def joined(found: Sequence[Finished], dataset: xarray.Dataset) -> xarray.Dataset:
+def joined(found: Sequence[Finished], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
     """Put the curves of several competitors together.
 
     Args:
         found: in the order of the policies of the evaluation.
         dataset: the evaluation, of whose variables none is needed.
+        episodes: of which the curves are.
     """
     units, shown = reported_components(dataset), shown_quantities(dataset)
     names = {
@@ -215,7 +222,7 @@ def joined(found: Sequence[Finished], dataset: xarray.Dataset) -> xarray.Dataset
             variables |= _present(key + ending, ("policy", *dims), stacked)
     variables |= _consistency_bands(found)
     coords: dict[str, Any] = {
-        name: dataset[name]
+        name: dataset[name].variable
         for name in ("policy", "kind", "control", "time", "elapsed")
         if name in dataset.coords
     }
@@ -224,7 +231,7 @@ def joined(found: Sequence[Finished], dataset: xarray.Dataset) -> xarray.Dataset
         if "error_exceeded" in variables:
             coords["share"] = SHARES
     if "mode_probability" in variables:
-        coords["mode"] = dataset["mode"]
+        coords["mode"] = dataset["mode"].variable
     coords |= {name: listed for name, listed in names.items() if listed}
     attrs = {
         name: dataset.attrs[name]
@@ -240,7 +247,7 @@ def joined(found: Sequence[Finished], dataset: xarray.Dataset) -> xarray.Dataset
             "recorded",
         )
     }
-    curves = xarray.Dataset(variables, coords, {**attrs, "episodes": dataset.sizes["episode"]})
+    curves = xarray.Dataset(variables, coords, {**attrs, "episodes": episodes})
     return with_windows(curves, windows_of(dataset))
 
 

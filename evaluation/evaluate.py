@@ -189,7 +189,7 @@ def evaluate(
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
             the control.
     """
-    plan = _planned(
+    plan = plan_of(
         env,
         competitors,
         scenario,
@@ -212,7 +212,7 @@ def evaluate(
         for first in range(0, len(plan.seeds), CHUNK)
     ]
     if not workers.alone:
-        _check_sendable(plan, competitors)
+        check_sendable(plan.id, competitors)
     sizes = [piece.measurements for piece in pieces]
     chunks = workers.results(run_piece, pieces, sizes, progress)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
@@ -376,7 +376,7 @@ class Plan(NamedTuple):
         )
 
 
-def _planned(
+def plan_of(
     env: str,
     competitors: Mapping[str, Any],
     scenario: Any,
@@ -390,7 +390,7 @@ def _planned(
     reference: str,
     keywords: dict[str, Any],
 ) -> Plan:
-    """Return the plan of an evaluation; arguments as of :func:`evaluate`."""
+    """Return the plan of an evaluation; arguments and refusals as of :func:`evaluate`."""
     cls = task_class(env)
     scenario = opened(cls, scenario)
     chosen = find_scenario(cls, scenario, keywords)
@@ -445,12 +445,17 @@ def _planned(
     )
 
 
-def _check_sendable(plan: Plan, competitors: Mapping[str, Any]) -> None:
-    """Raise ValueError for what another process cannot be given, or would not find."""
-    if plan.id.startswith("__main__:"):
+def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
+    """Raise ValueError for what another process cannot be given, or would not find.
+
+    Args:
+        environment: id, with the module that registers it where that is a user's.
+        competitors: by their names.
+    """
+    if environment.startswith("__main__:"):
         raise ValueError(
-            f"{plan.id.removeprefix('__main__:')} is registered by the program that runs, which other processes do not "
-            "run: register it in a module of its own, or leave out jobs"
+            f"{environment.removeprefix('__main__:')} is registered by the program that runs, which other processes do "
+            "not run: register it in a module of its own, or leave out jobs and cluster"
         )
     import cloudpickle
 
@@ -459,8 +464,7 @@ def _check_sendable(plan: Plan, competitors: Mapping[str, Any]) -> None:
             cloudpickle.dumps(maker)
         except Exception as error:  # whatever an object raises when it is asked
             raise ValueError(
-                f"{plan.kinds[name]} {name!r} cannot be sent to another process ({error}): give its class, or leave "
-                "out jobs"
+                f"{name!r} cannot be sent to another process ({error}): give its class, or leave out jobs and cluster"
             ) from error
 
 

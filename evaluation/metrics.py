@@ -138,16 +138,19 @@ class Judged(NamedTuple):
     """What records are made of: of one competitor over some episodes, the fewer the less memory it takes."""
 
     averaged: dict[Key, Averaged]
-    costs: numpy.ndarray | None
-    """Mean cost of every episode; None of bounds, and without truth."""
+    costs: list[numpy.ndarray]
+    """Mean cost of every episode, piece by piece; nothing of bounds, and without truth."""
 
     def and_of(self, later: "Judged") -> "Judged":
         """Add the episodes that come next."""
         averaged = dict(self.averaged)
         for key, (of, sums) in later.averaged.items():
             averaged[key] = of, added(averaged[key][1], sums) if key in averaged else sums
-        costs = None if self.costs is None else numpy.concatenate([self.costs, later.costs])
-        return Judged(averaged, costs)
+        return Judged(averaged, self.costs + later.costs)
+
+    def cost(self) -> numpy.ndarray | None:
+        """Mean cost of every episode, ``(episodes,)``; None of bounds, and without truth."""
+        return numpy.concatenate(self.costs) if self.costs else None
 
     def measures(self, bootstrap: Bootstrap) -> list[Measure]:
         """Turn sums over all episodes into measures."""
@@ -174,7 +177,7 @@ def judge(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Judged:
         for s in _statistics(part, bootstrap.episodes):
             averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first + i)
         told = "cost" in part and str(part["kind"].values) != "bound"
-        judged = Judged(averaged, mean_over_time(part, part["cost"].values) if told else None)
+        judged = Judged(averaged, [mean_over_time(part, part["cost"].values)] if told else [])
         found = judged if found is None else found.and_of(judged)
     assert found is not None
     return found
@@ -418,7 +421,6 @@ def contender(
     run: xarray.Dataset,
     bootstrap: Bootstrap,
     metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None,
-    judged: Judged | None = None,
 ) -> Contender:
     """Return what the records of a competitor are made of.
 
@@ -426,14 +428,13 @@ def contender(
         run: its part of an evaluation.
         bootstrap: over the episodes.
         metrics: the environment's own.
-        judged: what its episodes come to; default: it is found from the run.
     """
-    judged = judge(run, bootstrap) if judged is None else judged
+    judged = judge(run, bootstrap)
     # Of a recording, they would ask for more of the truth than it holds.
     own = metrics is not None and not run.attrs.get("recorded")
     further = metrics(run, bootstrap) if metrics is not None and own else []
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.costs)
+    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.cost())
 
 
 def records_of(

@@ -182,6 +182,8 @@ class Workers:
         import joblib
         from joblib.externals.loky.process_executor import TerminatedWorkerError
 
+        # Whoever ends the work early, by an error or Ctrl-C, knows that the rest is not done.
+        warnings.filterwarnings("ignore", message=".*tasks which were still being processed by the workers")
         try:
             with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
                 # Arrays are passed whole: those that joblib maps into memory could not be written to.

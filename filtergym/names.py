@@ -11,7 +11,7 @@ from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
-from .envs.catalogue import imported, make_task, nearest, task_class
+from .envs.catalogue import importable_name, imported, make_task, nearest, task_class
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .envs.mixture import MixedLanes
 from .evaluation import metrics
@@ -21,6 +21,7 @@ from .evaluation.metrics import Record
 from .evaluation.recording import record as record
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
+from .evaluation.summary import Asked
 
 GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
@@ -105,7 +106,8 @@ def evaluate(
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
         trust: load models' zips, which can execute code.
-        **keywords: parameters of the task.
+        **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes`` and
+            ``workers``, see :func:`.evaluation.evaluate.evaluate`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
@@ -115,6 +117,14 @@ def evaluate(
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
             an estimator that does not answer with mean and covariance.
     """
+    objects = competitors_of(env, competitors, trust=trust)
+    return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
+
+
+def competitors_of(
+    env: str, competitors: str | Path | Sequence[str | Path] | Mapping[str, Any], *, trust: bool = False
+) -> dict[str, Any]:
+    """Return what makes each of some competitors, by their names; arguments and refusals as of :func:`evaluate`."""
     if isinstance(competitors, str | Path):
         competitors = [competitors]
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
@@ -122,13 +132,56 @@ def evaluate(
     for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
         if named[name] not in (name, competitor(id, name)):
             raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
-    objects = {
+    return {
         name: competitor(env, entry, trust=trust)
         if isinstance(entry, str | Path)
         else with_normalisation(entry)
         for name, entry in named.items()
     }
-    return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
+
+
+def asked_of(
+    env: str,
+    competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
+    scenario: Any = None,
+    episodes: int = 500,
+    seed: int = 0,
+    split: str = "test",
+    control: str | None = None,
+    *,
+    trust: bool = False,
+    drawn_episodes: int = 0,
+    backend: str = "auto",
+    threads: int = 1,
+    **keywords: Any,
+) -> list[Asked]:
+    """Return what :func:`.evaluation.summary.summaries` makes, for each competitor; arguments as of :func:`evaluate`.
+
+    Raises:
+        ValueError: for unknown names.
+    """
+    cls, known = task_class(env), baselines_of(env)
+    return [
+        Asked(
+            importable_name(cls),
+            name,
+            maker,
+            scenario,
+            episodes,
+            seed,
+            split,
+            control,
+            drawn_episodes,
+            known.score_paper,
+            known.score_bound,
+            backend,
+            threads,
+            keywords,
+            known.metrics,
+            make_task(cls.id, control, scenario, **keywords).horizon,
+        )
+        for name, maker in competitors_of(env, competitors, trust=trust).items()
+    ]
 
 
 def make_policy(

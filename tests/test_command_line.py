@@ -166,42 +166,46 @@ def test_a_mistake_ends_the_process(tmp_path):
     assert result.stderr.strip().count("\n") == 0
 
 
-def test_benchmark_resumes_at_the_first_missing_cell(tmp_path, monkeypatch):
+def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     from filtergym.reports import benchmark
 
     cells = [benchmark.Cell(ENV, scenario, 20, ("imm", "known-turn")) for scenario in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
     ran = []
-    original = benchmark.run_cell
+    original = benchmark.summaries
 
-    def run_cell(cell, *rest):
-        ran.append(cell.scenario)
-        if len(ran) == 2:
-            raise KeyboardInterrupt
-        return original(cell, *rest)
+    def interrupted(asked, workers, progress):
+        for i, summary in original(asked, workers, progress):
+            ran.append((asked[i].scenario, asked[i].name))
+            yield i, summary
+            if len(ran) == 3:
+                raise KeyboardInterrupt
 
-    monkeypatch.setattr(benchmark, "run_cell", run_cell)
+    monkeypatch.setattr(benchmark, "summaries", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        benchmark.run_benchmark(tmp_path, full=False, seed=0)
-    assert not (tmp_path / "results.json").exists()
-    results = benchmark.run_benchmark(tmp_path, full=False, seed=0)
-    assert ran == ["paper", "random", "random"]
+        benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
+    assert not (tmp_path / "parts" / "results.json").exists()
+    results = benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
+    assert ran == [(cell.scenario, name) for cell in cells for name in cell.policies]
     assert [result.scenario for result in results] == ["paper", "random"]
-    read, settings = read_results(tmp_path)
+    read, settings = read_results(tmp_path / "parts")
     assert [result.records for result in read] == [result.records for result in results]
     assert settings.command == "filtergym benchmark"
-    assert not (tmp_path / "unfinished").exists()
+    assert not (tmp_path / "parts" / "unfinished").exists()
+    # What a file has kept is what was in memory: the results of one go are the same to the last digit.
+    benchmark.run_benchmark(tmp_path / "whole", full=False, seed=0)
+    assert (tmp_path / "whole" / "results.json").read_bytes() == (
+        tmp_path / "parts" / "results.json"
+    ).read_bytes()
 
 
 def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
     from filtergym.reports import benchmark
 
-    cell = benchmark.Cell(ENV, "paper", 20, ("imm",))
+    cell = benchmark.Cell(ENV, "paper", 5, ("imm",))
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])
-    found = results_of(ENV, ["imm"], "paper", 2)
-    monkeypatch.setattr(benchmark, "run_cell", lambda *_: (found, found.curves))
     waiting = tmp_path / "unfinished"
-    others = {"thesis.tex", "ManeuveringTarget-v0.paper.20.test1.json", "folder"}
+    others = {"thesis.tex", "ManeuveringTarget-v0.paper.5.test1.json", "folder"}
     (waiting / "folder").mkdir(parents=True)
     for name in others - {"folder"}:
         (waiting / name).write_text("mine")

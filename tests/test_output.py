@@ -7,9 +7,8 @@ import shutil
 
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
-from filtergym.evaluation.curves import curves_of
 
-from filtergym import evaluate, tidy_records
+from filtergym import evaluate
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console
 from filtergym.reports import benchmark
@@ -86,17 +85,9 @@ def test_results_are_written_whatever_becomes_of_standard_output(output, code, r
         stream.close()
 
 
-def test_work_goes_on_after_a_print_that_failed(run, dataset, tmp_path, monkeypatch):
-    records = tidy_records(dataset)
+def test_work_goes_on_after_a_print_that_failed(run, tmp_path, monkeypatch):
     cells = [benchmark.Cell("ManeuveringTarget", name, 4, ("imm",)) for name in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
-    found = benchmark.result_of(dataset, records, curves_of(dataset), [])
-
-    def run_cell(cell, *_):
-        own = [r._replace(scenario=cell.scenario) for r in records]
-        return found._replace(scenario=cell.scenario, records=own), found.curves
-
-    monkeypatch.setattr(benchmark, "run_cell", run_cell)
     with closed_pipe() as output:
         assert run("benchmark", "--out", "out", output=output) == (0, "")
     kept = json.loads((tmp_path / "out" / "results.json").read_text())
@@ -120,7 +111,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
         raise AssertionError("the work began")
 
     monkeypatch.setattr("filtergym.commands.measure.evaluate", unexpected)
-    monkeypatch.setattr("filtergym.reports.benchmark.run_cell", unexpected)
+    monkeypatch.setattr("filtergym.reports.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
     for name in ("folder.png", "out/results.json", "values/ManeuveringTarget-v0.json"):

@@ -8,20 +8,22 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
-from ..envs.catalogue import catalogue, check_names, make_task, read_recording, short_name, task_class
+from ..envs.catalogue import catalogue, check_names, make_task, read_recording, task_class
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
-from ..evaluation.dataset import fits_classic, notes_of, write_dataset
+from ..evaluation.dataset import MOST_BYTES, fits_classic, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import flight_records
+from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
-from ..names import competitor, evaluate, is_learned, tidy_records
+from ..evaluation.summary import summaries, told_together
+from ..names import asked_of, competitor, evaluate, is_learned, tidy_records
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
@@ -32,11 +34,13 @@ from ..reports.tables import flights_table, recorded_table, results_tables
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
+    Cluster,
     Columns,
     Environment,
     Episodes,
     Experiment,
     Formats,
+    Jobs,
     ScenarioName,
     Split,
     Threads,
@@ -128,6 +132,8 @@ def evaluate_policies(
     trust: Trust = False,
     backend: Backend = "auto",
     threads: Threads = 1,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     site: Annotated[
         str | None,
         typer.Option(
@@ -191,29 +197,46 @@ def evaluate_policies(
         if not policy:  # references and bounds are told what a recording does not hold
             names = [name for name in names if kind_of(competitor(cls.id, name)) in RANKED]
     check_names(cls, keywords)
-    measurements = len(set(names)) * episodes * make_task(cls.id, control, flown, **keywords).horizon
-    with progress_bar() as bar:
-        line = bar.add_task("evaluating", total=measurements)
-        dataset = evaluate(
-            cls.id,
-            names,
-            flown,
-            episodes,
-            seed,
-            split,
-            control,
-            progress=lambda done: bar.update(line, advance=done),
-            trust=trust,
-            tracks=estimates is not None,
-            drawn_episodes=int(out is not None and estimates is None),
-            backend=backend,
-            threads=threads,
-            **keywords,
-        )
+    task = make_task(cls.id, control, flown, **keywords)
+    largest = len(set(names)) * episodes * task.horizon * len(task.components) * 8
+    # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
+    everything = bool(task.flights) or estimates is not None or (out is not None and largest <= MOST_BYTES)
+    options: dict[str, Any] = {"trust": trust, "backend": backend, "threads": threads, **keywords}
+    drawn = int(out is not None and estimates is None)
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
+        line = bar.add_task("evaluating", total=len(set(names)) * episodes * task.horizon)
+
+        def tick(done: int) -> None:
+            bar.update(line, advance=done)
+
+        if everything:
+            dataset = evaluate(
+                cls.id,
+                names,
+                flown,
+                episodes,
+                seed,
+                split,
+                control,
+                progress=tick,
+                tracks=estimates is not None,
+                drawn_episodes=drawn,
+                workers=workers,
+                **options,
+            )
+        else:
+            asked = asked_of(
+                cls.id, names, flown, episodes, seed, split, control, drawn_episodes=drawn, **options
+            )
+            found = dict(summaries(asked, workers, tick))
+    if everything:
+        records, curves = tidy_records(dataset), curves_of(dataset) if out is not None else None
+    else:
+        records, curves, dataset = told_together([found[i] for i in range(len(asked))])
+    whole = everything and fits_classic(dataset)
     if estimates is not None:
         write_estimates(estimates, dataset)
     judged = dataset.attrs["truth"]
-    records = tidy_records(dataset)
     each = "flight" in dataset.coords and judged
     if each and dataset.attrs["recorded"]:
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
@@ -231,7 +254,7 @@ def evaluate_policies(
             write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
             if not refusal:
                 write_dataset(waiting / "results.nc", whole)
-            curves = curves_of(dataset)
+            assert curves is not None
             for name, figure in evaluation_figures(curves, columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
@@ -327,6 +350,8 @@ def benchmark(
     columns: Columns = 2,
     backend: Backend = "auto",
     threads: Threads = 1,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Run every environment with its competitors; quick by default, resumes after an interruption.
 
@@ -336,10 +361,10 @@ def benchmark(
     """
     formats = check_formats(format or [])
     check_columns(columns)
-    with progress_bar() as bar:
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
-        def started(cell: Cell, total: int) -> Any:
-            line = bar.add_task(f"{short_name(cell.environment)} {cell.scenario}", total=total)
+        def started(total: int) -> Any:
+            line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
         def finished(result: Result) -> None:
@@ -368,6 +393,7 @@ def benchmark(
             backend=backend,
             threads=threads,
             command=command_line(),
+            workers=workers,
         )
     tables = [headline_table(results)]
     tables += [table for result in results for table in results_tables(result.records, console.width)]

@@ -113,6 +113,20 @@ Backend = Annotated[
     ),
 ]
 Threads = Annotated[int, typer.Option(help="Threads that share the episodes of the compiled backend.")]
+Jobs = Annotated[
+    int,
+    typer.Option(
+        help="Processes that share the work; -1: as many as there are cores. The results are the same."
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Share the work over a cluster (with filtergym[cluster]): ray, ray://HOST:PORT, dask or tcp://HOST:PORT.",
+        autocompletion=one_of("ray", "dask"),
+    ),
+]
 Formats = Annotated[
     list[str] | None,
     typer.Option(

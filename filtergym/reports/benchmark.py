@@ -14,11 +14,12 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
-from ..evaluation.curves import curves_of
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
-from ..names import evaluate, tidy_records
+from ..evaluation.parallel import Workers
+from ..evaluation.summary import Asked, Summary, read_summary, summaries, told_together, write_summary
+from ..names import asked_of
 from .results import (
     RESULTS,
     Result,
@@ -111,38 +112,13 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
     return wanted
 
 
-def run_cell(
-    cell: Cell,
-    seed: int,
-    split: str,
-    progress: Callable[[int], None],
-    backend: str = "auto",
-    threads: int = 1,
-) -> tuple[Result, xarray.Dataset]:
-    """Evaluate one cell; return its result and all its curves."""
-    dataset = evaluate(
-        cell.environment,
-        cell.policies,
-        cell.scenario,
-        cell.episodes,
-        seed,
-        split,
-        progress=progress,
-        drawn_episodes=1,
-        backend=backend,
-        threads=threads,
-    )
-    curves = curves_of(dataset)
-    return result_of(dataset, tidy_records(dataset), curves, shipped_agents(cell.environment)), curves
-
-
 def result_of(
     dataset: xarray.Dataset, records: list[Record], curves: xarray.Dataset, learned: Sequence[str]
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
     Args:
-        dataset: from an evaluation; with ``drawn_episodes`` there is a track.
+        dataset: the evaluation, of whose variables only those of the track are needed, which ``drawn_episodes`` keeps.
         records: of it, tidy.
         curves: of it; those of what is shown are kept.
         learned: names that stand for something learned, those of competitors among them.
@@ -178,27 +154,29 @@ def run_benchmark(
     seed: int,
     environments: Sequence[str] = (),
     split: str = "test",
-    started: Callable[[Cell, int], Callable[[int], None]] = lambda cell, total: lambda done: None,
+    started: Callable[[int], Callable[[int], None]] = lambda total: lambda done: None,
     finished: Callable[[Result], None] = lambda result: None,
     drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None,
     backend: str = "auto",
     threads: int = 1,
     command: str = "filtergym benchmark",
+    workers: Workers | None = None,
 ) -> list[Result]:
-    """Run every cell, resuming at the first missing one after an interruption.
+    """Run every cell, going on after an interruption with the competitors that are missing.
 
     Args:
-        folder: where ``results.json`` goes; cells wait in ``unfinished/`` until all are done.
+        folder: where ``results.json`` goes; competitors and cells wait in ``unfinished/`` until all are done.
         full: all scenarios and policies, and more episodes.
         seed: number of the experiment.
         environments: ids; default: all.
         split: "test", or another one for development.
-        started: called with a cell and its number of measurements; returns what is told of progress.
-        finished: called with the result of each cell.
+        started: called with the number of measurements; returns what is told of progress.
+        finished: called with the result of each cell, in their order.
         drawn: called with each cell that was run now, and its curves.
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
         command: that runs this, kept in the results.
+        workers: who does the work; default: this process.
 
     Returns:
         All results.
@@ -206,27 +184,77 @@ def run_benchmark(
     wanted = cells(full, environments, split)
     settings = settings_of(command)
     unfinished = writable_folder(folder / "unfinished")
-    waiting = [unfinished / f"{cell.name}.{cell.episodes}.{split}{seed}.json" for cell in wanted]
+    stems = [f"{cell.name}.{cell.episodes}.{split}{seed}" for cell in wanted]
+    waiting = [unfinished / f"{stem}.json" for stem in stems]
     writable_file(folder / RESULTS)
-    results: list[Result] = []
-    for cell, path in zip(wanted, waiting, strict=True):
-        tick = started(cell, cell.measurements)
-        found = _waiting_result(path, cell)
-        if found is None:
-            found, curves = run_cell(cell, seed, split, tick, backend, threads)
-            drawn(cell, curves)
-            write_results(path, [found], settings)
-        else:
+    tick = started(sum(cell.measurements for cell in wanted))
+    results = [_waiting_result(path, cell) for cell, path in zip(wanted, waiting, strict=True)]
+    made_by = f"{settings.versions} {backend} {threads}"
+    # What is asked for, the cell that it belongs to, and the file that keeps it.
+    asked: list[tuple[Asked, int, Path]] = []
+    kept: list[dict[str, Summary]] = [{} for _ in wanted]
+    for i, (cell, stem) in enumerate(zip(wanted, stems, strict=True)):
+        if results[i] is not None:
             tick(cell.measurements)
-        finished(found)
-        results.append(found)
-    write_results(folder / RESULTS, results, settings)
+            continue
+        for one in asked_of(
+            cell.environment,
+            cell.policies,
+            cell.scenario,
+            cell.episodes,
+            seed,
+            split,
+            drawn_episodes=1,
+            backend=backend,
+            threads=threads,
+        ):
+            place = unfinished / f"{stem}.{one.name}.npz"
+            found = read_summary(place, made_by)
+            if found is None:
+                asked.append((one, i, place))
+            else:
+                kept[i][one.name] = found
+                tick(one.measurements)
+    told = 0
+
+    def settle(i: int) -> None:
+        """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
+        nonlocal told
+        cell = wanted[i]
+        if results[i] is None and len(kept[i]) == len(cell.policies):
+            everyone = [kept[i].pop(name) for name in cell.policies]
+            records, curves, head = told_together(everyone)
+            result = result_of(head, records, curves, shipped_agents(cell.environment))
+            drawn(cell, curves)
+            write_results(waiting[i], [result], settings)
+            results[i] = result
+        if results[i] is not None:
+            for name in cell.policies:
+                (unfinished / f"{stems[i]}.{name}.npz").unlink(missing_ok=True)
+        while told < len(results) and (due := results[told]) is not None:
+            finished(due)
+            told += 1
+
+    for i in range(len(wanted)):
+        settle(i)
+    workers = workers or Workers()
+    if not workers.alone:  # the dear ones first, that nobody waits for them at the end
+        asked.sort(
+            key=lambda one: -one[0].measurements * baselines_of(one[0].environment).measurement_seconds
+        )
+    for k, summary in summaries([one for one, *_ in asked], workers, tick):
+        one, i, place = asked[k]
+        kept[i][one.name] = summary
+        write_summary(place, summary, made_by)
+        settle(i)
+    done = [result for result in results if result is not None]
+    write_results(folder / RESULTS, done, settings)
     # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
     for path in waiting:
         path.unlink(missing_ok=True)
     if not any(unfinished.iterdir()):
         unfinished.rmdir()
-    return results
+    return done
 
 
 def _waiting_result(path: Path, cell: Cell) -> Result | None:

@@ -173,7 +173,7 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
         "unit",
     }
     found = found.drop_vars(list(further))
-    found.attrs = {"plane": int(plane), "seed": str(dataset["episode_seed"].values[0])}
+    found.attrs = {"plane": int(plane), "seed": str(dataset["episode_seed"].values.ravel()[0])}
     return found
 
 

@@ -1,0 +1,290 @@
+"""What records, curves and a track need of an evaluation: little enough to send, to keep in a file, and to hold.
+
+A summary is of one competitor. Its episodes are run where it is made, in chunks each of which is reduced before the
+next begins, and what they come to is added in their order; so its bits depend on nothing but what was asked for.
+"""
+
+import functools
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from .bootstrap import RESAMPLES, Bootstrap, Estimate
+from .curves import Drawn, Finished, drawn_from, joined
+from .evaluate import CHUNK, DRAWN, check_sendable, plan_of, run_piece
+from .files import whole_file
+from .metrics import Contender, Judged, Measure, Record, judge, records_of
+from .parallel import Workers
+from .rollout import Progress
+
+CURVE_RESAMPLES = 200
+"""Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
+TOGETHER = 4 * CHUNK
+"""Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+
+Metrics = Callable[[xarray.Dataset, Bootstrap], list[Measure]]
+
+
+class Asked(NamedTuple):
+    """One competitor over episodes of a scenario; fields as the arguments of :func:`.evaluate.evaluate`."""
+
+    environment: str
+    name: str
+    maker: Any
+    scenario: Any
+    episodes: int
+    seed: int = 0
+    split: str = "test"
+    control: str | None = None
+    drawn_episodes: int = 0
+    paper: str = ""
+    reference: str = ""
+    backend: str = "auto"
+    threads: int = 1
+    keywords: dict[str, Any] | None = None
+    metrics: Metrics | None = None
+    """The environment's own, which take all episodes at once."""
+    horizon: int = 1
+    """Measurements of an episode, for the progress."""
+    first: int = 0
+    """Episode with which a piece of the work begins."""
+    last: int | None = None
+    """Episode before which it ends; None: the end."""
+
+    @property
+    def measurements(self) -> int:
+        """How many there are."""
+        last = self.episodes if self.last is None else self.last
+        return (last - self.first) * self.horizon
+
+    def pieces(self) -> list["Asked"]:
+        """Return the pieces of work that this is: one, unless there are many episodes that can be reduced apart."""
+        if self.metrics is not None or self.episodes <= TOGETHER:
+            return [self]
+        begins = range(0, self.episodes, TOGETHER)
+        return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
+
+
+class Summary(NamedTuple):
+    """One competitor of an evaluation."""
+
+    contender: Contender
+    finished: Finished
+    head: xarray.Dataset
+    """Its part of the evaluation, without what was kept of every episode."""
+    episodes: int
+
+
+class Part(NamedTuple):
+    """Some episodes of one competitor."""
+
+    judged: Judged
+    drawn: Drawn
+    head: xarray.Dataset
+
+    def and_of(self, later: "Part") -> "Part":
+        """Add the episodes that come next."""
+        return self._replace(judged=self.judged.and_of(later.judged), drawn=self.drawn.and_of(later.drawn))
+
+    def finished(self, bootstrap: Bootstrap, further: Sequence[Measure] = ()) -> Summary:
+        """Return the summary of all episodes."""
+        name, kind, control = (str(self.head[word].values) for word in ("policy", "kind", "control"))
+        measures = self.judged.measures(bootstrap)
+        found = Contender(name, kind, control, measures, list(further), self.judged.cost())
+        return Summary(found, self.drawn.finished(), self.head, bootstrap.episodes)
+
+
+@functools.lru_cache(maxsize=1)
+def _resampling(episodes: int) -> Bootstrap:
+    """Return the resampling of so many episodes, which takes a while where they are many."""
+    return Bootstrap(episodes, RESAMPLES)
+
+
+def summarise(asked: Asked, tick: Progress) -> Summary | Part:
+    """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
+
+    Raises:
+        ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
+    """
+    plan = plan_of(
+        asked.environment,
+        {asked.name: asked.maker},
+        asked.scenario,
+        asked.episodes,
+        asked.seed,
+        asked.split,
+        asked.control,
+        asked.backend,
+        asked.threads,
+        asked.paper,
+        asked.reference,
+        asked.keywords or {},
+    )
+    if plan.flown is not None:
+        raise ValueError("flights and recordings have no summary: evaluate them")
+    bootstrap = _resampling(asked.episodes)
+    curves = bootstrap.fewer(CURVE_RESAMPLES)
+    last = asked.episodes if asked.last is None else asked.last
+    together = CHUNK if asked.metrics is None else asked.episodes
+    found: Part | None = None
+    further: list[Measure] = []
+    for i in range(asked.first, last, together):
+        piece = plan.piece(asked.name, i, min(together, last - i), False, asked.drawn_episodes, True)
+        run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
+        run = run.isel(policy=0)
+        part = Part(judge(run, bootstrap, i), drawn_from(run, curves, i), _head(run))
+        if asked.metrics is not None:
+            further = asked.metrics(run, bootstrap)
+        found = part if found is None else found.and_of(part)
+    assert found is not None
+    return found.finished(bootstrap, further) if last - asked.first == asked.episodes else found
+
+
+def _head(run: xarray.Dataset) -> xarray.Dataset:
+    """Return an evaluation without what was kept of every episode; of the first, its seed."""
+    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN)]
+    return run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
+
+
+def summaries(
+    asked: Sequence[Asked], workers: Workers, progress: Progress | None = None
+) -> Iterator[tuple[int, Summary]]:
+    """Summarise competitors, of any environments.
+
+    Args:
+        asked: whom, over what.
+        workers: who does it.
+        progress: told of measurements done.
+
+    Yields:
+        Place among what was asked, and its summary, as they are finished.
+    """
+    if not workers.alone:
+        for one in asked:
+            check_sendable(one.environment, {one.name: one.maker})
+    pieces = [(i, piece) for i, one in enumerate(asked) for piece in one.pieces()]
+    work = [piece for _, piece in pieces]
+    waiting: dict[int, dict[int, tuple[Part, int]]] = {}
+    added: dict[int, Part] = {}
+    done = [0] * len(asked)
+    for k, found in workers.run(summarise, work, [piece.measurements for piece in work], progress):
+        i, piece = pieces[k]
+        if isinstance(found, Summary):
+            yield i, found
+            continue
+        # In the order of the episodes, whichever come first: sums of the same numbers in another order differ.
+        waiting.setdefault(i, {})[piece.first] = found, piece.last or 0
+        while done[i] in waiting[i]:
+            later, done[i] = waiting[i].pop(done[i])
+            added[i] = added[i].and_of(later) if i in added else later
+        if done[i] == asked[i].episodes:
+            yield i, added.pop(i).finished(_resampling(asked[i].episodes))
+
+
+def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:
+    """Return what the summaries of all competitors of an evaluation come to.
+
+    Returns:
+        Records, as :func:`.metrics.tidy_records` makes them; curves, as :func:`.curves.curves_of`; and the evaluation,
+        of whose variables there is what was kept of the first episodes, over policy, drawn_episode and time.
+    """
+    evaluation = _heads_together(found)
+    records = records_of([one.contender for one in found], evaluation, _resampling(found[0].episodes))
+    finished = [one.finished for one in found]
+    if len({one.contender.control for one in found if one.finished.actions}) > 1:
+        finished = [
+            one.finished._replace(
+                actions=[f"{one.contender.control}: {part}" for part in one.finished.actions]
+            )
+            for one in found
+        ]
+    curves = joined(finished, evaluation, found[0].episodes)
+    return records, curves, evaluation
+
+
+def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
+    heads = [one.head for one in found]
+    coords: dict[str, Any] = {}
+    for head in heads:
+        coords |= {str(n): c.variable for n, c in head.coords.items() if n not in coords}
+    for name in ("policy", "kind", "control"):
+        coords[name] = ("policy", [str(head[name].values) for head in heads])
+    variables: dict[str, Any] = {}
+    for name in sorted({str(name) for head in heads for name in head.data_vars}):
+        example = next(head[name] for head in heads if name in head)
+        stacked = numpy.full((len(heads), *example.shape), numpy.nan)
+        for i, head in enumerate(heads):
+            if name in head:
+                stacked[i] = head[name].values
+        variables[name] = (("policy", *example.dims), stacked)
+    # A file has an order of its own.
+    return xarray.Dataset(variables, dict(sorted(coords.items())), heads[0].attrs)
+
+
+def write_summary(path: Path, summary: Summary, made_by: str) -> None:
+    """Keep a summary in a file, from which nothing is executed when it is read.
+
+    Args:
+        path: of the file, whole or as it was.
+        summary: of a competitor.
+        made_by: what else it depends on, such as versions, in words.
+
+    Raises:
+        ValueError: if it cannot be written.
+    """
+    own = summary.contender
+    words = {
+        "made_by": made_by,
+        "name": own.name,
+        "kind": own.kind,
+        "control": own.control,
+        "measures": own.measures,
+        "further": own.further,
+        "actions": summary.finished.actions,
+        "gains": summary.finished.gains,
+        "episodes": summary.episodes,
+    }
+    arrays = {f"curve {name}": values for name, values in summary.finished.curves.items()}
+    if own.costs is not None:
+        arrays["costs"] = own.costs
+    head = numpy.frombuffer(
+        bytes(summary.head.to_netcdf(engine="scipy", format="NETCDF3_64BIT")), numpy.uint8
+    )
+    with whole_file(path) as partial, partial.open("wb") as file:
+        numpy.savez(file, words=json.dumps(words), head=head, **arrays)
+
+
+def read_summary(path: Path, made_by: str) -> Summary | None:
+    """Return what :func:`write_summary` has kept; None where there is nothing, or nothing that was made by the same."""
+    if not path.exists():
+        return None
+    try:
+        with numpy.load(path, allow_pickle=False) as kept:
+            words = json.loads(str(kept["words"]))
+            if words["made_by"] != made_by:
+                return None
+            with xarray.open_dataset(io.BytesIO(kept["head"].tobytes()), engine="scipy") as read:
+                head = read.load()
+            curves = {n.removeprefix("curve "): kept[n] for n in kept.files if n.startswith("curve ")}
+            costs = kept["costs"] if "costs" in kept.files else None
+            measures, further = (
+                [Measure(*m[:3], Estimate(*m[3]), m[4]) for m in words[name]]
+                for name in ("measures", "further")
+            )
+            contender = Contender(words["name"], words["kind"], words["control"], measures, further, costs)
+            finished = Finished(curves, words["actions"], words["gains"])
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        return None  # what a crash has left half: it is made again
+    head.attrs = {name: _plain(value) for name, value in head.attrs.items()}
+    return Summary(contender, finished, head, words["episodes"])
+
+
+def _plain(value: Any) -> Any:
+    """Return an attribute as it was before a file held it."""
+    return value.item() if isinstance(value, numpy.generic) else value

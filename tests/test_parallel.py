@@ -1,0 +1,186 @@
+"""Work in several processes: the bits of one process, one sentence for what goes wrong, and what was begun goes on."""
+
+import numpy as np
+import pytest
+from filtergym.evaluation import parallel, summary
+from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.summary import summaries, told_together
+
+import filtergym
+from filtergym import evaluate, tidy_records
+from filtergym.names import asked_of
+from filtergym.reports import benchmark
+
+ENV = "filtergym/ManeuveringTarget-v0"
+RADAR = "filtergym/RadarEsmTracking-v0"
+NAMES = ["imm", "imm-tuned", "known-turn", "known-input-bound", "ppo"]
+assert filtergym
+
+
+@pytest.fixture(scope="module")
+def two():
+    with Workers(2) as workers:
+        yield workers
+
+
+class Unsendable:
+    control = "gain"
+
+    def __init__(self):
+        self.lock = __import__("threading").Lock()
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        raise AssertionError
+
+
+class Wrong:
+    """An estimator that cannot go on; found by the other process in this file's code."""
+
+    def start(self, initial, N):
+        return initial.mean, initial.covariance
+
+    def update(self, measurement, memory):
+        raise KeyError("nothing")
+
+
+def test_an_evaluation_has_the_same_bits(two, monkeypatch):
+    monkeypatch.setattr("filtergym.evaluation.evaluate.CHUNK", 16)  # several pieces of few episodes
+    one = evaluate(ENV, NAMES, episodes=40, drawn_episodes=1)
+    assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
+    assert tidy_records(one) == tidy_records(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
+
+
+@pytest.mark.parametrize("env", [ENV, RADAR])
+def test_summaries_tell_what_the_evaluation_does(env, monkeypatch):
+    names = NAMES if env == ENV else ["quasi-optimal", "joint-type", "known-class-bound", "ppo"]
+    dataset = evaluate(env, names, episodes=40, drawn_episodes=1)
+    asked = asked_of(env, names, episodes=40, drawn_episodes=1)
+    assert [one.episodes for one in asked] == [40] * len(names)
+    found = dict(summaries(asked, Workers()))
+    records, curves, evaluation = told_together([found[i] for i in range(len(names))])
+    assert records == tidy_records(dataset)
+    expected = filtergym.evaluation.curves.curves_of(dataset)
+    assert set(curves.variables) == set(expected.variables)
+    for name in expected.variables:
+        np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
+    result = benchmark.result_from(records, curves, evaluation, ["ppo"])[0]
+    whole = benchmark.result_of(dataset, ["ppo"])[0]
+    assert result.records == whole.records
+    assert set(result.track.variables) == set(whole.track.variables)
+    for name in whole.track.variables:
+        np.testing.assert_array_equal(result.track[name].values, whole.track[name].values, err_msg=name)
+
+
+def shuffled(run):
+    """Let pieces of work come back in another order."""
+
+    def other(self, *arguments):
+        yield from sorted(run(self, *arguments), key=lambda found: -found[0] % 7)
+
+    return other
+
+
+def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_order(monkeypatch):
+    names = ["imm", "known-turn", "known-input-bound"]
+    whole = evaluate(ENV, names, episodes=100)
+    for module in ("evaluate", "summary"):
+        monkeypatch.setattr(f"filtergym.evaluation.{module}.CHUNK", 16)
+    monkeypatch.setattr(summary, "TOGETHER", 32)
+    asked = asked_of(ENV, names, episodes=100)
+    assert len(asked[0].pieces()) == 4
+    in_turn = dict(summaries(asked, Workers()))
+    monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
+    in_any = dict(summaries(asked, Workers()))
+    first, other = ([found[i] for i in range(3)] for found in (in_turn, in_any))
+    records, curves, _ = told_together(first)
+    again, curves_again, _ = told_together(other)
+    assert records == again
+    assert curves.identical(curves_again)
+    # Sums of blocks are rounded otherwise than those of all episodes at once.
+    for own, expected in zip(records, tidy_records(whole), strict=True):
+        assert own[:8] == expected[:8]
+        assert own.value == pytest.approx(expected.value, rel=1e-9, nan_ok=True)
+        assert (own.low, own.high) == pytest.approx((expected.low, expected.high), rel=1e-9, nan_ok=True)
+    expected = filtergym.evaluation.curves.curves_of(whole)
+    for name in expected.data_vars:
+        np.testing.assert_allclose(curves[name].values, expected[name].values, rtol=1e-9, err_msg=name)
+
+
+def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
+    cells = [benchmark.Cell(id, name, 12, ("random", *n)) for id, name, n in (
+        (ENV, "paper", ("imm", "known-turn")), (RADAR, "random", ("quasi-optimal", "ppo")),
+    )]  # fmt: skip
+    monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
+    for folder, workers in (("one", None), ("two", two)):
+        benchmark.run_benchmark(tmp_path / folder, False, 0, workers=workers)
+    assert (tmp_path / "one/results.json").read_bytes() == (tmp_path / "two/results.json").read_bytes()
+
+
+def test_an_error_elsewhere_is_the_same_sentence(two):
+    with pytest.raises(ValueError, match="estimator 'mine' failed at measurement 1") as here:
+        evaluate(ENV, {"mine": Wrong}, episodes=4)
+    with pytest.raises(ValueError, match="estimator 'mine' failed at measurement 1") as there:
+        evaluate(ENV, {"mine": Wrong}, episodes=4, workers=two)
+    assert str(here.value) == str(there.value)
+    assert "Wrong" in str(there.value.__cause__) or "update" in str(
+        there.value.__cause__
+    )  # where it happened
+
+
+def test_what_cannot_be_sent_is_said_before_the_work(two):
+    with pytest.raises(ValueError, match="'mine' cannot be sent to another process"):
+        evaluate(ENV, {"mine": Unsendable()}, episodes=4, workers=two)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--jobs", "0"), "jobs must be at least 1, or -1 for all cores, got 0"),
+        (
+            ("--cluster", "slurm"),
+            "cluster must be ray, ray://HOST:PORT, dask or tcp://HOST:PORT, got 'slurm'",
+        ),
+        (("--cluster", "dask://here"), "got 'dask://here'"),
+        (("--cluster", "ray://nowhere:1", "--jobs", "2"), "leave out jobs"),
+    ],
+)
+def test_wrong_words_are_refused_before_the_work(command, words, sentence):
+    code, _, errors = command("evaluate", ENV, "--policy", "imm", "--episodes", 2, *words)
+    assert code == 2
+    assert sentence in errors
+    assert errors.count("\n") == 1
+
+
+def warned(item, tick):
+    import warnings
+
+    warnings.warn(f"beware of {item}", UserWarning, stacklevel=1)
+    return item
+
+
+def ended(item, tick):
+    import os
+
+    os._exit(3)
+
+
+def test_warnings_come_home_once(two):
+    with pytest.warns(UserWarning, match="beware of 1") as seen:
+        assert sorted(two.run(warned, [1, 1, 1])) == [(0, 1), (1, 1), (2, 1)]
+    assert len(seen) == 1
+
+
+def test_a_lost_process_is_one_sentence(two):
+    with pytest.raises(ValueError, match="ended from outside"):
+        list(two.run(ended, [1]))
+    assert list(two.run(warned, [])) == []
+
+
+def test_paths_of_this_process_are_found(two, tmp_path, monkeypatch):
+    (tmp_path / "mine_there.py").write_text("def double(item, tick):\n    return 2 * item\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    import mine_there
+
+    assert two.results(mine_there.double, [1, 2, 3]) == [2, 4, 6]
+    assert parallel.RETRIES > 0
