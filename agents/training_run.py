@@ -11,6 +11,7 @@ import json
 import shlex
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -626,6 +627,9 @@ def curves_beside(logger: Any) -> Callable[[int, Mapping[str, float]], None]:
 def interruption() -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C or SIGTERM into a wish to stop at the next safe point; the second stops at once."""
     wished = False
+    if threading.current_thread() is not threading.main_thread():  # of a worker, which no signal reaches
+        yield lambda: False
+        return
 
     def wish(*_: Any) -> None:
         nonlocal wished

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, make_task, nearest, short_name, task_class
+from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, short_name, task_class
 from ..envs.task import Episode, Task
 from ..evaluation.competitors import Kind
 from ..evaluation.files import write_text
-from ..evaluation.rollout import run_estimator, run_policy
+from ..evaluation.parallel import Workers
+from ..evaluation.rollout import Progress, run_estimator, run_policy
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import fits, read_json
 from .catalogue import baselines_of, package_of
@@ -29,6 +30,8 @@ from .table import Tunable
 
 FOLDER = Path("tuned")
 """Where tuned values of one's own are kept, below the working directory."""
+FEWEST = 16
+"""Episodes that a process is given at once: of fewer the work is less than what sending it takes."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,37 @@ def _cost(task: Task, episode: Episode) -> numpy.ndarray:
     return task.cost(episode)
 
 
+class _Candidate(NamedTuple):
+    """Values of a policy or an estimator over some episodes."""
+
+    environment: str
+    scenario: Any
+    tunable: Tunable
+    values: Mapping[str, float]
+    seeds: Sequence[int]
+    backend: str
+
+
+def _costs(candidate: _Candidate, tick: Progress) -> numpy.ndarray:
+    """Cost of every measurement of every episode, ``(time, episodes)``."""
+    keywords, make = candidate.tunable.apply(candidate.values)
+    task = task_on(
+        candidate.backend, candidate.environment, candidate.tunable.control, candidate.scenario, **keywords
+    )
+    kept: list[numpy.ndarray] = []
+
+    def keep(cost: numpy.ndarray) -> None:
+        kept.append(numpy.asarray(cost[: len(candidate.seeds)]))
+
+    if candidate.tunable.control:
+        run_policy(task, make(task), candidate.seeds, keep, lambda _: None, _cost)
+    else:
+        run_estimator(
+            task, make(task), candidate.seeds, lambda episode: keep(task.cost(episode)), lambda _: None
+        )
+    return numpy.stack(kept)
+
+
 def mean_cost(
     id: str,
     scenario: Any,
@@ -57,21 +91,21 @@ def mean_cost(
     values: Mapping[str, float],
     seeds: Sequence[int],
     backend: str = "auto",
+    workers: Workers | None = None,
 ) -> float:
-    """Mean uncapped cost of a candidate over some episodes."""
-    keywords, make = tunable.apply(values)
-    task = task_on(backend, id, tunable.control, scenario, **keywords)
+    """Mean uncapped cost of a candidate over some episodes, which the workers share."""
+    workers = workers or Workers()
+    share = max(FEWEST, -(-len(seeds) // workers.width))
+    name = importable_name(task_class(id))
+    pieces = [
+        _Candidate(name, scenario, tunable, values, seeds[i : i + share], backend)
+        for i in range(0, len(seeds), share)
+    ]
+    costs = numpy.concatenate(workers.results(_costs, pieces), axis=1)
     total = 0.0
-
-    def add(cost: numpy.ndarray) -> None:
-        nonlocal total
-        total += float(cost[: len(seeds)].sum())
-
-    if tunable.control:
-        run_policy(task, make(task), seeds, add, lambda _: None, _cost)
-    else:
-        run_estimator(task, make(task), seeds, lambda episode: add(task.cost(episode)), lambda _: None)
-    return total / (len(seeds) * task.horizon)
+    for cost in costs:  # added up as if one process had run all episodes side by side
+        total += float(cost.sum())
+    return total / costs.size
 
 
 def tune(
@@ -84,6 +118,7 @@ def tune(
     episodes: int = 256,
     progress: Callable[[int], None] = lambda steps: None,
     backend: str = "auto",
+    workers: Workers | None = None,
 ) -> Tuned:
     """Search a policy's values.
 
@@ -97,6 +132,8 @@ def tune(
         episodes: training episodes that every candidate meets.
         progress: told of environment steps done.
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
+        workers: who shares the episodes of a candidate; candidates follow each other, since the search learns from
+            each. Default: this process.
 
     Raises:
         ValueError: for a held-out scenario, or a budget too small for one generation.
@@ -129,7 +166,7 @@ def tune(
         if spent >= evaluations:
             return math.inf
         values = dict(zip(names, map(float, vector), strict=True))
-        cost = mean_cost(cls.id, chosen.name, tunable, values, train, backend)
+        cost = mean_cost(cls.id, chosen.name, tunable, values, train, backend, workers)
         spent += 1
         progress(steps)
         best = min(best, (cost, values), key=lambda pair: pair[0])
@@ -151,8 +188,8 @@ def tune(
     )
     # A winner among many candidates on the training episodes is flattered by them: ask fresh episodes.
     fresh = episode_seeds("validation", seed, 4 * episodes)
-    untuned = mean_cost(cls.id, chosen.name, tunable, tunable.start, fresh, backend)
-    cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh, backend), best[1]
+    untuned = mean_cost(cls.id, chosen.name, tunable, tunable.start, fresh, backend, workers)
+    cost, values = mean_cost(cls.id, chosen.name, tunable, best[1], fresh, backend, workers), best[1]
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
     kept = {name: rounded(value) for name, value in values.items()}

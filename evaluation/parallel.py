@@ -26,6 +26,8 @@ from .threads import one_thread
 
 RETRIES = 10
 """How often a piece is begun again on a cluster that lost the process that ran it."""
+GUESSED = 16
+"""Processes that a cluster elsewhere is thought to have, where work is cut for it."""
 CLUSTERS = "ray, ray://HOST:PORT, dask or tcp://HOST:PORT"
 
 Function = Callable[[Any, Progress], Any]
@@ -113,6 +115,15 @@ class Workers:
     def alone(self) -> bool:
         """Whether this process does everything itself."""
         return self.jobs == 1 and self.cluster is None
+
+    @property
+    def width(self) -> int:
+        """Into how many pieces work is best cut; of a cluster that runs elsewhere a guess."""
+        if self.alone:
+            return 1
+        if self.cluster is not None and "://" in self.cluster:
+            return GUESSED
+        return self._cores
 
     def __enter__(self) -> Self:
         return self

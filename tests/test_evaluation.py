@@ -137,7 +137,7 @@ def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
     train = episode_seeds("train", 0, 8)
     (name,) = tunable.start
 
-    def flattered(id, scenario, tunable, values, seeds, backend):
+    def flattered(id, scenario, tunable, values, seeds, backend, workers):
         return -values[name] if seeds == train else 1.0 + abs(values[name] - tunable.start[name])
 
     monkeypatch.setattr(tuning, "mean_cost", flattered)

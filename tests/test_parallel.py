@@ -184,3 +184,59 @@ def test_paths_of_this_process_are_found(two, tmp_path, monkeypatch):
 
     assert two.results(mine_there.double, [1, 2, 3]) == [2, 4, 6]
     assert parallel.RETRIES > 0
+
+
+def test_tuning_finds_the_same_values(two):
+    from filtergym.baselines.catalogue import baselines_of
+    from filtergym.baselines.tuning import tune
+
+    tunable = baselines_of(ENV).tunable["imm"]
+    budget = 2 * (4 * len(tunable.limits) + 4) * 40 * 100
+    asked = (ENV, "imm", tunable, budget, None, 0, 40)
+    assert tune(*asked) == tune(*asked, workers=two)
+
+
+def test_training_seeds_are_scored_the_same(two, tmp_path):
+    import json
+    import shutil
+
+    from filtergym.agents.learned_policy import PRETRAINED
+
+    from filtergym.reports.training_seeds import episode_means, load_runs
+
+    folders = []
+    for seed, shipped in ((0, "ppo"), (1, "bptt")):
+        folders.append(tmp_path / f"run-{seed}")
+        (folders[-1] / "best").mkdir(parents=True)
+        source = PRETRAINED / "ManeuveringTarget-v0" / shipped
+        shutil.copyfile(source.with_suffix(".safetensors"), folders[-1] / "best" / "agent.safetensors")
+        record = json.loads((PRETRAINED / "ManeuveringTarget-v0" / "bptt.json").read_text(encoding="utf-8"))
+        (folders[-1] / "run.json").write_text(json.dumps(record | {"seed": seed}))
+    asked = (load_runs(folders), ["adaptive"], "random", 10, 0, "validation")
+    one = episode_means(*asked)
+    other = episode_means(*asked, waiting=tmp_path, workers=two)
+    assert list(one.cost) == list(other.cost)
+    assert one.units == other.units
+    for name in one.cost:
+        np.testing.assert_array_equal(one.cost[name], other.cost[name])
+        for component in one.squares:
+            np.testing.assert_array_equal(one.squares[component][name], other.squares[component][name])
+    assert len(list(tmp_path.glob("*.npz"))) == 4
+
+
+def test_units_of_a_reproduction_stand_in_their_places(two):
+    from filtergym.baselines.maneuvering_target.reproduction.experiment import flown, squares_of
+    from filtergym.baselines.reproduction import gathered, later
+
+    asked = {
+        ("imm", 1): [later(flown, "imm", 8), 3.0],
+        "few": (later(squares_of, "adaptive", 8, gains=(0.3, 0.8)),),
+    }
+    told = []
+    one, other = (gathered(asked, told.append, workers) for workers in (None, two))
+    assert told == [1] * 4
+    assert one["imm", 1][1] == 3.0
+    np.testing.assert_array_equal(one["few"][0], squares_of("adaptive", 8, gains=(0.3, 0.8)))
+    np.testing.assert_array_equal(one["few"][0], other["few"][0])
+    for name, values in one["imm", 1][0]._asdict().items():
+        np.testing.assert_array_equal(values, getattr(other["imm", 1][0], name))

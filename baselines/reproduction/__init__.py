@@ -3,8 +3,8 @@
 Every environment's folder beside this one names its ``PAPER`` and holds a package ``reproduction``:
 ``experiment`` (what is run and computed), ``claims`` (statements, verdicts, tables), ``figures``. It defines
 ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
-``reproduce(progress, episodes=None) -> Reproduction``, which runs the experiment (``episodes`` Monte Carlo
-runs instead of its own number) and judges the claims.
+``reproduce(progress, episodes=None, workers=None) -> Reproduction``, which runs the experiment (``episodes`` Monte
+Carlo runs instead of its own number; units of work :func:`gathered` from workers) and judges the claims.
 
 There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. Pictures: :mod:`.panels`.
 """
@@ -14,19 +14,68 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from ...envs.catalogue import nearest
 from ...evaluation.files import whole_files, write_text
+from ...evaluation.parallel import Workers
 from ...evaluation.print_layout import save
 from ..catalogue import packages
 
 Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
-Progress = Callable[[float], None]
+Progress = Callable[[int], None]
 """Told of units of work done."""
 UNCERTAINTY = (
     '± is one standard error, by bootstrap over the runs; "certainly" means by a 95 % bootstrap interval.'
 )
+
+
+class Later(NamedTuple):
+    """A unit of work that somebody will do: a function of a module and its arguments."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    keywords: dict[str, Any]
+
+
+def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+    """Leave a unit of work to :func:`gathered`, which puts its result in this place."""
+    return Later(function, arguments, keywords)
+
+
+def gathered(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
+    """Do what was left for later, and return the same structure with what came out of it.
+
+    Args:
+        results: tuples, named ones too, lists and dictionaries, in which :func:`later` left units of work.
+        progress: told of units done.
+        workers: who does them; default: this process, one after the other.
+    """
+    units: list[Later] = []
+    _places(results, units.append)
+    done = (workers or Workers()).results(_unit, units, [1] * len(units), progress)
+    found = iter(done)
+    return _places(results, lambda unit: next(found))
+
+
+def _unit(unit: Later, tick: Progress) -> Any:
+    found = unit.function(*unit.arguments, **unit.keywords)
+    tick(1)
+    return found
+
+
+def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
+    """Return a structure with something else where units of work stand, in their order."""
+    if isinstance(part, Later):
+        return instead(part)
+    if isinstance(part, dict):
+        return {key: _places(value, instead) for key, value in part.items()}
+    if isinstance(part, list):
+        return [_places(value, instead) for value in part]
+    if isinstance(part, tuple):
+        values = [_places(value, instead) for value in part]
+        return type(part)(*values) if hasattr(part, "_fields") else tuple(values)
+    return part
 
 
 def verdict_of(holds: Iterable[bool]) -> Verdict:

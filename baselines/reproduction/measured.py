@@ -16,7 +16,6 @@ import xarray
 from ...evaluation.bootstrap import Bootstrap
 from ...evaluation.rollout import run_policy, run_reference
 from ..names import evaluate
-from . import Progress
 
 RESAMPLES = 500
 
@@ -73,9 +72,7 @@ def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
     return low, high
 
 
-def evaluated(
-    environment: str, name: str, scenario: str, episodes: int, progress: Progress, **keywords: Any
-) -> xarray.Dataset:
+def evaluated(environment: str, name: str, scenario: str, episodes: int, **keywords: Any) -> xarray.Dataset:
     """Evaluate a policy, reference or bound on test episodes; one unit of work.
 
     Args:
@@ -83,12 +80,9 @@ def evaluated(
         name: of the policy.
         scenario: name of the scenario.
         episodes: Monte Carlo runs.
-        progress: told when it is done.
         **keywords: of :func:`~filtergym.baselines.evaluation.evaluate`; parameters of the task.
     """
-    dataset = evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
-    progress(1.0)
-    return dataset
+    return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 
 
 def recorded(

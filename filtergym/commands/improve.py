@@ -1,8 +1,9 @@
 """Commands that search for something better: tuned values and trained agents."""
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,11 +15,14 @@ from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation.files import writable_file
+from ..evaluation.parallel import Workers
 from ..reports import standing
 from ..reports.tables import tuned_table
 from .terminal import (
     Backend,
+    Cluster,
     Environment,
+    Jobs,
     TrainingScenario,
     Trust,
     complete_policy,
@@ -36,6 +40,8 @@ def tune_policy(
     seed: Annotated[int, typer.Option(help="Of the training episodes and the search.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the tuned values.")] = FOLDER,
     backend: Backend = "auto",
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
 
@@ -47,7 +53,7 @@ def tune_policy(
         raise nearest("tunable policy", policy, tunable)
     table = writable_file(table_path(cls.id, out))
     read_table(table)  # a file that cannot take the values is refused before the work
-    with progress_bar() as bar:
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
             cls.id,
@@ -58,6 +64,7 @@ def tune_policy(
             seed,
             progress=lambda steps: bar.update(line, advance=steps),
             backend=backend,
+            workers=workers,
         )
     command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
@@ -86,6 +93,72 @@ def _trainer(algo: str, trust: bool = False) -> Any:
         ) from error
     torch.set_num_threads(1)  # networks this small run slower on more
     return trainer
+
+
+class _Training(NamedTuple):
+    """A run that is to be trained, or trained on."""
+
+    run: TrainingRun
+    folder: Path
+    begun: bool
+    validate_every: int | None
+    trust: bool
+
+
+def _one_by_one(waiting: Mapping[Path, _Training], trainer: Any, several: bool) -> dict[Path, TrainingRun]:
+    """Train in this process, up to a wish to stop."""
+    for folder, (run, _, begun, validate_every, _) in waiting.items():
+        if several:
+            console.print(f"{folder}: seed {run.seed}")
+        with progress_bar() as bar:
+            line = bar.add_task(f"training {run.algorithm}", total=run.steps)
+            trainer(
+                run,
+                folder,
+                begun,
+                validate_every,
+                progress=lambda done, bar=bar, line=line: bar.update(line, completed=done),
+                report=lambda text: console.print(text, highlight=False),
+            )
+        _print_done(folder, run)
+        if not run.finished:
+            break
+    return {folder: training.run for folder, training in waiting.items()}
+
+
+def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[Path, TrainingRun]:
+    """Train in other processes; what each has to say is printed when it has ended."""
+    folders, found = list(waiting), {}
+    with progress_bar() as bar:
+        line = bar.add_task("training", total=sum(training.run.steps for training in waiting.values()))
+        work = list(waiting.values())
+        sizes = [training.run.steps for training in work]
+        for i, lines in workers.run(_trained, work, sizes, lambda done: bar.update(line, advance=done)):
+            folder = folders[i]
+            if not training_run.holds_run(folder):
+                raise ValueError(
+                    f"{folder} is not here: the machines of a cluster must share the folder of a run"
+                )
+            found[folder] = training_run.load_run(folder, work[i].trust)
+            console.print(f"{folder}: seed {found[folder].seed}")
+            for text in lines:
+                console.print(text, highlight=False)
+            _print_done(folder, found[folder])
+    return found
+
+
+def _trained(training: _Training, tick: Any) -> list[str]:
+    """Train in a process of its own; returns what there is to say."""
+    lines: list[str] = []
+    run, folder, begun, validate_every, trust = training
+    _trainer(run.algorithm, trust)(
+        run, folder, begun, validate_every, progress=lambda done: None, report=lines.append
+    )
+    return lines
+
+
+def _print_done(folder: Path, run: TrainingRun) -> None:
+    console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
 
 
 def train(
@@ -134,6 +207,8 @@ def train(
     gated: Annotated[
         bool, typer.Option("--gated", help="The agent acts only where an alarm says that something is wrong.")
     ] = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
     compare: Annotated[
         bool,
         typer.Option(help="Say at the end how the best agent stands against paper, classical and reference."),
@@ -159,6 +234,8 @@ def train(
         raise ValueError(
             "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
         )
+    if seeds is None and not (jobs == 1 and cluster is None):
+        raise ValueError("a run is trained in one process: --jobs and --cluster share the runs of --seeds")
     keywords, hyperparameters = parsed_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward
@@ -195,25 +272,22 @@ def train(
                     f"{folder} goes on from a checkpoint that is loaded with pickle", trust
                 )
             runs[folder] = run, begun
+    waiting = {}
     for folder, (run, begun) in runs.items():
         if begun and run.finished:
             console.print(f"{folder} is finished: {run.steps_done:,} steps")
-            continue
-        if seeds is not None:
-            console.print(f"{folder}: seed {run.seed}")
-        with progress_bar() as bar:
-            line = bar.add_task(f"training {algo}", total=run.steps)
-            trainer(
-                run,
-                folder,
-                begun,
-                validate_every,
-                progress=lambda done, bar=bar, line=line: bar.update(line, completed=done),
-                report=lambda text: console.print(text, highlight=False),
-            )
-        console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
-        if not run.finished:
-            return  # somebody wished to stop
+        else:
+            waiting[folder] = _Training(run, folder.absolute(), begun, validate_every, trust)
+    with Workers(jobs, cluster) as workers:
+        done = (
+            _one_by_one(waiting, trainer, seeds is not None)
+            if workers.alone
+            else _side_by_side(waiting, workers)
+        )
+    for folder, run in done.items():
+        runs[folder] = run, True
+    if not all(run.finished for run, _ in runs.values()):
+        return  # somebody wished to stop
     if compare:
         _print_standing({folder: run for folder, (run, _) in runs.items()}, trust)
 

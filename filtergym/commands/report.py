@@ -9,6 +9,7 @@ import typer
 from ..baselines.reproduction import paper_module, papers, save_reproduction
 from ..envs.catalogue import find_scenario, importable_name, short_name, task_class
 from ..evaluation.files import whole_files, writable_file, writable_folder
+from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..reports import comparison, training_seeds
 from ..reports.environment_page import environment_tables, put_tables
@@ -19,11 +20,13 @@ from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
+    Cluster,
     Columns,
     Environment,
     Episodes,
     Experiment,
     Formats,
+    Jobs,
     Split,
     Trust,
     complete_policy,
@@ -143,6 +146,8 @@ def reproduce(
         int | None, typer.Option(help="Monte Carlo runs instead of the module's own.")
     ] = None,
     format: Formats = None,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Run a paper's experiments again and give a verdict on each of its claims.
 
@@ -152,9 +157,9 @@ def reproduce(
     module = paper_module(paper)
     if out is not None:
         writable_folder(out)
-    with progress_bar() as bar:
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task(f"reproducing {paper}", total=module.STEPS)
-        result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes)
+        result = module.reproduce(lambda done=1: bar.update(line, advance=done), episodes, workers)
     if out is not None:
         save_reproduction(result, out, formats)
     console.print(claims_table(result))
@@ -185,6 +190,8 @@ def seeds(
     curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
     columns: Columns = 2,
     trust: Trust = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
 ) -> None:
     """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
 
@@ -209,7 +216,7 @@ def seeds(
         check_markers(into, [marker])
     if curves is not None:
         save(training_seeds.learning_curves(found, columns), curves)
-    with progress_bar() as bar:
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
         records, grids = training_seeds.compare_scenarios(
             found,
@@ -221,6 +228,7 @@ def seeds(
             lambda done: bar.update(line, advance=done),
             trust,
             waiting,
+            workers,
         )
     if out is not None:
         write_records(out, records)

@@ -20,13 +20,15 @@ from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.names import evaluate
 from ..baselines.reproduction import Grid, markdown_table
 from ..baselines.tuning import tuned_names
-from ..envs.catalogue import task_class
+from ..envs.catalogue import importable_name, make_task, task_class
 from ..evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from ..evaluation.competitors import kind_of
 from ..evaluation.dataset import groups_of, windows_of
+from ..evaluation.evaluate import check_sendable
 from ..evaluation.figures import draw_learning_curves
 from ..evaluation.files import whole_file
 from ..evaluation.metrics import reported_components, score, squared_errors
+from ..evaluation.parallel import Workers
 from ..names import competitor
 from .tables import shown_components, with_interval
 
@@ -198,11 +200,12 @@ def episode_means(
     progress: Callable[[int], None] = lambda done: None,
     trust: bool = False,
     waiting: Path | None = None,
+    workers: Workers | None = None,
 ) -> EpisodeMeans:
-    """Evaluate runs and opponents on the same episodes, one after the other to save memory.
+    """Evaluate runs and opponents on the same episodes, each by itself to save memory.
 
     With ``trust``, models that can execute code are loaded. In the folder ``waiting`` the means of each are kept as
-    soon as they are there, and those that are kept there are taken from it.
+    soon as they are there, and those that are kept there are taken from it. ``workers`` share them.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
@@ -217,33 +220,82 @@ def episode_means(
         policies[name] = competitor(id, name, trust=trust), None
         if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
-    cost: dict[str, numpy.ndarray] = {}
-    squares: dict[str, dict[str, numpy.ndarray]] = {}
-    units: dict[str, str] = {}
     agents = {member.name: member.agent for member in runs}
+    importable = importable_name(task_class(id))
+    found: dict[str, Means | None] = {}
+    missing: list[tuple[_Asked, Path | None]] = []
     for name, (maker, control) in policies.items():
         key = json.dumps(
             [installed_versions(), id, task_class(id).interface, scenario, episodes, seed, split, name]
         )
         kept = None if waiting is None else _kept_file(waiting, key, agents.get(name))
-        found = None if kept is None else _read_means(kept)
-        if found is None:
-            known_as = "agent" if name in agents else name
-            dataset = evaluate(id, {known_as: maker}, scenario, episodes, seed, split, control, progress)
-            data = dataset.isel(policy=0)
-            first, last = windows_of(dataset)["all"]
-            known = reported_components(dataset)
-            errors = {}
-            for component in shown_components(list(known)):
-                values = squared_errors(data, component, groups_of(dataset))[:, first - 1 : last]
-                errors[component] = values.mean(axis=1)
-            found = data["cost"].values.mean(axis=1), errors, known
-            if kept is not None:
-                _write_means(kept, *found)
-        cost[name], errors, units = found
+        found[name] = None if kept is None else _read_means(kept)
+        if found[name] is None:
+            missing.append(
+                (
+                    _Asked(importable, name, name in agents, maker, scenario, episodes, seed, split, control),
+                    kept,
+                )
+            )
+    workers = workers or Workers()
+    if not workers.alone:
+        check_sendable(importable, {asked.name: asked.maker for asked, _ in missing})
+    horizon = make_task(id, None, scenario).horizon
+    work = [asked for asked, _ in missing]
+    for i, measured in workers.run(_means_of, work, [episodes * horizon] * len(work), progress):
+        asked, kept = missing[i]
+        if kept is not None:
+            _write_means(kept, *measured)
+        found[asked.name] = measured
+    cost: dict[str, numpy.ndarray] = {}
+    squares: dict[str, dict[str, numpy.ndarray]] = {}
+    units: dict[str, str] = {}
+    for name, every in found.items():
+        assert every is not None
+        cost[name], errors, units = every
         for component, values in errors.items():
             squares.setdefault(component, {})[name] = values
     return EpisodeMeans(cost, squares, units)
+
+
+Means = tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]]
+"""Cost and squared errors of every episode, and units of the components."""
+
+
+class _Asked(NamedTuple):
+    """A run or an opponent over episodes of a scenario."""
+
+    environment: str
+    name: str
+    trained: bool
+    maker: Any
+    scenario: str | None
+    episodes: int
+    seed: int
+    split: str
+    control: str | None
+
+
+def _means_of(asked: _Asked, tick: Callable[[int], None]) -> Means:
+    known_as = "agent" if asked.trained else asked.name
+    dataset = evaluate(
+        asked.environment,
+        {known_as: asked.maker},
+        asked.scenario,
+        asked.episodes,
+        asked.seed,
+        asked.split,
+        asked.control,
+        tick,
+    )
+    data = dataset.isel(policy=0)
+    first, last = windows_of(dataset)["all"]
+    known = reported_components(dataset)
+    errors = {}
+    for component in shown_components(list(known)):
+        values = squared_errors(data, component, groups_of(dataset))[:, first - 1 : last]
+        errors[component] = values.mean(axis=1)
+    return data["cost"].values.mean(axis=1), errors, known
 
 
 def _kept_file(waiting: Path, key: str, agent: Path | None) -> Path:
@@ -260,7 +312,7 @@ def _write_means(
         numpy.savez(file, cost=cost, units=json.dumps(units), **arrays)
 
 
-def _read_means(path: Path) -> tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]] | None:
+def _read_means(path: Path) -> Means | None:
     """Return cost, squares by component, and units; None if they are not there yet."""
     if not path.exists():
         return None
@@ -415,6 +467,7 @@ def compare_scenarios(
     progress: Callable[[int], None] = lambda done: None,
     trust: bool = False,
     waiting: Path | None = None,
+    workers: Workers | None = None,
 ) -> tuple[list[Comparison], list[Grid]]:
     """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them.
 
@@ -423,7 +476,9 @@ def compare_scenarios(
     records: list[Comparison] = []
     grids: list[Grid] = []
     for scenario in scenarios:
-        means = episode_means(runs, opponents, scenario, episodes, seed, split, progress, trust, waiting)
+        means = episode_means(
+            runs, opponents, scenario, episodes, seed, split, progress, trust, waiting, workers
+        )
         comparisons = compare(runs, means, scenario, seed, split)
         records += comparisons
         grids += comparison_grids(runs, comparisons)

@@ -8,6 +8,7 @@ Reading: "the systematic errors are compensated" is tested twice, as attenuation
 as removal (no mean error left).
 """
 
+from ....evaluation.parallel import Workers
 from ...reproduction import Progress, Reproduction, episode_count, its_command
 from .. import PAPER
 from . import claims, experiment, figures
@@ -16,8 +17,10 @@ TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they 
 STEPS = experiment.STEPS
 
 
-def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
     """Run the examples and judge the claims."""
-    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES))
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = claims.claims(r), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

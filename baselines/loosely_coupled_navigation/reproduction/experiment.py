@@ -9,12 +9,13 @@ import numpy
 from ....envs.catalogue import make_task
 from ....envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ....envs.task import Episode
+from ....evaluation.parallel import Workers
 from ....evaluation.seeds import episode_seeds
 from ....filters import kalman_bucy
 from ....filters import loosely_coupled as ins_gnss
 from ....filters.linear_systems import steady_kalman_bucy, van_loan
 from ...names import own_competitor
-from ...reproduction import Progress
+from ...reproduction import Progress, gathered, later
 from ...reproduction.measured import evaluated, means, recorded
 
 EPISODES = 4000
@@ -235,19 +236,35 @@ class Results(NamedTuple):
     """One run of the policies of ``DRAWN``."""
 
 
-def run_everything(progress: Progress, episodes: int) -> Results:
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
-
-    def errors(name: str, count: int, **keywords: Any) -> numpy.ndarray:
-        # A policy is tuned to the model; a fixed drift is one value of that model's prior.
-        one = evaluated(LooselyCoupledNavigation.id, name, "paper", count, progress, seed=SEED, **keywords)
-        return one["error"].values[:, :, 0]
-
     drifting = max(8, episodes // 4)
-    example = first_order(episodes)
-    progress(1.0)
-    squares = {name: means((errors(name, episodes)[:, LATE] ** 2).mean(axis=1)) for name in NAMES}
-    drift = {name: means(errors(name, drifting, fixed_drift=DRIFT, horizon=LONG)) for name in DRIFTING}
-    paths = {name: example_run(name) for name in DRAWN}
-    progress(1.0)
-    return Results(episodes, drifting, example, squares, drift, paths)
+    results = Results(
+        episodes,
+        drifting,
+        later(first_order, episodes),
+        {name: later(_late_squares, name, episodes) for name in NAMES},
+        {name: later(_drift, name, drifting) for name in DRIFTING},
+        later(_example_runs),
+    )
+    done: Results = gathered(results, progress, workers)
+    return done
+
+
+def _errors(name: str, count: int, **keywords: Any) -> numpy.ndarray:
+    # A policy is tuned to the model; a fixed drift is one value of that model's prior.
+    one = evaluated(LooselyCoupledNavigation.id, name, "paper", count, seed=SEED, **keywords)
+    values: numpy.ndarray = one["error"].values[:, :, 0]
+    return values
+
+
+def _late_squares(name: str, count: int) -> numpy.ndarray:
+    return means((_errors(name, count)[:, LATE] ** 2).mean(axis=1))
+
+
+def _drift(name: str, count: int) -> numpy.ndarray:
+    return means(_errors(name, count, fixed_drift=DRIFT, horizon=LONG))
+
+
+def _example_runs() -> dict[str, dict[str, numpy.ndarray]]:
+    return {name: example_run(name) for name in DRAWN}

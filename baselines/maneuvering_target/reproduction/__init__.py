@@ -9,6 +9,7 @@ Reading: the paper calls the improvement substantial without a number; here the 
 Reading: it gives no criterion for the best gains; here the RMS over the whole run.
 """
 
+from ....evaluation.parallel import Workers
 from ...reproduction import Progress, Reproduction, episode_count, its_command
 from .. import PAPER
 from . import claims, experiment, figures
@@ -17,8 +18,10 @@ TITLE = "Tracking a manoeuvring target with an IMM algorithm over two alpha-beta
 STEPS = experiment.STEPS
 
 
-def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
     """Run the paper's experiment and judge its claims; at most ``GRID_EPISODES`` runs in a cell of the grids."""
-    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES))
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = claims.claims(r), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

@@ -8,9 +8,10 @@ import numpy
 from ....envs.catalogue import make_task
 from ....envs.maneuvering_target.task import ManeuveringTarget
 from ....envs.task import Episode, Initial
+from ....evaluation.parallel import Workers
 from ....evaluation.rollout import started_lanes
 from ....evaluation.seeds import episode_seeds
-from ...reproduction import Progress
+from ...reproduction import Progress, gathered, later
 from ...reproduction.measured import evaluated, means
 from .gain_schedules import best_schedule, maneuver_flight, mean_square_errors, ramp_schedule
 from .imm_readings import Likelihood, Reading, Recording, interacting_multiple_model
@@ -80,9 +81,9 @@ class Run(NamedTuple):
     """Estimate minus truth in the first episode, ``(K, 4)``."""
 
 
-def flown(name: str, episodes: int, progress: Progress, **keywords: Any) -> Run:
+def flown(name: str, episodes: int, **keywords: Any) -> Run:
     """Run a policy, reference or bound of the environment over the paper's flight; one unit of work."""
-    one = evaluated(ManeuveringTarget.id, name, "paper", episodes, progress, seed=SEED, **keywords)
+    one = evaluated(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
     nothing = numpy.empty((0, 0))
     if "mean_square" in one:
         squares = one["mean_square"].values[:1]
@@ -128,14 +129,15 @@ def variant(recording: Recording, reading: Reading) -> numpy.ndarray:
     return mean_squares(numpy.moveaxis(interacting_multiple_model(recording, reading), -1, 0))
 
 
-def gain_grid(recording: Recording, likelihood: Likelihood, progress: Progress) -> numpy.ndarray:
-    """Mean squares of every pair of gains, ``(6, 8, 1 + resamples, K, 2)``; a unit of work a lower gain."""
-    rows = []
-    for low in LOW_GAINS:
-        readings = [Reading(gains=(low, high), likelihood=likelihood) for high in HIGH_GAINS]
-        rows.append([variant(recording, reading) for reading in readings])
-        progress(1.0)
-    return numpy.array(rows)
+def grid_row(recording: Recording, likelihood: Likelihood, low: float) -> list[numpy.ndarray]:
+    """Mean squares of a lower gain with every higher one, each ``(1 + resamples, K, 2)``; a unit of work."""
+    readings = [Reading(gains=(low, high), likelihood=likelihood) for high in HIGH_GAINS]
+    return [variant(recording, reading) for reading in readings]
+
+
+def squares_of(name: str, episodes: int, **keywords: Any) -> numpy.ndarray:
+    """Mean squares of a policy, ``(1 + resamples, K, 2)``; a unit of work."""
+    return flown(name, episodes, **keywords).squares
 
 
 class Results(NamedTuple):
@@ -160,7 +162,7 @@ class Results(NamedTuple):
     """Best gains of each scan, ``(K,)``."""
 
 
-def run_everything(progress: Progress, episodes: int) -> Results:
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
     parameters: Any = make_task(ManeuveringTarget.id, "gain", "paper").parameters
     flight, scans, (low, high) = maneuver_flight(parameters), parameters.horizon, parameters.gains
@@ -168,13 +170,8 @@ def run_everything(progress: Progress, episodes: int) -> Results:
     def exactly(alpha: numpy.ndarray) -> numpy.ndarray:
         return numpy.stack(mean_square_errors(flight, alpha), axis=-1)[None]
 
-    def rivals(**keywords: Any) -> dict[str, numpy.ndarray]:
-        return {name: flown(name, episodes, progress, **keywords).squares for name in COMPARED}
-
-    def read(reading: Reading) -> numpy.ndarray:
-        squares = variant(recording, reading)
-        progress(1.0)
-        return squares
+    def rivals(**keywords: Any) -> dict[str, Any]:
+        return {name: later(squares_of, name, episodes, **keywords) for name in COMPARED}
 
     schedule = best_schedule(flight)
     exact = {f"fixed gain {a:g}": exactly(numpy.full(scans, a)) for a in (low, high, 0.65)}
@@ -182,17 +179,19 @@ def run_everything(progress: Progress, episodes: int) -> Results:
     recording = recorded(episodes, SEED)
     grid_episodes = min(episodes, GRID_EPISODES)
     few = recorded(grid_episodes, SEED)
-    return Results(
+    results = Results(
         episodes,
         grid_episodes,
-        main={name: flown(name, episodes, progress) for name in NAMES},
+        main={name: later(flown, name, episodes) for name in NAMES},
         exact=exact | {"best gain schedule, flight known": exactly(schedule)},
         forced={k: exactly(ramp_schedule(low, high, scans, k)) for k in range(first, last + 1)},
         boxed={gains: rivals(gains=gains) for gains in BOX_PAIRS},
         polar=rivals(polar_measurements=True),
         later=rivals(maneuver_steps=(first + LATER, last + LATER)),
-        readings={name: read(reading) for name, reading in VARIANTS.items()},
-        grids={kind: gain_grid(few, kind, progress) for kind in LIKELIHOODS},
+        readings={name: later(variant, recording, reading) for name, reading in VARIANTS.items()},
+        grids={kind: [later(grid_row, few, kind, low) for low in LOW_GAINS] for kind in LIKELIHOODS},  # type: ignore
         recording=recording,
         schedule=schedule,
     )
+    done: Results = gathered(results, progress, workers)
+    return done._replace(grids={kind: numpy.array(rows) for kind, rows in done.grids.items()})

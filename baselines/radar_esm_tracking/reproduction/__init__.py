@@ -11,6 +11,7 @@ Reading: the "posterior" deviations of figures 2 to 4 belong to one run "corresp
 are most likely the filters' own; both those and the errors really made are drawn and told apart.
 """
 
+from ....evaluation.parallel import Workers
 from ...reproduction import Progress, Reproduction, episode_count, its_command
 from .. import PAPER
 from . import claims, experiment, figures
@@ -19,8 +20,10 @@ TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's
 STEPS = experiment.STEPS
 
 
-def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
     """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
-    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100))
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100), workers)
     shown = claims.claims(r), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

@@ -8,8 +8,9 @@ import numpy
 from ....envs.catalogue import make_task
 from ....envs.radar_esm_tracking.parameters import RadarEsmTrackingParameters
 from ....envs.radar_esm_tracking.task import RadarEsmTracking
+from ....evaluation.parallel import Workers
 from ....filters import class_fusion
-from ...reproduction import Progress
+from ...reproduction import Progress, gathered, later
 from ...reproduction.measured import Measured, evaluated, mean, means, measured
 from ..metrics import SURE
 
@@ -129,9 +130,9 @@ def _quantile(scan: numpy.ndarray, share: float) -> float:
     return INTERVAL * (float(numpy.sort(scan)[math.ceil(share * len(scan)) - 1]) + 1.0)
 
 
-def tracked(name: str, scenario: str, episodes: int, progress: Progress, **keywords: Any) -> Run:
+def tracked(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
     """Run a policy; one unit of work."""
-    one = evaluated(RadarEsmTracking.id, name, scenario, episodes, progress, seed=SEED, **keywords)
+    one = evaluated(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
     variance = [one[f"variance_{c.name}"].values for c in RadarEsmTracking.components]
     return Run(
         one["error"].values,
@@ -177,20 +178,20 @@ class Results(NamedTuple):
         return measured(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
 
 
-def run_everything(progress: Progress, episodes: int) -> Results:
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work. Side experiments have a quarter of the episodes."""
     small = max(episodes // 4, 2)
     p = parameters()
     models, start = RadarEsmTracking.design_models(p)
     channels = class_fusion.design_channels(models, start, p.horizon)
 
-    def by_class(name: str, count: int) -> list[Run]:
-        return [tracked(name, "paper", count, progress, true_class=s) for s in CLASSES]
+    def by_class(name: str, count: int) -> list[Any]:
+        return [later(tracked, name, "paper", count, true_class=s) for s in CLASSES]
 
-    def both(one: str, other: str, count: int, **keywords: Any) -> list[Run]:
-        return [tracked(name, "paper", count, progress, **keywords) for name in (one, other)]
+    def both(one: str, other: str, count: int, **keywords: Any) -> list[Any]:
+        return [later(tracked, name, "paper", count, **keywords) for name in (one, other)]
 
-    return Results(
+    results = Results(
         episodes,
         small,
         {(t, c): exact_mean_squares(p, t, c) for t in range(3) for c in range(3)},
@@ -199,6 +200,8 @@ def run_everything(progress: Progress, episodes: int) -> Results:
         by_class("radar-only", small),
         by_class("esm-only", small),
         both("quasi-optimal", "ungated", episodes),
-        {name: tracked(name, "fixed-type", episodes, progress) for name in ("quasi-optimal", "joint-type")},
+        {name: later(tracked, name, "fixed-type", episodes) for name in ("quasi-optimal", "joint-type")},
         {name: both("quasi-optimal", "radar-only", small, **keywords) for name, keywords in VARIANTS.items()},
     )
+    done: Results = gathered(results, progress, workers)
+    return done

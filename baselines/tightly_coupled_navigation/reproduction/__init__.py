@@ -12,6 +12,7 @@ are steered by that prediction (``aperture``).
 Reading: "without rates", "pseudoranges only": the standard deviation of what is left out is 10^6 of its unit.
 """
 
+from ....evaluation.parallel import Workers
 from ...reproduction import Progress, Reproduction, episode_count, its_command
 from .. import PAPER
 from . import claims, experiment, figures
@@ -20,8 +21,10 @@ TITLE = "Adaptive multi-hypothesis algorithm of an inertial-satellite navigation
 STEPS = experiment.STEPS
 
 
-def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
     """Run the paper's experiment and judge its claims; comparators have at most ``FEW`` runs."""
-    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES))
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = claims.claims(r), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

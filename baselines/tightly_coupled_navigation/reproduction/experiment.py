@@ -10,9 +10,10 @@ from ....envs.task import Episode, Outside, Task
 from ....envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ....envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ....evaluation.competitors import Policy
+from ....evaluation.parallel import Workers
 from ....evaluation.seeds import episode_seeds
 from ....filters import gnss_ins, imm
-from ...reproduction import Progress
+from ...reproduction import Progress, gathered, later
 from ...reproduction.measured import Measured, means, measured, recorded
 from ..metrics import lasting, switches
 from ..policies import chain
@@ -200,46 +201,59 @@ class Results(NamedTuple):
     settings: dict[str, Run]
 
 
-def run_everything(progress: Progress, episodes: int) -> Results:
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
     few, scatter = min(FEW, episodes), min(SCATTER, episodes)
 
-    def run(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict[str, Run]:
-        found = simulate(scenario, filters, **keywords)
-        progress(1.0)
-        return found
+    def run(scenario: str, filters: Mapping[str, int], **keywords: Any) -> Any:
+        return later(simulate, scenario, filters, **keywords)
 
     both = {ADAPTIVE: episodes, "Singer": few}
-    courses = {course: run(scenario, both) for course, scenario in COURSES.items()}
-    courses["increment"] |= {
-        "Singer, no aperture": run("paper", {"Singer": few}, aperture=False)["Singer"],
-        **run("paper", {"known mode": few}),
+    short: dict[str, Any] = {"horizon": SHORT_LEG + 200, "leg_steps": (SHORT_LEG, SHORT_LEG + 1000)}
+    shortest: dict[str, Any] = {
+        "horizon": SHORTEST_LEG + 160,
+        "leg_steps": (SHORTEST_LEG, SHORTEST_LEG + 1000),
     }
-    short: dict[str, dict[str, Run]] = {}
-    legs: dict[str, Any] = {"leg_steps": (SHORT_LEG, SHORT_LEG + 1000), "horizon": SHORT_LEG + 200}
     blind = {"accelerometer_sigma": NOTHING}
-    for course, scenario in COURSES.items():
-        short.setdefault("Singer without accelerometers", {})[course] = run(
-            scenario, {"Singer": few}, **blind, **legs
-        )["Singer"]
-        for name, found in run(scenario, {"constant velocity": few, "rest": few}, **legs).items():
-            short.setdefault(name, {})[course] = found
-    legs = {"leg_steps": (SHORTEST_LEG, SHORTEST_LEG + 1000), "horizon": SHORTEST_LEG + 160}
+    found = gathered(
+        {
+            "courses": {course: run(scenario, both) for course, scenario in COURSES.items()},
+            "no aperture": run("paper", {"Singer": few}, aperture=False),
+            "known mode": run("paper", {"known mode": few}),
+            "blind": {c: run(scenario, {"Singer": few}, **blind, **short) for c, scenario in COURSES.items()},
+            "short": {
+                c: run(scenario, {"constant velocity": few, "rest": few}, **short)
+                for c, scenario in COURSES.items()
+            },
+            "matched": {
+                name: run("matched", {ADAPTIVE: few, "Singer": few}, horizon=MATCHED_WINDOW[1], **keywords)
+                for name, keywords in MATCHED.items()
+            },
+            "waits": {
+                name: run("paper", {ADAPTIVE: episodes}, horizon=MOTION + 99, **keywords)
+                for name, keywords in WAITS.items()
+            },
+            "settings": {
+                name: run("paper", {"Singer": scatter}, **shortest, **keywords)
+                for name, keywords in SETTINGS.items()
+            },
+        },
+        progress,
+        workers,
+    )
+    courses = found["courses"]
+    courses["increment"] |= {"Singer, no aperture": found["no aperture"]["Singer"], **found["known mode"]}
+    of_short: dict[str, dict[str, Run]] = {}
+    for course in COURSES:
+        of_short.setdefault("Singer without accelerometers", {})[course] = found["blind"][course]["Singer"]
+        for name, one in found["short"][course].items():
+            of_short.setdefault(name, {})[course] = one
     return Results(
         courses,
-        {
-            name: run("matched", {ADAPTIVE: few, "Singer": few}, horizon=MATCHED_WINDOW[1], **keywords)
-            for name, keywords in MATCHED.items()
-        },
-        {
-            name: run("paper", {ADAPTIVE: episodes}, horizon=MOTION + 99, **keywords)[ADAPTIVE]
-            for name, keywords in WAITS.items()
-        },
-        short,
-        {
-            name: run("paper", {"Singer": scatter}, **legs, **keywords)["Singer"]
-            for name, keywords in SETTINGS.items()
-        },
+        found["matched"],
+        {name: one[ADAPTIVE] for name, one in found["waits"].items()},
+        of_short,
+        {name: one["Singer"] for name, one in found["settings"].items()},
     )
 
 

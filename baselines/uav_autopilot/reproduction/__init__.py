@@ -8,6 +8,7 @@ Nodes: 1 the plant's input (control, command and white noise), 2 the observation
 innovation; all of the output coordinate. Energy spectrum: ``|DFT|^2 T / n`` averaged over runs, two-sided.
 """
 
+from ....evaluation.parallel import Workers
 from ...reproduction import Progress, Reproduction, episode_count, its_command
 from .. import PAPER
 from . import claims, experiment, figures
@@ -16,8 +17,10 @@ TITLE = "Stochastic simulation of a UAV autopilot with the optimal Kalman filter
 STEPS = experiment.STEPS
 
 
-def reproduce(progress: Progress, episodes: int | None = None) -> Reproduction:
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
     """Run the experiments and judge the claims."""
-    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES))
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
     shown = claims.claims(r), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(PAPER, episodes))

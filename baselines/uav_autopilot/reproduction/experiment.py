@@ -9,9 +9,10 @@ import numpy
 from ....envs.catalogue import make_task
 from ....envs.task import Episode
 from ....envs.uav_autopilot.task import UavAutopilot
+from ....evaluation.parallel import Workers
 from ....evaluation.seeds import episode_seeds
 from ....filters import linear_systems
-from ...reproduction import Progress
+from ...reproduction import Progress, gathered, later
 from ...reproduction.measured import evaluated, mean, recorded
 from ..policies import Kalman, RawSensors
 from ..references import TrueState
@@ -127,15 +128,13 @@ class Results(NamedTuple):
         return max(float(y.max()) - 1.0, 0.0), float(numpy.argmax(y >= 0.9)) * T, float(outside[-1] + 1) * T
 
 
-def run_everything(progress: Progress, episodes: int) -> Results:
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
 
-    def signals(keywords: dict[str, Any], scenario: str, loop: str) -> Signals:
-        found = simulate(keywords, scenario, loop, episodes)
-        progress(1.0)
-        return found
+    def signals(keywords: dict[str, Any], scenario: str, loop: str) -> Any:
+        return later(simulate, keywords, scenario, loop, episodes)
 
-    return Results(
+    results = Results(
         episodes,
         {
             # One sensor cannot be fed back alone: the loop is unstable.
@@ -152,12 +151,14 @@ def run_everything(progress: Progress, episodes: int) -> Results:
         },
         {
             plant: {
-                name: evaluated("UavAutopilot", name, "random", episodes, progress, plant=plant)
+                name: later(evaluated, "UavAutopilot", name, "random", episodes, plant=plant)
                 for name in RANDOM
             }
             for plant in "PU"
         },
     )
+    done: Results = gathered(results, progress, workers)
+    return done
 
 
 # --- theory
