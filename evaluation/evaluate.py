@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
+import cloudpickle
 import gymnasium
 import numpy
 import xarray
@@ -457,8 +458,6 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
             f"{environment.removeprefix('__main__:')} is registered by the program that runs, which other processes do "
             "not run: register it in a module of its own, or leave out jobs and cluster"
         )
-    import cloudpickle
-
     for name, maker in competitors.items():
         try:
             cloudpickle.dumps(maker)

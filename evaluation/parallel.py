@@ -5,9 +5,8 @@ that can be pickled. Pieces are run in any order, each with one thread of BLAS a
 piece itself does not seed; so who puts the results into the order of the pieces has the same bits wherever they came
 from.
 
-On this machine joblib's processes (loky) run them, on a cluster of Dask joblib's backend for it, on a cluster of Ray
-Ray's own tasks, which are run again where a process or a machine is lost: joblib's backend for Ray is a pool of actors,
-and ends with the first of them.
+On this machine joblib's processes (loky) run them, on a cluster the tasks of Ray or Dask, which are run again where a
+process or a machine is lost. joblib's backend for Ray is a pool of actors, and ends with the first that is lost.
 """
 
 import os
@@ -20,6 +19,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
+
+import cloudpickle
 
 from .rollout import Progress
 from .threads import one_thread
@@ -56,7 +57,7 @@ class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands beh
     """Traceback of an error in another process."""
 
 
-def _done(function: Function, index: int, item: Any, place: Place) -> Outcome:
+def _done(index: int, packed: bytes, place: Place) -> Outcome:
     """Do a piece of work, in a process that may know nothing yet."""
     if os.getcwd() != place.folder:
         with suppress(OSError):  # another machine may not have it
@@ -64,6 +65,7 @@ def _done(function: Function, index: int, item: Any, place: Place) -> Outcome:
     sys.path.extend(path for path in place.paths if path not in sys.path and Path(path).is_dir())
     with warnings.catch_warnings(record=True) as noted, one_thread():
         try:
+            function, item = pickle.loads(packed)  # only now: its modules may lie on those paths
             found = Outcome(index, function(item, lambda measurements: None), None, "", [])
         except Exception as error:
             found = Outcome(index, None, _sendable(error), traceback.format_exc(), [])
@@ -109,7 +111,7 @@ class Workers:
         self.jobs, self.cluster = jobs, cluster
         self._cores = os.cpu_count() or 1 if jobs in (1, -1) else jobs
         self._ended = ExitStack()
-        self._started = False
+        self._dask: Any = None
 
     @property
     def alone(self) -> bool:
@@ -162,7 +164,7 @@ class Workers:
                 yield index, result
             return
         place = Place(os.getcwd(), list(sys.path))
-        calls = ((function, index, item, place) for index, item in enumerate(items))
+        calls = ((index, cloudpickle.dumps((function, item)), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         told: set[tuple[str, type[Warning]]] = set()
         for outcome in spread(calls):
@@ -209,32 +211,30 @@ class Workers:
             ) from error
 
     def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
-        import joblib
-
         try:
-            from distributed import Client, KilledWorker
+            from distributed import Client, KilledWorker, as_completed
         except ImportError as error:
             raise _missing(error) from error
-        if not self._started:
+        if self._dask is None:
             try:
                 if self.cluster == "dask":
-                    client = Client(
+                    self._dask = Client(
                         n_workers=self._cores, threads_per_worker=1, processes=True, dashboard_address=None
                     )
                 else:
-                    client = Client(self.cluster, timeout=30)
+                    self._dask = Client(self.cluster, timeout=30)
             except (OSError, ValueError) as error:
                 raise ValueError(f"there is no cluster of Dask at {self.cluster}: {error}") from error
-            self._ended.callback(client.close)
-            self._started = True
+            self._ended.callback(self._dask.close)
+        futures = [self._dask.submit(_done, *call, pure=False) for call in calls]
         try:
-            with joblib.parallel_config(backend="dask", wait_for_workers_timeout=60):
-                pool = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-                yield from pool(joblib.delayed(_done)(*call) for call in calls)
+            for future in as_completed(futures):
+                yield future.result()
+                future.release()  # a result is large, and has been taken
         except KilledWorker as error:
-            raise ValueError(
-                f"the cluster has lost every process that took a piece of work: {error}"
-            ) from error
+            raise ValueError(f"the cluster has lost a piece of work for good: {error}") from error
+        finally:
+            self._dask.cancel(futures)
 
     def _over_ray(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody asked to tell others
@@ -250,6 +250,17 @@ class Workers:
             self._ended.callback(ray.shutdown)
         remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_done)
         pending: list[Any] = []
+        try:
+            yield from self._from_ray(ray, remote, calls, pending)
+        finally:
+            for reference in pending:  # of who ends the work early
+                ray.cancel(reference, force=True)
+
+    @staticmethod
+    def _from_ray(
+        ray: Any, remote: Any, calls: Iterator[tuple[Any, ...]], pending: list[Any]
+    ) -> Iterator[Outcome]:
+        """Keep the cluster busy; ``pending`` is what it has to do."""
         more = True
         while pending or more:
             # The cluster may grow meanwhile; two pieces for each core keep it busy.
@@ -260,7 +271,7 @@ class Workers:
                 if call is not None:
                     pending.append(remote.remote(*call))
             if pending:
-                ready, pending = ray.wait(pending, num_returns=1)
+                ready, pending[:] = ray.wait(pending, num_returns=1)
                 try:
                     yield from ray.get(ready)
                 except ray.exceptions.RayError as error:

@@ -1,5 +1,9 @@
 """Work in several processes: the bits of one process, one sentence for what goes wrong, and what was begun goes on."""
 
+import importlib
+import inspect
+import sys
+
 import numpy as np
 import pytest
 from filtergym.evaluation import parallel, summary
@@ -184,6 +188,52 @@ def test_paths_of_this_process_are_found(two, tmp_path, monkeypatch):
 
     assert two.results(mine_there.double, [1, 2, 3]) == [2, 4, 6]
     assert parallel.RETRIES > 0
+
+
+def lost_once(item, tick):
+    """End the process at the first call; the next one finds the file."""
+    import os
+
+    if not item.exists():
+        item.touch()
+        os._exit(3)
+    return "done"
+
+
+@pytest.fixture(scope="module", params=["ray", "dask"])
+def clustered(request):
+    if request.param == "ray":
+        ray = pytest.importorskip("ray", reason="a cluster needs filtergym[cluster]")
+        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
+        yield Workers(cluster="ray")
+        ray.shutdown()
+        return
+    pytest.importorskip("distributed", reason="a cluster needs filtergym[cluster]")
+    with Workers(2, "dask") as workers:
+        yield workers
+
+
+def test_a_cluster_has_the_same_bits_and_loses_nothing(clustered, tmp_path, monkeypatch):
+    names = ["imm", "imm-tuned", "known-turn"]
+    one = evaluate(ENV, names, episodes=10)
+    assert one.identical(evaluate(ENV, names, episodes=10, workers=clustered))
+    with pytest.raises(ValueError, match="estimator 'mine' failed at measurement 1"):
+        evaluate(ENV, {"mine": Wrong}, episodes=4, workers=clustered)
+    (tmp_path / "elsewhere.py").write_text(inspect.getsource(lost_once))
+    monkeypatch.syspath_prepend(tmp_path)
+    elsewhere = importlib.import_module("elsewhere")
+    flags = [tmp_path / "first", tmp_path / "second"]
+    assert clustered.results(elsewhere.lost_once, flags) == ["done", "done"]
+    sys.modules.pop("elsewhere")
+
+
+def test_a_cluster_without_its_packages_is_one_sentence(command, monkeypatch):
+    for name in ("ray", "distributed"):
+        monkeypatch.setitem(sys.modules, name, None)
+    for cluster in ("ray", "tcp://127.0.0.1:1"):
+        code, _, errors = command("evaluate", ENV, "--policy", "imm", "--episodes", 2, "--cluster", cluster)
+        assert code == 2
+        assert "a cluster needs more packages: pip install 'filtergym[cluster]'" in errors
 
 
 def test_tuning_finds_the_same_values(two):
