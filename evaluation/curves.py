@@ -88,10 +88,9 @@ class Drawn(NamedTuple):
     def and_of(self, later: "Drawn") -> "Drawn":
         """Add the episodes that come next."""
         sums = {key: added(own, later.sums[key]) for key, own in self.sums.items()}
-        totals = {
-            key: self.totals.get(key, 0.0) + later.totals.get(key, 0.0)
-            for key in {**self.totals, **later.totals}
-        }
+        totals = dict(self.totals)
+        for key, total in later.totals.items():
+            totals[key] = totals[key] + total if key in totals else total
         kept = {key: own + later.kept[key] for key, own in self.kept.items()}
         return self._replace(sums=sums, totals=totals, kept=kept)
 

@@ -45,7 +45,7 @@ class Place(NamedTuple):
 class Outcome(NamedTuple):
     """What became of a piece of work."""
 
-    index: int
+    number: int
     result: Any
     error: Exception | None
     traceback: str
@@ -175,8 +175,8 @@ class Workers:
             if outcome.error is not None:
                 raise outcome.error from Elsewhere(outcome.traceback)
             if sizes is not None:
-                tick(sizes[outcome.index])
-            yield outcome.index, outcome.result
+                tick(sizes[outcome.number])
+            yield outcome.number, outcome.result
 
     def results(
         self,

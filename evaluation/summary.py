@@ -250,7 +250,7 @@ def write_summary(path: Path, summary: Summary, made_by: str) -> None:
         "gains": summary.finished.gains,
         "episodes": summary.episodes,
     }
-    arrays = {f"curve {name}": values for name, values in summary.finished.curves.items()}
+    arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.finished.curves.items()}
     if own.costs is not None:
         arrays["costs"] = own.costs
     head = numpy.frombuffer(
@@ -274,7 +274,7 @@ def read_summary(path: Path, made_by: str) -> Summary | None:
             curves = {n.removeprefix("curve "): kept[n] for n in kept.files if n.startswith("curve ")}
             costs = kept["costs"] if "costs" in kept.files else None
             measures, further = (
-                [Measure(*m[:3], Estimate(*m[3]), m[4]) for m in words[name]]
+                [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[name]]
                 for name in ("measures", "further")
             )
             contender = Contender(words["name"], words["kind"], words["control"], measures, further, costs)
