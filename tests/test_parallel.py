@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import json
 import sys
 
 import numpy as np
@@ -247,7 +248,6 @@ def test_tuning_finds_the_same_values(two):
 
 
 def test_training_seeds_are_scored_the_same(two, tmp_path):
-    import json
     import shutil
 
     from filtergym.agents.learned_policy import PRETRAINED
@@ -290,3 +290,21 @@ def test_units_of_a_reproduction_stand_in_their_places(two):
     np.testing.assert_array_equal(one["few"][0], other["few"][0])
     for name, values in one["imm", 1][0]._asdict().items():
         np.testing.assert_array_equal(values, getattr(other["imm", 1][0], name))
+
+
+def test_training_seeds_trains_the_same_agents(command, tmp_path):
+    pytest.importorskip("torch")
+    pytest.importorskip("stable_baselines3")
+    words = ("train", ENV, "--algo", "bptt", "--steps", 400, "--envs", 4, "--seeds", "0-1", "--no-compare")
+    for jobs in (1, 2):
+        code, said, _ = command(*words, "--jobs", jobs, "--out", tmp_path / f"{jobs}" / "run")
+        assert code == 0
+        assert said.count("best agent in") == 2
+    for seed in (0, 1):
+        one, other = (
+            json.loads((tmp_path / f"{jobs}" / f"run-{seed}" / "run.json").read_text()) for jobs in (1, 2)
+        )
+        assert one["validation"] == other["validation"]
+    code, _, errors = command("train", ENV, "--jobs", 2, "--out", tmp_path / "single")
+    assert code == 2
+    assert "--jobs and --cluster share the runs of --seeds" in errors
