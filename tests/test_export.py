@@ -182,7 +182,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
 
 
 def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("filtergym.evaluation.dataset.MOST_BYTES", 1000)
+    monkeypatch.setattr("filtergym.commands.measure.MOST_BYTES", 1000)
     words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
     assert run(monkeypatch, *words) == 0
     assert not (tmp_path / "results.nc").exists()

@@ -68,8 +68,8 @@ def test_summaries_tell_what_the_evaluation_does(env, monkeypatch):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_from(records, curves, evaluation, ["ppo"])[0]
-    whole = benchmark.result_of(dataset, ["ppo"])[0]
+    result = benchmark.result_of(evaluation, records, curves, ["ppo"])
+    whole = benchmark.result_of(dataset, records, expected, ["ppo"])
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:

@@ -14,7 +14,7 @@ from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
-from ..evaluation.dataset import MOST_BYTES, fits_classic, notes_of, write_dataset
+from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
@@ -198,42 +198,33 @@ def evaluate_policies(
             names = [name for name in names if kind_of(competitor(cls.id, name)) in RANKED]
     check_names(cls, keywords)
     task = make_task(cls.id, control, flown, **keywords)
-    largest = len(set(names)) * episodes * task.horizon * len(task.components) * 8
+    measurements = len(set(names)) * episodes * task.horizon
+    errors = measurements * len(task.components) * 8
+    refusal = _unwritten(errors, errors, netcdf) if out is not None else "nobody asked"
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
-    everything = bool(task.flights) or estimates is not None or (out is not None and largest <= MOST_BYTES)
-    options: dict[str, Any] = {"trust": trust, "backend": backend, "threads": threads, **keywords}
+    everything = bool(task.flights) or estimates is not None or not refusal
+    of_all: Any = (cls.id, names, flown, episodes, seed, split, control)
     drawn = int(out is not None and estimates is None)
+    options: dict[str, Any] = {"trust": trust, "backend": backend, "threads": threads, **keywords}
+    options |= {"drawn_episodes": drawn}
+    curves = None
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
-        line = bar.add_task("evaluating", total=len(set(names)) * episodes * task.horizon)
+        line = bar.add_task("evaluating", total=measurements)
 
         def tick(done: int) -> None:
             bar.update(line, advance=done)
 
         if everything:
             dataset = evaluate(
-                cls.id,
-                names,
-                flown,
-                episodes,
-                seed,
-                split,
-                control,
-                progress=tick,
-                tracks=estimates is not None,
-                drawn_episodes=drawn,
-                workers=workers,
-                **options,
+                *of_all, progress=tick, tracks=estimates is not None, workers=workers, **options
             )
         else:
-            asked = asked_of(
-                cls.id, names, flown, episodes, seed, split, control, drawn_episodes=drawn, **options
-            )
-            found = dict(summaries(asked, workers, tick))
+            found = dict(summaries(asked_of(*of_all, **options), workers, tick))
     if everything:
-        records, curves = tidy_records(dataset), curves_of(dataset) if out is not None else None
+        records = tidy_records(dataset)
+        curves = None if out is None else curves_of(dataset)
     else:
-        records, curves, dataset = told_together([found[i] for i in range(len(asked))])
-    whole = everything and fits_classic(dataset)
+        records, curves, dataset = told_together([found[i] for i in range(len(found))])
     if estimates is not None:
         write_estimates(estimates, dataset)
     judged = dataset.attrs["truth"]
@@ -246,15 +237,15 @@ def evaluate_policies(
     if json is not None:
         write_records(json, [*records, *of_flights])
     whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
-    refusal = _unwritten(whole, netcdf)
-    if out is not None:
+    if not refusal:
+        refusal = _unwritten(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
+    if out is not None and curves is not None:
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
             records_as_csv(waiting / "records.csv", [*records, *of_flights])
             write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
             if not refusal:
                 write_dataset(waiting / "results.nc", whole)
-            assert curves is not None
             for name, figure in evaluation_figures(curves, columns, learned=learned):
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
@@ -277,16 +268,20 @@ def evaluate_policies(
         console.print(f"estimates in {estimates}", soft_wrap=True)
 
 
-def _unwritten(dataset: xarray.Dataset, asked: bool | None) -> str:
-    """Say why a dataset is not written as NetCDF; empty if it is."""
-    if not fits_classic(dataset):
+def _unwritten(size: int, largest: int, asked: bool | None) -> str:
+    """Say why a dataset of so many bytes, and so many in its largest variable, is no NetCDF file; empty if it is."""
+    if asked is False:
+        return "--no-netcdf"
+    if largest > MOST_BYTES:
         return (
             "it is too large for NetCDF's classic format. From Python, "
             "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
         )
-    if asked is None and dataset.nbytes > LARGE:
-        return f"it would have {dataset.nbytes / 1e6:,.0f} MB; --netcdf writes it"
-    return "" if asked is not False else "--no-netcdf"
+    return (
+        f"it would have more than {LARGE / 1e6:.0f} MB; --netcdf writes it"
+        if size > LARGE and not asked
+        else ""
+    )
 
 
 def record_scenario(
