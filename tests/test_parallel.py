@@ -7,6 +7,9 @@ import sys
 
 import numpy as np
 import pytest
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.catalogue import catalogue
 from filtergym.evaluation import parallel, summary
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.summary import summaries, told_together
@@ -55,12 +58,19 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
     assert tidy_records(one) == tidy_records(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
 
 
-@pytest.mark.parametrize("env", [ENV, RADAR])
-def test_summaries_tell_what_the_evaluation_does(env, monkeypatch):
-    names = NAMES if env == ENV else ["quasi-optimal", "joint-type", "known-class-bound", "ppo"]
-    dataset = evaluate(env, names, episodes=40, drawn_episodes=1)
-    asked = asked_of(env, names, episodes=40, drawn_episodes=1)
-    assert [one.episodes for one in asked] == [40] * len(names)
+@pytest.mark.parametrize("env", catalogue())
+def test_summaries_tell_what_the_evaluation_does(env):
+    """One after the other: also of those who lack what others have, as bounds, and estimators without a bank."""
+    known = baselines_of(env)
+    names = list(
+        dict.fromkeys(
+            [known.score_paper, *known.estimators, *known.references, *known.bounds, *shipped_agents(env)]
+        )
+    )
+    shorter = {} if env == ENV else {"horizon": 60}
+    dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
+    asked = asked_of(env, names, episodes=6, drawn_episodes=1, **shorter)
+    assert [one.episodes for one in asked] == [6] * len(names)
     found = dict(summaries(asked, Workers()))
     records, curves, evaluation = told_together([found[i] for i in range(len(names))])
     assert records == tidy_records(dataset)
@@ -68,8 +78,8 @@ def test_summaries_tell_what_the_evaluation_does(env, monkeypatch):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(evaluation, records, curves, ["ppo"])
-    whole = benchmark.result_of(dataset, records, expected, ["ppo"])
+    result = benchmark.result_of(evaluation, records, curves, shipped_agents(env))
+    whole = benchmark.result_of(dataset, records, expected, shipped_agents(env))
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
