@@ -81,6 +81,14 @@ class Summary(NamedTuple):
     episodes: int
 
 
+class Kept(NamedTuple):
+    """Where a summary waits for the rest."""
+
+    path: Path
+    made_by: str
+    """What it depends on, in words; one that depends on something else is made again."""
+
+
 class Part(NamedTuple):
     """Some episodes of one competitor."""
 
@@ -153,22 +161,49 @@ def _head(run: xarray.Dataset) -> xarray.Dataset:
 
 
 def summaries(
-    asked: Sequence[Asked], workers: Workers, progress: Progress | None = None
+    asked: Sequence[Asked],
+    workers: Workers,
+    progress: Progress | None = None,
+    kept: Sequence[Kept | None] = (),
 ) -> Iterator[tuple[int, Summary]]:
     """Summarise competitors, of any environments.
 
     Args:
-        asked: whom, over what.
+        asked: whom, over what; they are begun in this order.
         workers: who does it.
         progress: told of measurements done.
+        kept: where the summary of each waits, from which a second call takes it; None: it is not kept.
 
     Yields:
-        Place among what was asked, and its summary, as they are finished.
+        Number of a competitor among them and its summary, as they are finished.
+
+    Raises:
+        ValueError: if a competitor cannot be sent to another process, or a file not be written; and as
+            :func:`.evaluate.evaluate`.
     """
+    places = list(kept) or [None] * len(asked)
+    missing = []
+    for i, (one, place) in enumerate(zip(asked, places, strict=True)):
+        found = None if place is None else read_summary(*place)
+        if found is None:
+            missing.append(i)
+            continue
+        if progress is not None:
+            progress(one.measurements)
+        yield i, found
+    for i, found in _summarised(asked, missing, workers, progress):
+        if (place := places[i]) is not None:
+            write_summary(place.path, found, place.made_by)
+        yield i, found
+
+
+def _summarised(
+    asked: Sequence[Asked], missing: Sequence[int], workers: Workers, progress: Progress | None
+) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
-        for one in asked:
-            check_sendable(one.environment, {one.name: one.maker})
-    pieces = [(i, piece) for i, one in enumerate(asked) for piece in one.pieces()]
+        for i in missing:
+            check_sendable(asked[i].environment, {asked[i].name: asked[i].maker})
+    pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
     work = [piece for _, piece in pieces]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}
     added: dict[int, Part] = {}

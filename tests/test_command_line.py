@@ -167,24 +167,27 @@ def test_a_mistake_ends_the_process(tmp_path):
 
 
 def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
+    from filtergym.evaluation import summary
+
     from filtergym.reports import benchmark
 
     cells = [benchmark.Cell(ENV, scenario, 20, ("imm", "known-turn")) for scenario in ("paper", "random")]
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
     ran = []
-    original = benchmark.summaries
+    original = summary.summarise
 
-    def interrupted(asked, workers, progress):
-        for i, summary in original(asked, workers, progress):
-            ran.append((asked[i].scenario, asked[i].name))
-            yield i, summary
-            if len(ran) == 3:
-                raise KeyboardInterrupt
+    def interrupted(asked, tick):
+        if len(ran) == 3 and not resumed:
+            raise KeyboardInterrupt
+        ran.append((asked.scenario, asked.name))
+        return original(asked, tick)
 
-    monkeypatch.setattr(benchmark, "summaries", interrupted)
+    resumed = False
+    monkeypatch.setattr(summary, "summarise", interrupted)
     with pytest.raises(KeyboardInterrupt):
         benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
     assert not (tmp_path / "parts" / "results.json").exists()
+    resumed = True
     results = benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
     assert ran == [(cell.scenario, name) for cell in cells for name in cell.policies]
     assert [result.scenario for result in results] == ["paper", "random"]

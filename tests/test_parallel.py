@@ -4,6 +4,7 @@ import importlib
 import inspect
 import json
 import sys
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -17,12 +18,11 @@ from filtergym.evaluation.summary import summaries, told_together
 import filtergym
 from filtergym import evaluate, tidy_records
 from filtergym.names import asked_of
-from filtergym.reports import benchmark
+from filtergym.reports import benchmark, waiting
 
 ENV = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"
 NAMES = ["imm", "imm-tuned", "known-turn", "known-input-bound", "ppo"]
-assert filtergym
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +129,48 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     for folder, workers in (("one", None), ("two", two)):
         benchmark.run_benchmark(tmp_path / folder, False, 0, workers=workers)
     assert (tmp_path / "one/results.json").read_bytes() == (tmp_path / "two/results.json").read_bytes()
+
+
+def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatch):
+    """What is done is not done again, unless something that it depends on has changed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("filtergym.commands.measure.LARGE", 1)  # too large for results.nc
+    words = ("evaluate", ENV, "--policy", "imm", "--policy", "known-turn", "--episodes", 4, "--out", "out")
+    assert command(*words)[0] == 0
+    whole = (tmp_path / "out/records.json").read_text()
+    assert not (tmp_path / "out/unfinished").exists()
+
+    done = []
+    summarise = summary.summarise
+
+    def ending(asked, tick):
+        done.append(asked.name)
+        if asked.name == "known-turn" and len(done) == 2:
+            raise KeyboardInterrupt
+        return summarise(asked, tick)
+
+    monkeypatch.setattr(summary, "summarise", ending)
+    with suppress(KeyboardInterrupt):
+        assert command(*words)[0] != 0
+    assert [path.name for path in (tmp_path / "out/unfinished").iterdir()] == [
+        "ManeuveringTarget-v0.default.4.test0.imm.npz"
+    ]
+    assert command(*words)[0] == 0
+    assert done == ["imm", "known-turn", "known-turn"]
+    assert (tmp_path / "out/records.json").read_text() == whole
+
+
+def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
+    [asked] = asked_of(ENV, ["imm-tuned"], episodes=4)
+    kept = waiting.kept_in(tmp_path, asked)
+    [(_, found)] = summaries([asked], Workers(), None, [kept])
+    assert summary.read_summary(*kept).contender.measures == found.contender.measures
+    assert waiting.kept_in(tmp_path, asked) == kept
+    for other in (asked._replace(keywords={"horizon": 50}), asked._replace(backend="numpy")):
+        assert summary.read_summary(*waiting.kept_in(tmp_path, other)) is None
+    monkeypatch.setattr(waiting, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
+    assert summary.read_summary(*waiting.kept_in(tmp_path, asked)) is None
+    assert waiting.kept_in(tmp_path, asked._replace(name="mine.py:Mine")) is None
 
 
 def test_an_error_elsewhere_is_the_same_sentence(two):
@@ -255,6 +297,32 @@ def test_tuning_finds_the_same_values(two):
     budget = 2 * (4 * len(tunable.limits) + 4) * 40 * 100
     asked = (ENV, "imm", tunable, budget, None, 0, 40)
     assert tune(*asked) == tune(*asked, workers=two)
+
+
+def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
+    from filtergym.baselines import tuning
+
+    tunable = baselines_of(ENV).tunable["imm"]
+    budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
+    asked = (ENV, "imm", tunable, budget, None, 0, 8)
+    whole = tuning.tune(*asked)
+    calls, own = [], tuning.mean_cost
+
+    def counted(*arguments):
+        calls.append(arguments)
+        if len(calls) == 10:
+            raise KeyboardInterrupt
+        return own(*arguments)
+
+    monkeypatch.setattr(tuning, "mean_cost", counted)
+    place = tmp_path / "costs.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        tuning.tune(*asked, waiting=place)
+    with place.open("a") as file:
+        file.write('{"half')  # what a crash may leave
+    assert tuning.tune(*asked, waiting=place) == whole
+    assert len(calls) == 10 + (whole.environment_steps // 800 - 9) + 2
+    assert not place.exists()
 
 
 def test_training_seeds_are_scored_the_same(two, tmp_path):

@@ -65,6 +65,7 @@ def tune_policy(
             progress=lambda steps: bar.update(line, advance=steps),
             backend=backend,
             workers=workers,
+            waiting=table.with_name(f"{table.stem}.{policy}.unfinished"),
         )
     command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)

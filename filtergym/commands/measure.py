@@ -31,6 +31,7 @@ from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
 from ..reports.tables import flights_table, recorded_table, results_tables
+from ..reports.waiting import UNFINISHED, kept_in, remove
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -207,7 +208,7 @@ def evaluate_policies(
     drawn = int(out is not None and estimates is None)
     options: dict[str, Any] = {"trust": trust, "backend": backend, "threads": threads, **keywords}
     options |= {"drawn_episodes": drawn}
-    curves = None
+    curves, kept = None, []
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
 
@@ -219,7 +220,9 @@ def evaluate_policies(
                 *of_all, progress=tick, tracks=estimates is not None, workers=workers, **options
             )
         else:
-            found = dict(summaries(asked_of(*of_all, **options), workers, tick))
+            asked = asked_of(*of_all, **options)
+            kept = [None if out is None else kept_in(out / UNFINISHED, one) for one in asked]
+            found = dict(summaries(asked, workers, tick, kept))
     if everything:
         records = tidy_records(dataset)
         curves = None if out is None else curves_of(dataset)
@@ -252,6 +255,7 @@ def evaluate_policies(
             if judged:
                 result, made = result_of(dataset, records, curves, learned), settings_of(command_line())
                 write_results(waiting / RESULTS, [result], made)
+        remove(out / UNFINISHED, [place.path for place in kept if place is not None])
     for table in tables:
         console.print(table)
     for note in notes_of(dataset):

@@ -18,7 +18,7 @@ from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers
-from ..evaluation.summary import Asked, Summary, read_summary, summaries, told_together, write_summary
+from ..evaluation.summary import Asked, Summary, summaries, told_together
 from ..names import asked_of
 from .results import (
     RESULTS,
@@ -31,6 +31,7 @@ from .results import (
     track_of,
     write_results,
 )
+from .waiting import UNFINISHED, kept_in, remove, stem_of
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
@@ -183,21 +184,20 @@ def run_benchmark(
     """
     wanted = cells(full, environments, split)
     settings = settings_of(command)
-    unfinished = writable_folder(folder / "unfinished")
-    stems = [f"{cell.name}.{cell.episodes}.{split}{seed}" for cell in wanted]
+    unfinished = writable_folder(folder / UNFINISHED)
+    stems = [stem_of(cell.environment, cell.scenario, cell.episodes, split, seed) for cell in wanted]
     waiting = [unfinished / f"{stem}.json" for stem in stems]
     writable_file(folder / RESULTS)
     tick = started(sum(cell.measurements for cell in wanted))
     results = [_waiting_result(path, cell) for cell, path in zip(wanted, waiting, strict=True)]
-    made_by = f"{settings.versions} {backend} {threads}"
-    # What is asked for, the cell that it belongs to, and the file that keeps it.
-    asked: list[tuple[Asked, int, Path]] = []
-    kept: list[dict[str, Summary]] = [{} for _ in wanted]
-    for i, (cell, stem) in enumerate(zip(wanted, stems, strict=True)):
+    # What is asked for, and the cell that it belongs to.
+    asked: list[tuple[Asked, int]] = []
+    found: list[dict[str, Summary]] = [{} for _ in wanted]
+    for i, cell in enumerate(wanted):
         if results[i] is not None:
             tick(cell.measurements)
             continue
-        for one in asked_of(
+        everyone = asked_of(
             cell.environment,
             cell.policies,
             cell.scenario,
@@ -207,30 +207,23 @@ def run_benchmark(
             drawn_episodes=1,
             backend=backend,
             threads=threads,
-        ):
-            place = unfinished / f"{stem}.{one.name}.npz"
-            found = read_summary(place, made_by)
-            if found is None:
-                asked.append((one, i, place))
-            else:
-                kept[i][one.name] = found
-                tick(one.measurements)
+        )
+        asked += [(one, i) for one in everyone]
     told = 0
 
     def settle(i: int) -> None:
         """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
         nonlocal told
         cell = wanted[i]
-        if results[i] is None and len(kept[i]) == len(cell.policies):
-            everyone = [kept[i].pop(name) for name in cell.policies]
+        if results[i] is None and len(found[i]) == len(cell.policies):
+            everyone = [found[i].pop(name) for name in cell.policies]
             records, curves, head = told_together(everyone)
             result = result_of(head, records, curves, shipped_agents(cell.environment))
             drawn(cell, curves)
             write_results(waiting[i], [result], settings)
             results[i] = result
         if results[i] is not None:
-            for name in cell.policies:
-                (unfinished / f"{stems[i]}.{name}.npz").unlink(missing_ok=True)
+            remove(unfinished, [unfinished / f"{stems[i]}.{name}.npz" for name in cell.policies])
         while told < len(results) and (due := results[told]) is not None:
             finished(due)
             told += 1
@@ -242,18 +235,15 @@ def run_benchmark(
         asked.sort(
             key=lambda one: -one[0].measurements * baselines_of(one[0].environment).measurement_seconds
         )
-    for k, summary in summaries([one for one, *_ in asked], workers, tick):
-        one, i, place = asked[k]
-        kept[i][one.name] = summary
-        write_summary(place, summary, made_by)
+    kept = [kept_in(unfinished, one) for one, _ in asked]
+    for k, summary in summaries([one for one, _ in asked], workers, tick, kept):
+        one, i = asked[k]
+        found[i][one.name] = summary
         settle(i)
     done = [result for result in results if result is not None]
     write_results(folder / RESULTS, done, settings)
     # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
-    for path in waiting:
-        path.unlink(missing_ok=True)
-    if not any(unfinished.iterdir()):
-        unfinished.rmdir()
+    remove(unfinished, waiting)
     return done
 
 
