@@ -302,6 +302,23 @@ def tuned_names(id: str) -> list[str]:
     ]
 
 
+def best_tuned_policy(id: str, control: str | None = None) -> str | None:
+    """Return ``NAME-tuned`` of the policy that cost least on the validation split; None if none was tuned.
+
+    Args:
+        id: environment id.
+        control: only policies of this control; estimators have none and are left out anyway.
+    """
+    found: dict[str, float] = {}
+    for policy, tunable in baselines_of(id).tunable.items():
+        if tunable.control is None or control not in (None, tunable.control):
+            continue
+        entry = next((table[policy] for table in map(read_table, _places(id)) if policy in table), None)
+        if entry is not None:
+            found[f"{policy}-tuned"] = entry.get("validation_cost", math.inf)
+    return min(found, key=lambda name: found[name], default=None)
+
+
 def _places(id: str) -> list[Any]:
     """Files of tuned values, one's own first."""
     package = package_of(id)

@@ -81,7 +81,8 @@ def append_line(path: Path, line: str) -> None:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """Give a new folder whose files go into another one together, when all of them are complete.
+    """Give a new folder whose files go into another one together, when all of them are complete; those of its folders
+    into the same ones there.
 
     Raises:
         ValueError: if they cannot be written.
@@ -92,11 +93,12 @@ def whole_files(folder: Path) -> Iterator[Path]:
         tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-", ignore_cleanup_errors=True) as waiting,
     ):
         yield Path(waiting)
-        complete = list(Path(waiting).iterdir())
-        for path in complete:
-            writable_file(folder / path.name)
-        for path in complete:
-            path.replace(folder / path.name)
+        complete = [path for path in Path(waiting).rglob("*") if path.is_file()]
+        places = [folder / path.relative_to(waiting) for path in complete]
+        for place in places:
+            writable_file(place)
+        for path, place in zip(complete, places, strict=True):
+            path.replace(place)
 
 
 def _beside(folder: Path) -> tuple[Path, Path]:

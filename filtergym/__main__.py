@@ -20,6 +20,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
     "evaluate": measure.evaluate_policies,
     "record": measure.record_scenario,
+    "offline": measure.write_offline,
     "benchmark": measure.benchmark,
     "report": report.make,
     "comparison": report.comparison_page,

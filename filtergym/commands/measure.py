@@ -8,7 +8,14 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
-from ..envs.catalogue import catalogue, check_names, make_task, read_recording, task_class
+from ..envs.catalogue import (
+    catalogue,
+    check_names,
+    make_task,
+    parameter_names,
+    read_recording,
+    task_class,
+)
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
@@ -24,13 +31,14 @@ from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..evaluation.summary import summaries, told_together
 from ..names import asked_of, competitor, evaluate, is_learned, tidy_records
+from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
-from ..reports.tables import flights_table, recorded_table, results_tables
+from ..reports.tables import datasets_table, flights_table, recorded_table, results_tables
 from ..reports.waiting import UNFINISHED, kept_in, remove
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
@@ -50,6 +58,7 @@ from .terminal import (
     complete_environment,
     complete_policy,
     console,
+    one_of,
     pair,
     parsed_settings,
     progress_bar,
@@ -327,6 +336,74 @@ def record_scenario(
     with whole_file(out) as waiting:
         recording.write(waiting)
     console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
+
+
+def write_offline(
+    environment: Environment,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Policy, one data set each; repeat for several; default: the paper's, the best tuned one, and random "
+            "actions. Also a file, the folder of a training run, or module:Class.",
+            autocompletion=complete_policy,
+        ),
+    ] = None,
+    scenario: ScenarioName = None,
+    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    episodes: Annotated[int, typer.Option(help="Episodes in each data set.")] = 1000,
+    seed: Experiment = 0,
+    split: Annotated[
+        str,
+        typer.Option(
+            help="train, validation or test; only test takes held-out scenarios and flights of your own.",
+            autocompletion=one_of("train", "validation", "test"),
+        ),
+    ] = "train",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Parameter of the task, reward or dtype, name=value; repeat for several."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of data sets; default: where Minari keeps them.")
+    ] = None,
+    namespace: Annotated[
+        str | None,
+        typer.Option(help="What names begin with; default: filtergym/maneuvering-target and the like."),
+    ] = None,
+    trust: Trust = False,
+) -> None:
+    """Write episodes of policies as Minari data sets, to learn from without an environment (with filtergym[offline]).
+
+    Random actions are drawn in the environment of the policy named before them. Data sets of the same control and
+    parameters can be combined.
+
+    Example: filtergym offline filtergym/ManeuveringTarget-v0 --policy imm --policy random --episodes 500
+    """
+    cls = task_class(environment)
+    keywords = parsed_settings(settings or [])
+    policies = policy or default_policies(cls.id, control)
+    known = parameter_names(cls)
+    task = make_task(cls.id, None, scenario, **{n: value for n, value in keywords.items() if n in known})
+    with progress_bar() as bar:
+        total = len(policies) * episodes * (task.horizon // task.decision_interval)
+        line = bar.add_task("recording", total=total)
+        written = write_datasets(
+            cls.id,
+            policies,
+            scenario,
+            control,
+            episodes,
+            seed,
+            split,
+            out,
+            namespace,
+            progress=lambda done: bar.update(line, advance=done),
+            trust=trust,
+            **keywords,
+        )
+    console.print(datasets_table(written))
+    place = f", with MINARI_DATASETS_PATH={out}" if out is not None else ""
+    console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
 
 
 def benchmark(

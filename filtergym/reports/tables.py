@@ -15,6 +15,7 @@ from ..baselines.catalogue import baselines_of
 from ..baselines.reproduction import Grid, Reproduction
 from ..baselines.tuning import Tuned
 from ..evaluation.competitors import RANKED
+from ..offline import Written
 
 NARROW, WIDE = 24, 44
 """Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
@@ -341,6 +342,19 @@ def tuned_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     for name, value in outcome.values.items():
         table.add_row(name, f"{start[name]:g}", f"{value:g}")
     table.add_row("validation cost", f"{outcome.untuned_cost:.4g}", f"{outcome.cost:.4g}")
+    return table
+
+
+def datasets_table(written: Iterable[Written]) -> Table:
+    """Return what data sets hold; those whose environments are the same can be combined."""
+    table = Table("data set", "environment")
+    for title in ("episodes", "steps", "mean return"):
+        table.add_column(title, justify="right")
+    for entry in written:
+        made_with = ", ".join(f"{name}={value}" for name, value in entry.environment.items())
+        table.add_row(
+            entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"
+        )
     return table
 
 

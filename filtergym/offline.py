@@ -1,0 +1,267 @@
+"""Offline data: episodes of policies as Minari data sets, to learn from without an environment.
+
+A data set holds the episodes of one policy in one environment: observations, actions and rewards exactly as
+``gymnasium.make`` gives them, and of every episode its seed. ``minari.load_dataset`` reads it, and
+``recover_environment()`` of what it returns makes the environment again.
+"""
+
+import os
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from . import __version__
+from .agents.training_run import training_scenarios
+from .baselines.catalogue import baselines_of
+from .baselines.tuning import best_tuned_policy
+from .envs.catalogue import check_names, find_scenario, task_class
+from .evaluation.files import whole_files
+from .evaluation.rollout import Progress
+from .evaluation.seeds import episode_seeds
+from .evaluation.stepping import SteppingPolicy
+from .evaluation.transitions import Transitions, transitions_of
+from .names import competitor, make_policy
+
+CHUNK = 256
+"""Episodes flown side by side, and held in memory until they are written."""
+RANDOM = "random"
+OF_THE_FACE = ("reward", "dtype")
+"""Keywords of ``gymnasium.make`` that are no parameters of the task, and change what an agent is given."""
+
+
+class Written(NamedTuple):
+    """A data set that was written."""
+
+    name: str
+    """For ``minari.load_dataset``."""
+    policy: str
+    environment: dict[str, Any]
+    """Keywords of ``gymnasium.make``; data sets of the same ones can be combined."""
+    episodes: int
+    steps: int
+    mean_return: float
+    """Mean over the episodes of the sum of their rewards."""
+
+
+def default_policies(env: str, control: str | None = None) -> list[str]:
+    """Return the names of the paper's policy, of the tuned one that costs least, and of random actions.
+
+    Args:
+        env: environment id.
+        control: leave out those that do not act in it.
+    """
+    id = task_class(env).id
+    paper = baselines_of(id).score_paper
+    names = [paper, best_tuned_policy(id, control), RANDOM]
+    if paper and control not in (None, competitor(id, paper).control):
+        names.remove(paper)
+    return list(dict.fromkeys(name for name in names if name))
+
+
+def write_datasets(
+    env: str,
+    policies: Sequence[str | Path] | None = None,
+    scenario: Any = None,
+    control: str | None = None,
+    episodes: int = 1000,
+    seed: int = 0,
+    split: str = "train",
+    folder: Path | None = None,
+    namespace: str | None = None,
+    progress: Progress | None = None,
+    *,
+    trust: bool = False,
+    **keywords: Any,
+) -> list[Written]:
+    """Write the episodes of policies as Minari data sets, one for each policy.
+
+    A policy acts in its own control and with its own parameters, which its environment is made with. One that has no
+    control of its own, such as ``random``, acts in the environment of the policy named before it: these two data sets
+    can be combined. All policies meet the same episodes. Where random actions are among the data sets of an
+    environment, their mean return is its ``ref_min_score`` and the largest one its ``ref_max_score``.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        policies: names or paths, see :func:`.names.competitor`; default: :func:`default_policies`.
+        scenario: of the environment; default: its training distribution.
+        control: demand this control of all policies.
+        episodes: in each data set.
+        seed: number of the experiment.
+        split: "train" (default), "validation" or "test"; held-out scenarios, and flights of one's own, take "test".
+        folder: where data sets are kept; default: where Minari keeps them, ``MINARI_DATASETS_PATH`` or
+            ``~/.minari/datasets``.
+        namespace: that the names begin with; default: ``filtergym/maneuvering-target`` and the like.
+        progress: called with the number of decisions done, now and then.
+        trust: load a model's zip, which can execute code.
+        **keywords: parameters of the task; also ``reward`` and ``dtype`` of ``gymnasium.make``.
+
+    Returns:
+        What was written, in the order of the policies.
+
+    Raises:
+        ValueError: for unknown names, what does not act, a scenario that is held out, a data set that is there already,
+            a folder that cannot be written to, or without Minari. Then nothing is written.
+    """
+    try:
+        import h5py  # noqa: F401  (Minari says what it lacks only when it writes)
+        from minari.storage import get_dataset_path
+    except ImportError as error:
+        raise ValueError(
+            f"Minari data sets need more packages: pip install 'filtergym[offline]' ({error})"
+        ) from error
+    cls = task_class(env)
+    asked = list(policies or default_policies(cls.id, control))
+    chosen = [str(policy) for policy in asked]
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    seeds = episode_seeds(split, seed, episodes)
+    if split != "test":
+        try:
+            training_scenarios(cls, cls.default_scenario if scenario is None else scenario)
+        except ValueError as error:
+            raise ValueError(f"{error}, or take the split test for data to be judged on") from error
+    of_the_face = {name: keywords.pop(name) for name in OF_THE_FACE if name in keywords}
+    check_names(cls, keywords, OF_THE_FACE)
+    root = Path(folder) if folder is not None else get_dataset_path()
+    names = _names(cls.id, chosen, namespace, root)
+    acting: list[SteppingPolicy] = []
+    for policy in asked:
+        before = acting[-1] if acting and _suits_any(competitor(cls.id, policy, trust=trust)) else None
+        own = before.control if before is not None and control is None else control
+        theirs = {} if before is None else before.task_keywords
+        acting.append(make_policy(cls.id, policy, own, scenario, trust=trust, **{**theirs, **keywords}))
+    story = (
+        f"scenario {find_scenario(cls, scenario).name}, {split} split, seed {seed}; filtergym {__version__}"
+    )
+    with whole_files(root) as waiting, _datasets_in(waiting):
+        written: list[Written] = []
+        stored: list[Any] = []
+        for name, policy, stepping in zip(names, chosen, acting, strict=True):
+            made_with = {**stepping.keywords, **of_the_face}
+            dataset: Any = None
+            returns: list[float] = []
+            for first in range(0, episodes, CHUNK):
+                part = transitions_of(
+                    cls.id,
+                    stepping,
+                    seeds[first : first + CHUNK],
+                    progress or (lambda _: None),
+                    **of_the_face,
+                )
+                returns += [float(episode.rewards.sum()) for episode in part]
+                if dataset is None:
+                    about = f"{episodes} episodes of policy {policy}, control {stepping.control}, {story}"
+                    dataset = _created(name, part, gymnasium.make(cls.id, **made_with), policy, about)
+                else:
+                    dataset.update_dataset_from_buffer(_buffers(part))
+            mean = sum(returns) / episodes
+            written.append(Written(name, policy, made_with, episodes, dataset.total_steps, mean))
+            stored.append(dataset)
+        _tell_scores(written, stored)
+        for about in waiting.rglob("namespace_metadata.json"):
+            if (root / about.relative_to(waiting)).exists():  # it may say what the user has written there
+                about.unlink()
+    return written
+
+
+def _suits_any(maker: Any) -> bool:
+    """Whether a policy has no control of its own."""
+    return getattr(maker, "control", None) is None and getattr(maker, "action_space", None) is None
+
+
+def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) -> list[str]:
+    """Name the data sets of policies.
+
+    Raises:
+        ValueError: for a namespace that is none, and if a data set has one of the names.
+    """
+    from minari.dataset.minari_dataset import parse_dataset_id
+
+    owner, _, title = id.partition("/")
+    title, _, version = title.rpartition("-v")
+    if namespace is None:
+        namespace = f"{owner}/{_worded(re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '-', title).lower())}"
+    names = [f"{namespace}/{_worded(policy)}-v{version}" for policy in policies]
+    for i, name in enumerate(names):
+        parse_dataset_id(name)
+        if name in names[:i]:
+            raise ValueError(f"two policies make data sets of the name {name!r}: write them one by one")
+        if (root / name).exists():
+            raise ValueError(
+                f"data set {name!r} is in {root} already: remove it, or choose another namespace"
+            )
+    return names
+
+
+def _worded(text: str) -> str:
+    """Letters, digits and hyphens, which Minari takes for a name."""
+    return re.sub(r"[^\w-]+", "-", text).strip("-")
+
+
+@contextmanager
+def _datasets_in(folder: Path) -> Iterator[None]:
+    """Let Minari keep its data sets in a folder; it asks the environment variable every time."""
+    variable = "MINARI_DATASETS_PATH"
+    before = os.environ.get(variable)
+    os.environ[variable] = str(folder.absolute())
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[variable]
+        else:
+            os.environ[variable] = before
+
+
+def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
+    """Episodes in Minari's form."""
+    from minari.data_collector import EpisodeBuffer
+
+    return [
+        EpisodeBuffer(
+            seed=episode.seed,
+            observations=episode.observations,
+            actions=episode.actions,
+            rewards=episode.rewards,
+            terminations=numpy.zeros_like(episode.truncations),
+            truncations=episode.truncations,
+        )
+        for episode in episodes
+    ]
+
+
+def _created(name: str, episodes: Sequence[Transitions], env: Any, policy: str, about: str) -> Any:
+    """Make a Minari data set of its first episodes."""
+    import minari
+
+    with warnings.catch_warnings():
+        # It asks for the address of an author and a link to code, which the data of a simulation need not have.
+        warnings.filterwarnings("ignore", r"`(author_email|code_permalink)` is set to None", UserWarning)
+        return minari.create_dataset_from_buffers(
+            name,
+            _buffers(episodes),
+            env=env,
+            eval_env=env,
+            algorithm_name=policy,
+            author="filtergym",
+            description=about,
+            requirements=[f"filtergym>={__version__}"],
+            data_format="hdf5",
+        )
+
+
+def _tell_scores(written: Sequence[Written], stored: Sequence[Any]) -> None:
+    """Say which mean return is 0 and which is 1 in ``minari.get_normalized_score``, where both are known."""
+    for entry, dataset in zip(written, stored, strict=True):
+        alike = [other for other in written if other.environment == entry.environment]
+        low = next((other.mean_return for other in alike if other.policy == RANDOM), None)
+        high = max(other.mean_return for other in alike)
+        if low is not None and low < high:
+            scores = {"ref_min_score": low, "ref_max_score": high}
+            dataset.storage.update_metadata({**scores, "num_episodes_average_score": entry.episodes})
