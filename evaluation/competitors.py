@@ -8,7 +8,7 @@ nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, 
 """
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Protocol, get_args
 
 import numpy
@@ -138,10 +138,17 @@ class FunctionPolicy(Policy):
     Args:
         function: given observations ``(N, fields)``, returns actions, batch first, as an array or a tensor on the CPU.
         control: that the actions are meant for; default: the environment's first.
+        task_keywords: parameters of the task that it acts with, as :attr:`.SteppingPolicy.task_keywords` of the policy
+            that it is a copy of; default: none but those of the evaluation.
     """
 
-    def __init__(self, function: Callable[[numpy.ndarray], Any], control: str | None = None) -> None:
-        self.function = function
+    def __init__(
+        self,
+        function: Callable[[numpy.ndarray], Any],
+        control: str | None = None,
+        task_keywords: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.function, self.task_keywords = function, dict(task_keywords or {})
         if control is not None:
             self.control = control  # type: ignore[misc]  # of the function, not of the class
 
