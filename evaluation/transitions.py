@@ -47,10 +47,10 @@ def transitions_of(
     Returns:
         Of every episode what ``gymnasium.make`` with the same keywords gives, bit for bit.
     """
-    envs = gymnasium.make_vec(id, num_envs=len(seeds), **policy.keywords, **keywords)
+    envs: Any = gymnasium.make_vec(id, num_envs=len(seeds), **policy.keywords, **keywords)
     observation, _ = envs.reset(seed=list(seeds))
     memory = policy.begin(seeds)
-    observations, actions, rewards, truncations = [observation], [], [], []
+    kept: list[list[numpy.ndarray]] = [[observation], [], [], []]
     finished = numpy.zeros(len(seeds), dtype=bool)
     while (
         not finished.all()
@@ -58,23 +58,17 @@ def transitions_of(
         action, memory = policy.predict(observation, memory)
         action = member(envs.single_action_space, action)
         observation, reward, _, truncated, _ = envs.step(action)
-        for kept, values in (
-            (observations, observation),
-            (actions, action),
-            (rewards, reward),
-            (truncations, truncated),
-        ):
-            kept.append(values)
+        for values, latest in zip(kept, (observation, action, reward, truncated), strict=True):
+            values.append(latest)
         finished |= truncated
         tick(len(seeds))
-    lengths = numpy.argmax(truncations, axis=0) + 1
-    arrays = [numpy.stack(kept, axis=1) for kept in (observations, actions, rewards, truncations)]
-    return [
-        Transitions(
-            seed, *(array[i, : length + extra] for array, extra in zip(arrays, (1, 0, 0, 0), strict=True))
-        )
-        for i, (seed, length) in enumerate(zip(seeds, lengths, strict=True))
-    ]
+    observations, actions, rewards, truncations = (numpy.stack(values, axis=1) for values in kept)
+    found = []
+    for i, seed in enumerate(seeds):
+        T = int(numpy.argmax(truncations[i])) + 1
+        parts = observations[i, : T + 1], actions[i, :T], rewards[i, :T], truncations[i, :T]
+        found.append(Transitions(seed, *parts))
+    return found
 
 
 def member(space: gymnasium.Space, action: numpy.ndarray) -> numpy.ndarray:

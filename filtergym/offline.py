@@ -59,7 +59,8 @@ def default_policies(env: str, control: str | None = None) -> list[str]:
     id = task_class(env).id
     paper = baselines_of(id).score_paper
     names = [paper, best_tuned_policy(id, control), RANDOM]
-    if paper and control not in (None, competitor(id, paper).control):
+    own = getattr(competitor(id, paper), "control", None) if paper else None
+    if own is not None and control not in (None, own):
         names.remove(paper)
     return list(dict.fromkeys(name for name in names if name))
 
@@ -164,9 +165,9 @@ def write_datasets(
             written.append(Written(name, policy, made_with, episodes, dataset.total_steps, mean))
             stored.append(dataset)
         _tell_scores(written, stored)
-        for about in waiting.rglob("namespace_metadata.json"):
-            if (root / about.relative_to(waiting)).exists():  # it may say what the user has written there
-                about.unlink()
+        for space in waiting.rglob("namespace_metadata.json"):
+            if (root / space.relative_to(waiting)).exists():  # it may say what the user has written there
+                space.unlink()
     return written
 
 
