@@ -27,6 +27,7 @@ actions = torch.tensor(np.concatenate([e.actions for e in episodes]))
 print(f"{dataset.total_episodes} episodes, {dataset.total_steps} steps of", dataset.env_spec.kwargs)
 
 torch.manual_seed(0)
+torch.set_num_threads(1)  # so small a network is slower on more
 actor = nn.Sequential(
     nn.Linear(observations.shape[1], 64),
     nn.ReLU(),
