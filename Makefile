@@ -1,5 +1,7 @@
 # Two commands do everything on a machine with Python >= 3.11: `make benchmark` and `make test`.
 PYTHON ?= python3
+# Processes of `make benchmark`; each takes up to half a GB.
+JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := docs/conf.py filtergym compiler filters envs evaluation baselines agents tests benchmarks
@@ -23,10 +25,10 @@ SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py 
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-lowest test-pythons distributions check format docs clean
+.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
-	$(BIN)/filtergym benchmark
+	$(BIN)/filtergym benchmark --jobs $(JOBS)
 
 test: $(VENV)/.dev  ## run the whole test suite
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
@@ -44,6 +46,13 @@ test-lowest:  ## core tests with the lowest versions that pyproject.toml declare
 	$(PYTHON) -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
 	  print('\n'.join(project['dependencies']).replace('>=', '=='))" > build/lowest.txt
 	$(MAKE) core-tests ENVIRONMENT=lowest VERSIONS=build/lowest.txt
+
+test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages change what others import
+	$(PYTHON) -m venv build/cluster
+	$(BIN)/python -c "import sysconfig; print(f'import site; site.addsitedir({sysconfig.get_path(\"purelib\")!r})')" \
+	  > $$(echo build/cluster/lib/python*/site-packages)/beneath.pth
+	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[cluster]"
+	OMP_NUM_THREADS=1 build/cluster/bin/python -m pytest tests/test_parallel.py -k cluster
 
 test-pythons:  ## core tests with every newer Python that is found
 	@for version in 3.12 3.13; do \
