@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..evaluation.competitors import Policy
+from ..evaluation.own_metrics import OwnMetrics
 from .alarm import Alarm
 
 
@@ -52,8 +53,8 @@ class Baselines:
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     best_constant: str = ""
     """The tunable policy that stands for the best constant action in the room table."""
-    metrics: Callable[[Any, Any], list[Any]] | None = None
-    """The environment's own metrics: from one policy's dataset and a ``Bootstrap`` to ``Measure`` tuples."""
+    metrics: OwnMetrics | None = None
+    """The environment's own."""
 
     alarm: Callable[[Any], Alarm] | None = None
     """Class that says from observations that something is wrong, for any control; None: the general one."""

@@ -16,7 +16,7 @@ too narrow.
 
 import copy
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -105,6 +105,11 @@ class Bootstrap:
         """Share of some episodes, ``(1 + resamples, some)``."""
         return self.counts[:, episodes] / self.totals[:, None]
 
+    def by_resamples(self, order: numpy.ndarray) -> Iterator[numpy.ndarray]:
+        """Share of the episodes in an order, ``(some, episodes)``, of the data and some resamples after the other."""
+        for i in range(0, len(self.counts), BLOCK // 64):
+            yield self.counts[i : i + BLOCK // 64, order] / self.totals[i : i + BLOCK // 64, None]
+
     def sums(self, values: numpy.ndarray, first: int = 0) -> Sums:
         """Add up what some episodes contribute to :meth:`means`.
 
@@ -143,11 +148,11 @@ class Bootstrap:
             values: one for each episode, ``(episodes,)``.
         """
         order = numpy.argsort(values)
-        found = []
-        for i in range(0, len(self.counts), BLOCK // 64):
-            # The smallest value that at least half of the sample does not exceed; a little off for rounding.
-            weights = self.counts[i : i + BLOCK // 64, order] / self.totals[i : i + BLOCK // 64, None]
-            found.append((numpy.cumsum(weights, axis=1) >= 0.5 - 1e-9).argmax(axis=1))
+        # The smallest value that at least half of the sample does not exceed; a little off for rounding.
+        found = [
+            (numpy.cumsum(weights, axis=1) >= 0.5 - 1e-9).argmax(axis=1)
+            for weights in self.by_resamples(order)
+        ]
         return values[order][numpy.concatenate(found)]
 
     def interval(self, statistics: numpy.ndarray) -> Estimate:

@@ -27,6 +27,8 @@ from .threads import one_thread
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
+DISTRIBUTED = 2**21
+"""Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
 PERCENTILES = (10.0, 90.0)
 """Of actions and gains over episodes."""
 
@@ -58,10 +60,11 @@ def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
           gains that a bank records, likewise;
         * ``mean_cost`` (policy): over episodes.
 
-        Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every quantity (the groups of components
-        where there are any, else the first three components), ``elapsed`` (s) of every measurement, where they come
-        regularly, and windows as the dataset has them. Attributes environment, scenario, split, seed, episodes,
-        paper, reference, cost, truth and recorded.
+        Errors exceeded, actions and gains are those of the first ``DISTRIBUTED`` measurements, or of the first 2048
+        episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every quantity
+        (the groups of components where there are any, else the first three components), ``elapsed`` (s) of every
+        measurement, where they come regularly, and windows as the dataset has them. Attributes environment, scenario,
+        split, seed, episodes, paper, reference, cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
     names = dataset["policy"].values.tolist()
@@ -148,12 +151,13 @@ def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
     sums: dict[str, Sums] = {}
     totals: dict[str, numpy.ndarray] = {}
     kept: dict[str, list[numpy.ndarray]] = {}
+    distributed = slice(max(0, max(BLOCK, DISTRIBUTED // run.sizes["time"]) - first))
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)
         sums["rmse"] = bootstrap.sums(squares, first)
         if str(run["kind"].values) != "bound":
-            kept["error_exceeded"] = [numpy.sqrt(squares)]
+            kept["error_exceeded"] = [numpy.sqrt(squares[distributed])]
             kept["mean_cost"] = [mean_over_time(run, run["cost"].values)]
     for metric in consistency_metrics(run):
         values, degrees = run[metric].values, consistency_degrees(run, metric)
@@ -168,10 +172,10 @@ def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
         values = run["action"].transpose("episode", "action_name", "time").values
         there = ~numpy.isnan(values).all(axis=(0, 2))
         if there.any():
-            kept["action"], actions = [values[:, there]], run["action_name"].values[there].tolist()
+            kept["action"], actions = [values[distributed, there]], run["action_name"].values[there].tolist()
     gains = [name for name in gains_of(run) if not numpy.isnan(run[name].values).all()]
     if gains:
-        kept["gain"] = [numpy.stack([run[name].values for name in gains], axis=1)]
+        kept["gain"] = [numpy.stack([run[name].values[distributed] for name in gains], axis=1)]
     return Drawn(sums, totals, kept, actions, gains)
 
 

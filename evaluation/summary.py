@@ -8,7 +8,7 @@ import functools
 import io
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from .curves import Drawn, Finished, drawn_from, joined
 from .evaluate import CHUNK, DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Judged, Measure, Record, judge, records_of
+from .own_metrics import OwnMetrics, Taken
 from .parallel import Workers
 from .rollout import Progress
 
@@ -27,8 +28,6 @@ CURVE_RESAMPLES = 200
 """Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
 TOGETHER = 4 * CHUNK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
-
-Metrics = Callable[[xarray.Dataset, Bootstrap], list[Measure]]
 
 
 class Asked(NamedTuple):
@@ -48,8 +47,8 @@ class Asked(NamedTuple):
     backend: str = "auto"
     threads: int = 1
     keywords: dict[str, Any] | None = None
-    metrics: Metrics | None = None
-    """The environment's own, which take all episodes at once."""
+    metrics: OwnMetrics | None = None
+    """The environment's own."""
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -64,8 +63,8 @@ class Asked(NamedTuple):
         return (last - self.first) * self.horizon
 
     def pieces(self) -> list["Asked"]:
-        """Return the pieces of work that this is: one, unless there are many episodes that can be reduced apart."""
-        if self.metrics is not None or self.episodes <= TOGETHER:
+        """Return the pieces of work that this is: one, unless there are many episodes."""
+        if self.episodes <= TOGETHER:
             return [self]
         begins = range(0, self.episodes, TOGETHER)
         return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
@@ -94,17 +93,23 @@ class Part(NamedTuple):
 
     judged: Judged
     drawn: Drawn
+    own: Taken | None
+    """For the environment's own metrics."""
     head: xarray.Dataset
 
     def and_of(self, later: "Part") -> "Part":
         """Add the episodes that come next."""
-        return self._replace(judged=self.judged.and_of(later.judged), drawn=self.drawn.and_of(later.drawn))
+        own = None if self.own is None or later.own is None else self.own.and_of(later.own)
+        return Part(self.judged.and_of(later.judged), self.drawn.and_of(later.drawn), own, self.head)
 
-    def finished(self, bootstrap: Bootstrap, further: Sequence[Measure] = ()) -> Summary:
+    def finished(self, bootstrap: Bootstrap, metrics: OwnMetrics | None) -> Summary:
         """Return the summary of all episodes."""
         name, kind, control = (str(self.head[word].values) for word in ("policy", "kind", "control"))
         measures = self.judged.measures(bootstrap)
-        found = Contender(name, kind, control, measures, list(further), self.judged.cost())
+        further = []
+        if metrics is not None and self.own is not None:
+            further = metrics.measures(self.own.gathered(), bootstrap, self.head)
+        found = Contender(name, kind, control, measures, further, self.judged.cost())
         return Summary(found, self.drawn.finished(), self.head, bootstrap.episodes)
 
 
@@ -139,19 +144,16 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     bootstrap = _resampling(asked.episodes)
     curves = bootstrap.fewer(CURVE_RESAMPLES)
     last = asked.episodes if asked.last is None else asked.last
-    together = CHUNK if asked.metrics is None else asked.episodes
     found: Part | None = None
-    further: list[Measure] = []
-    for i in range(asked.first, last, together):
-        piece = plan.piece(asked.name, i, min(together, last - i), False, asked.drawn_episodes, True)
+    for i in range(asked.first, last, CHUNK):
+        piece = plan.piece(asked.name, i, min(CHUNK, last - i), False, asked.drawn_episodes, True)
         run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
         run = run.isel(policy=0)
-        part = Part(judge(run, bootstrap, i), drawn_from(run, curves, i), _head(run))
-        if asked.metrics is not None:
-            further = asked.metrics(run, bootstrap)
+        own = None if asked.metrics is None else asked.metrics.take(run, bootstrap, i)
+        part = Part(judge(run, bootstrap, i), drawn_from(run, curves, i), own, _head(run))
         found = part if found is None else found.and_of(part)
     assert found is not None
-    return found.finished(bootstrap, further) if last - asked.first == asked.episodes else found
+    return found.finished(bootstrap, asked.metrics) if last - asked.first == asked.episodes else found
 
 
 def _head(run: xarray.Dataset) -> xarray.Dataset:
@@ -219,7 +221,7 @@ def _summarised(
             later, done[i] = waiting[i].pop(done[i])
             added[i] = added[i].and_of(later) if i in added else later
         if done[i] == asked[i].episodes:
-            yield i, added.pop(i).finished(_resampling(asked[i].episodes))
+            yield i, added.pop(i).finished(_resampling(asked[i].episodes), asked[i].metrics)
 
 
 def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:

@@ -95,13 +95,16 @@ def shuffled(run):
     return other
 
 
-def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_order(monkeypatch):
-    names = ["imm", "known-turn", "known-input-bound"]
-    whole = evaluate(ENV, names, episodes=100)
+@pytest.mark.parametrize("env", catalogue())
+def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_order(env, monkeypatch):
+    known = baselines_of(env)
+    names = [known.score_paper, next(iter(known.references)), list(known.bounds)[-1]]
+    shorter = {} if env == ENV else {"horizon": 60}
+    whole = evaluate(env, names, episodes=100, **shorter)
     for module in ("evaluate", "summary"):
         monkeypatch.setattr(f"filtergym.evaluation.{module}.CHUNK", 16)
     monkeypatch.setattr(summary, "TOGETHER", 32)
-    asked = asked_of(ENV, names, episodes=100)
+    asked = asked_of(env, names, episodes=100, **shorter)
     assert len(asked[0].pieces()) == 4
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
@@ -114,11 +117,24 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     # Sums of blocks are rounded otherwise than those of all episodes at once.
     for own, expected in zip(records, tidy_records(whole), strict=True):
         assert own[:8] == expected[:8]
-        assert own.value == pytest.approx(expected.value, rel=1e-9, nan_ok=True)
-        assert (own.low, own.high) == pytest.approx((expected.low, expected.high), rel=1e-9, nan_ok=True)
+        numbers = [np.array([r.value, r.low, r.high], dtype=float) for r in (own, expected)]
+        np.testing.assert_allclose(*numbers, rtol=1e-9, atol=1e-12, err_msg=str(own))
     expected = filtergym.evaluation.curves.curves_of(whole)
     for name in expected.data_vars:
-        np.testing.assert_allclose(curves[name].values, expected[name].values, rtol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            curves[name].values, expected[name].values, rtol=1e-9, atol=1e-12, err_msg=name
+        )
+
+
+def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch):
+    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTED", 3000)
+    monkeypatch.setattr("filtergym.evaluation.curves.BLOCK", 16)
+    names = ["imm"]
+    curves = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=100))
+    few = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=30))
+    for name in ("error_exceeded", "action", "action_low"):
+        np.testing.assert_array_equal(curves[name].values, few[name].values, err_msg=name)
+    assert (curves["rmse"].values != few["rmse"].values).any()
 
 
 def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):

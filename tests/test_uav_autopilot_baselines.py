@@ -12,7 +12,7 @@ from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalB
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot import reproduction as paper
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
-from filtergym.baselines.uav_autopilot.metrics import metrics
+from filtergym.baselines.uav_autopilot.metrics import METRICS
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.reproduction import experiment
 from filtergym.baselines.uav_autopilot.theory import stationary
@@ -362,7 +362,7 @@ def hand_made(output: numpy.ndarray, **more: Any) -> xarray.Dataset:
 
 
 def own(dataset: xarray.Dataset) -> dict[tuple[str, str], float]:
-    found = metrics(dataset, Bootstrap(dataset.sizes["episode"], 20))
+    found = METRICS(dataset, Bootstrap(dataset.sizes["episode"], 20))
     return {(m.metric, m.window): m.estimate.value for m in found}
 
 

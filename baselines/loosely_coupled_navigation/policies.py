@@ -18,6 +18,7 @@ from ...evaluation.bootstrap import Bootstrap
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, mean_of_present
+from ...evaluation.own_metrics import Gathered, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
 from ..table import Baselines, Tunable
@@ -307,10 +308,10 @@ def recovery_times(
     return numpy.where(counted, time.astype(float), math.nan)
 
 
-def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
-    """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
+def _recoveries(run: xarray.Dataset) -> Gathered:
+    """Seconds to recover of each episode, and whether it does not within a second; NaN without an outage."""
     if "available" not in run or numpy.isnan(run["available"].values).all():
-        return []
+        return Gathered()
     cls = task_class(run.attrs["environment"])
     scenario = cls.scenarios.get(run.attrs["scenario"])
     parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **keywords_of(run)})
@@ -318,18 +319,19 @@ def outage_metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     limit = RECOVERED * math.sqrt(parameters.receiver_variance * parameters.axes)
     held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))
     times = recovery_times(size, run["available"].values, limit, held, longest)
-    if numpy.isnan(times).all():
-        return []
     lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
+    return Gathered({"time": times * parameters.sampling_interval, "lost": lost})
+
+
+def _outage_measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+    """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
+    each = gathered.each
+    if not each or numpy.isnan(each["time"]).all():
+        return []
+    time, lost = (mean_of_present(each[name][:, None], bootstrap) for name in ("time", "lost"))
     return [
-        Measure(
-            "recovery_time",
-            "position",
-            "all",
-            mean_of_present(times[:, None] * parameters.sampling_interval, bootstrap),
-            "s",
-        ),
-        Measure("not_recovered", "position", "all", mean_of_present(lost[:, None], bootstrap), "1"),
+        Measure("recovery_time", "position", "all", time, "s"),
+        Measure("not_recovered", "position", "all", lost, "1"),
     ]
 
 
@@ -434,6 +436,6 @@ BASELINES = Baselines(
         "matched",
         "matched-covariance",
     ),
-    metrics=outage_metrics,
+    metrics=OwnMetrics(_recoveries, _outage_measures),
 )
 """What the environment is compared with."""

@@ -9,7 +9,9 @@ import xarray
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import windows_of
 from ...evaluation.metrics import Measure, squared_errors
+from ...evaluation.own_metrics import Gathered, OwnMetrics
 
+CLASSES = 3
 SURE = 0.9
 """Probability from which a class counts as recognised."""
 TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
@@ -60,7 +62,74 @@ def _recognition(
     yield Measure(f"{name}_censored", component, "all", censored, "1")
 
 
-def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
+def _missing(run: xarray.Dataset, name: str) -> bool:
+    return name not in run or bool(numpy.isnan(run[name].values).any())
+
+
+def _slices(run: xarray.Dataset) -> dict[str, slice]:
+    return {name: slice(first - 1, last) for name, (first, last) in windows_of(run).items()}
+
+
+def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
+    """Whether a target is of a class, ``(..., classes)``."""
+    return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
+
+
+def gather(run: xarray.Dataset) -> Gathered:
+    """Return what the metrics need of each episode; nothing of a bound, and of a reference no beliefs."""
+    if _missing(run, "true_class"):
+        return Gathered()
+    true_class = run["true_class"].values.astype(int)
+    of_class, slices = _of_class(true_class), _slices(run).values()
+    squares, by_class, variance = [], [], []
+    for component in run["component"].values.tolist():
+        square = squared_errors(run, component, {})
+        squares.append([square[:, times].mean(axis=1) for times in slices])
+        by_class.append(
+            [[(square * of_class[..., s])[:, t].mean(axis=1) for s in range(CLASSES)] for t in slices]
+        )
+        variance.append([run[f"variance_{component}"].values[:, times].mean(axis=1) for times in slices])
+    share = [[of_class[:, times, s].mean(axis=1) for s in range(CLASSES)] for times in slices]
+    each = {"squares": squares, "squares_by_class": by_class, "variance": variance, "share": share}
+    found = Gathered({key: numpy.moveaxis(numpy.array(values), -1, 0) for key, values in each.items()})
+    return found if _missing(run, "mode_probability") else _with_beliefs(run, found)
+
+
+def _with_beliefs(run: xarray.Dataset, errors: Gathered) -> Gathered:
+    true_class, seconds = run["true_class"].values.astype(int), run["seconds"].values[0]
+    true_probability, probability = run["true_class_probability"].values, run["mode_probability"].values
+    moments = _moments(seconds)
+    sure, same = true_probability >= SURE, true_class == true_class[:, :1]
+    change = _first(~same)
+    waited = _first(sure & (numpy.arange(len(seconds)) >= change[:, None]))
+    last = _last(seconds)
+    wrong = (probability[:, last] >= SURE) & (numpy.arange(probability.shape[2]) != true_class[:, last, None])
+    excess = probability.max(axis=2) - (probability.argmax(axis=2) == true_class)
+    each = {
+        "probability": true_probability[:, list(moments.values())],
+        "class": true_class[:, list(moments.values())],
+        "first_class": true_class[:, 0],
+        "recognised": _first(sure & same),
+        "change": change,
+        "recognised_again": numpy.where(waited < len(seconds), waited - change, len(seconds)),
+        "last_class": true_class[:, last],
+        "wrong": wrong.any(axis=1),
+        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in _slices(run).values()], axis=1),
+    }
+    return Gathered({**errors.each, **each}, {}, {"seconds": seconds})
+
+
+def _moments(seconds: numpy.ndarray) -> dict[float, int]:
+    """Indices of the times of :data:`TIMES` that there are."""
+    found = {moment: numpy.flatnonzero(numpy.isclose(seconds, moment)) for moment in TIMES}
+    return {moment: int(at[0]) for moment, at in found.items() if len(at)}
+
+
+def _last(seconds: numpy.ndarray) -> int:
+    return _moments(seconds).get(TIMES[-1], len(seconds) - 1)
+
+
+def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Errors by true class, recognition of the class, and calibration, of one policy.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
@@ -71,87 +140,52 @@ def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     ``confidence_excess``, mean probability of the most probable class minus how often it is the true one.
     A reference has no class probabilities: of it only errors and calibration.
     """
-    if _missing(run, "true_class"):
-        return []  # a bound
-    errors = list(_errors(run, bootstrap))
-    return errors if _missing(run, "mode_probability") else [*errors, *_beliefs(run, bootstrap)]
-
-
-def _missing(run: xarray.Dataset, name: str) -> bool:
-    return name not in run or bool(numpy.isnan(run[name].values).any())
-
-
-def _slices(run: xarray.Dataset) -> dict[str, slice]:
-    return {name: slice(first - 1, last) for name, (first, last) in windows_of(run).items()}
+    if not gathered.each:
+        return []
+    errors = list(_errors(gathered, bootstrap, evaluation))
+    return [*errors, *_beliefs(gathered, bootstrap, evaluation)] if "excess" in gathered.each else errors
 
 
 def _groups(true_class: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Everybody, and the targets of each class, ``(episodes, T)`` booleans."""
+    """Everybody, and the targets of each class that there is, ``(episodes,)`` booleans."""
     by_class = {f"S{s}": true_class == s for s in numpy.unique(true_class)}
     return {"": numpy.ones(true_class.shape, dtype=bool)} | by_class
 
 
-def _errors(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
-    slices, groups = _slices(run), _groups(run["true_class"].values.astype(int))
-    units = dict(zip(run["component"].values.tolist(), run["unit"].values.tolist(), strict=True))
-    for component, unit in units.items():
-        squares = squared_errors(run, component, {})
-        variance = run[f"variance_{component}"].values
-        for window, times in slices.items():
-            means = squares[:, times].mean(axis=1)
-            for mode, of_mode in groups.items():
-                if mode:
-                    share = of_mode[:, times].mean(axis=1)
-                    if share.any():
-                        ratio = _ratio(bootstrap, (squares * of_mode)[:, times].mean(axis=1), share)
-                        value = bootstrap.interval(numpy.sqrt(ratio))
-                        yield Measure("rmse_by_class", f"{component} {mode}", window, value, unit)
-            ratio = _ratio(bootstrap, means, variance[:, times].mean(axis=1))
+def _errors(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
+    each = gathered.each
+    names, units = evaluation["component"].values.tolist(), evaluation["unit"].values.tolist()
+    for i, (component, unit) in enumerate(zip(names, units, strict=True)):
+        for j, window in enumerate(windows_of(evaluation)):
+            for s in range(CLASSES):
+                share = each["share"][:, j, s]
+                if share.any():
+                    ratio = _ratio(bootstrap, each["squares_by_class"][:, i, j, s], share)
+                    value = bootstrap.interval(numpy.sqrt(ratio))
+                    yield Measure("rmse_by_class", f"{component} S{s}", window, value, unit)
+            ratio = _ratio(bootstrap, each["squares"][:, i, j], each["variance"][:, i, j])
             yield Measure("calibration_ratio", component, window, bootstrap.interval(ratio), "1")
 
 
-def _beliefs(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
-    true_class = run["true_class"].values.astype(int)
-    groups = _groups(true_class)
-    true_probability = run["true_class_probability"].values
-    probability = run["mode_probability"].values
-    seconds = run["seconds"].values[0]
-    for moment in TIMES:
-        at = numpy.flatnonzero(numpy.isclose(seconds, moment))
-        for mode, of_mode in groups.items():
-            if len(at) and of_mode[:, at[0]].any():
-                chosen = of_mode[:, at[0]].astype(float)
-                ratio = _ratio(bootstrap, true_probability[:, at[0]] * chosen, chosen)
-                value = bootstrap.interval(ratio)
-                yield Measure("mean_true_class_probability", mode, f"{moment:g} s", value, "1")
+def _beliefs(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
+    each, seconds = gathered.each, gathered.common["seconds"]
+    for k, moment in enumerate(_moments(seconds)):
+        for mode, chosen in _groups(each["class"][:, k]).items():
+            ratio = _ratio(bootstrap, each["probability"][:, k] * chosen, chosen.astype(float))
+            value = bootstrap.interval(ratio)
+            yield Measure("mean_true_class_probability", mode, f"{moment:g} s", value, "1")
+    for mode, chosen in _groups(each["first_class"]).items():
+        yield from _recognition("time_to_recognise", bootstrap, each["recognised"], chosen, seconds, mode)
+    changed = each["change"] < len(seconds)
+    if changed.any():
+        name, again = "time_to_recognise_change", each["recognised_again"]
+        yield from _recognition(name, bootstrap, again, changed, seconds - seconds[0], "")
+    for mode, chosen in _groups(each["last_class"]).items():
+        ratio = _ratio(bootstrap, each["wrong"] * chosen.astype(float), chosen.astype(float))
+        window = f"{seconds[_last(seconds)]:g} s"
+        yield Measure("sure_and_wrong", mode, window, bootstrap.interval(ratio), "1")
+    for j, window in enumerate(windows_of(evaluation)):
+        yield Measure("confidence_excess", "", window, bootstrap.estimate(each["excess"][:, j]), "1")
 
-    sure = true_probability >= SURE
-    same = true_class == true_class[:, :1]
-    for mode, of_mode in groups.items():
-        if of_mode[:, 0].any():
-            yield from _recognition(
-                "time_to_recognise", bootstrap, _first(sure & same), of_mode[:, 0], seconds, mode
-            )
-    if not same.all():
-        change = _first(~same)
-        after = numpy.arange(len(seconds)) >= change[:, None]
-        waited = _first(sure & after)
-        waited = numpy.where(waited < len(seconds), waited - change, len(seconds))
-        changed = change < len(seconds)
-        yield from _recognition(
-            "time_to_recognise_change", bootstrap, waited, changed, seconds - seconds[0], ""
-        )
 
-    reached = numpy.flatnonzero(numpy.isclose(seconds, TIMES[-1]))
-    last = int(reached[0]) if len(reached) else len(seconds) - 1
-    wrong = (probability[:, last] >= SURE) & (numpy.arange(probability.shape[2]) != true_class[:, last, None])
-    for mode, of_mode in groups.items():
-        chosen = of_mode[:, last].astype(float)
-        if chosen.any():
-            ratio = _ratio(bootstrap, wrong.any(axis=1) * chosen, chosen)
-            yield Measure("sure_and_wrong", mode, f"{seconds[last]:g} s", bootstrap.interval(ratio), "1")
-
-    excess = probability.max(axis=2) - (probability.argmax(axis=2) == true_class)
-    for window, times in _slices(run).items():
-        value = bootstrap.estimate(excess[:, times].mean(axis=1))
-        yield Measure("confidence_excess", "", window, value, "1")
+METRICS = OwnMetrics(gather, measures)

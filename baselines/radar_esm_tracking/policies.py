@@ -17,7 +17,7 @@ from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
 from ..table import Baselines, Tunable
 from .alarm import ClassAlarm
-from .metrics import metrics
+from .metrics import METRICS
 from .references import Ideal, KnownClassBound
 
 
@@ -284,5 +284,5 @@ BASELINES = Baselines(
         "ideal",
         "known-class-bound",
     ),
-    metrics=metrics,
+    metrics=METRICS,
 )

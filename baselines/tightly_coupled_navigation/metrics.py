@@ -1,7 +1,7 @@
 """What is measured of TightlyCoupledNavigation beside the metrics of every environment."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy
@@ -11,7 +11,9 @@ from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import groups_of
 from ...evaluation.metrics import Measure, squared_errors
+from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
 
+UNITS = {"position": "m", "velocity": "m/s"}
 LASTING = 10
 """Steps for which a hypothesis must stay believed, or a rate outside its aperture, to count."""
 
@@ -37,11 +39,13 @@ def quantile(
     """
     chosen = numpy.ones(len(values), dtype=bool) if chosen is None else chosen
     order = numpy.argsort(numpy.where(chosen, values, numpy.inf))
-    weights = numpy.cumsum((bootstrap.weights * chosen)[:, order], axis=1)
-    # Rounding of the sums must not move a share that is met exactly.
-    enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
-    found = numpy.where(weights[:, -1] > 0.0, values[order][enough.argmax(axis=1)], numpy.nan)
-    return bootstrap.interval(found)
+    found = []
+    for some in bootstrap.by_resamples(order):
+        weights = numpy.cumsum(some * chosen[order], axis=1)
+        # Rounding of the sums must not move a share that is met exactly.
+        enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
+        found.append(numpy.where(weights[:, -1] > 0.0, values[order][enough.argmax(axis=1)], numpy.nan))
+    return bootstrap.interval(numpy.concatenate(found))
 
 
 def lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
@@ -92,7 +96,50 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
     return found
 
 
-def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
+def gather(run: xarray.Dataset) -> Gathered:
+    """Return what the metrics need of each episode; nothing of a bound."""
+    if str(run["kind"].values) == "bound":
+        return Gathered()
+    true_mode = run["true_mode"].values.astype(int)
+    there = [true_mode == i for i in range(len(HYPOTHESES))]
+    squares = [
+        [(square * of_mode).mean(axis=1) for of_mode in there]
+        for square in (squared_errors(run, component, groups_of(run)) for component in UNITS)
+    ]
+    each = {
+        "squares": numpy.moveaxis(numpy.array(squares), -1, 0),
+        "share": numpy.stack([of_mode.mean(axis=1) for of_mode in there], axis=1),
+        "cost": run["cost"].values.mean(axis=1),
+    }
+    if "mode_probability" not in run or numpy.isnan(run["mode_probability"].values).all():
+        return Gathered(each)
+    step = float(run["seconds"].values[0, 0])
+    moved = true_mode != true_mode[:, :1]
+    begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
+    in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
+    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
+    each |= {
+        "switches": _counted(switches(true_mode, run["mode_probability"].values), len(true_mode), step),
+        "lost": numpy.asarray(outside.any(axis=1)),
+        "lost_after": (outside.argmax(axis=1) - begin + 1.0) * step,
+    }
+    return Gathered(each)
+
+
+def _counted(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
+    """Number of changes, of those that were missed, and seconds waited for the others, from and to each hypothesis.
+
+    Returns:
+        ``(episodes, M, M, 3)``.
+    """
+    found = numpy.zeros((episodes, len(HYPOTHESES), len(HYPOTHESES), 3))
+    for s in changes:
+        seen = math.isfinite(s.wait)
+        found[s.episode, s.before, s.after] += (1.0, not seen, s.wait * step if seen else 0.0)
+    return found
+
+
+def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,
@@ -103,52 +150,35 @@ def metrics(run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
     the aperture from the combined prediction, from the first change of motion on. Those from ``adaptation_time``
     on need the records of a bank: references have none.
     """
-    if str(run["kind"].values) == "bound":
+    if not gathered.each:
         return []
-    measures = list(_errors(run, bootstrap))
-    if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
-        measures += _of_bank(run, bootstrap)
-    return measures
+    found = list(_errors(gathered.each, bootstrap))
+    return [*found, *_of_bank(gathered.each, bootstrap)] if "switches" in gathered.each else found
 
 
-def _errors(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
-    true_mode = run["true_mode"].values.astype(int)
-    for component, unit in (("position", "m"), ("velocity", "m/s")):
-        squares = squared_errors(run, component, groups_of(run))
+def _errors(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
+    for k, (component, unit) in enumerate(UNITS.items()):
         for i, name in enumerate(HYPOTHESES):
-            there = true_mode == i
-            if there.any():
-                value = _ratio(bootstrap, (squares * there).mean(axis=1), there.mean(axis=1))
+            if each["share"][:, i].any():
+                value = _ratio(bootstrap, each["squares"][:, k, i], each["share"][:, i])
                 root = Estimate(*(math.sqrt(v) for v in value))
                 yield Measure("rmse_by_hypothesis", f"{component} {name}", "all", root, unit)
-    cost = run["cost"].values.mean(axis=1)
-    yield Measure("cost_median", "", "all", quantile(bootstrap, cost, 0.5), "1")
-    yield Measure("cost_95_quantile", "", "all", quantile(bootstrap, cost, 0.95), "1")
+    yield Measure("cost_median", "", "all", quantile(bootstrap, each["cost"], 0.5), "1")
+    yield Measure("cost_95_quantile", "", "all", quantile(bootstrap, each["cost"], 0.95), "1")
 
 
-def _of_bank(run: xarray.Dataset, bootstrap: Bootstrap) -> Iterator[Measure]:
-    true_mode = run["true_mode"].values.astype(int)
-    step = float(run["seconds"].values[0, 0])
-    episodes = len(true_mode)
-    changes = switches(true_mode, run["mode_probability"].values)
-    for before, after in sorted({(s.before, s.after) for s in changes}):
-        count, missed, total = numpy.zeros(episodes), numpy.zeros(episodes), numpy.zeros(episodes)
-        for s in changes:
-            if (s.before, s.after) == (before, after):
-                count[s.episode] += 1.0
-                missed[s.episode] += not math.isfinite(s.wait)
-                total[s.episode] += s.wait * step if math.isfinite(s.wait) else 0.0
+def _of_bank(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
+    for before, after in numpy.argwhere(each["switches"][..., 0].any(axis=0)):
+        count, missed, total = numpy.moveaxis(each["switches"][:, before, after], -1, 0)
         name = f"{HYPOTHESES[before]} to {HYPOTHESES[after]}"
         if (missed < count).any():
             yield Measure("adaptation_time", name, "all", _ratio(bootstrap, total, count - missed), "s")
         yield Measure("adaptation_censored", name, "all", _ratio(bootstrap, missed, count), "1")
-
-    moved = true_mode != true_mode[:, :1]
-    begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
-    in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
-    outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
-    lost = numpy.asarray(outside.any(axis=1))
+    lost = each["lost"]
     yield Measure("track_loss_rate", "", "all", bootstrap.estimate(lost.astype(float)), "1")
     if lost.any():
-        time = (outside.argmax(axis=1) - begin + 1.0) * step
-        yield Measure("track_loss_time", "", "all", quantile(bootstrap, time, 0.5, lost), "s")
+        value = quantile(bootstrap, each["lost_after"], 0.5, lost)
+        yield Measure("track_loss_time", "", "all", value, "s")
+
+
+METRICS = OwnMetrics(gather, measures)

@@ -17,7 +17,7 @@ from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, Tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
-from .metrics import metrics
+from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 
 
@@ -281,5 +281,5 @@ BASELINES = Baselines(
     benchmark=("multi-hypothesis", "nis-adaptive", "singer", "known-mode", "known-mode-bound"),
     physical=("rmse", "velocity"),
     measurement_seconds=4e-5,
-    metrics=metrics,
+    metrics=METRICS,
 )

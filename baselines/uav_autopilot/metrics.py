@@ -2,22 +2,70 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy
+import xarray
 
 from ...envs.catalogue import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import keywords_of, windows_of
 from ...evaluation.metrics import Measure
+from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
 from .theory import stationary
 
 LOST_SIGMAS = 100.0
 """Tracking error, over the nominal sigma of the output's sensor, beyond which a loop counts as lost."""
 
 
-def metrics(run: Any, bootstrap: Bootstrap) -> list[Measure]:
+def _task(evaluation: xarray.Dataset) -> UavAutopilot:
+    attrs = evaluation.attrs
+    task = make_task(attrs["environment"], "gain", attrs["scenario"], **keywords_of(evaluation))
+    assert isinstance(task, UavAutopilot)
+    return task
+
+
+def _slices(evaluation: xarray.Dataset) -> dict[str, slice]:
+    return {w: slice(first - 1, last) for w, (first, last) in windows_of(evaluation).items()}
+
+
+def gather(run: xarray.Dataset) -> Gathered:
+    """Return what the metrics need of each episode; nothing of a bound, and of a reference no innovation."""
+    if "output" not in run or numpy.isnan(run["output"].values).all():
+        return Gathered()
+    task, slices = _task(run), _slices(run)
+    output, control = run["output"].values, run["control_signal"].values
+    tracking = output - run["command"].values
+    # Variances across episodes are those of the mean square less the squared mean: both are averages.
+    averaged = {
+        "tracking": tracking,
+        "tracking_square": tracking**2,
+        "control": control,
+        "control_square": control**2,
+    }
+    if task.parameters.step_size:
+        averaged["output"] = output
+    squares = [(tracking[:, times] ** 2).mean(axis=1) for times in slices.values()]
+    each = {
+        "tracking_square": numpy.stack(squares, axis=1),
+        "far": (numpy.abs(tracking) > LOST_SIGMAS * math.sqrt(task.cost_unit)).any(axis=1),
+    }
+    if "steady" in slices:
+        each["settled"] = output[:, slices["steady"]].mean(axis=1)
+    if "innovation" in run and not numpy.isnan(run["innovation"].values).all():
+        parts = [_lagged(run["innovation"].values[:, times]) for times in slices.values()]
+        each["innovation"] = numpy.stack(parts, axis=1)
+    return Gathered(each, averaged)
+
+
+def _lagged(values: numpy.ndarray) -> numpy.ndarray:
+    """Mean product of neighbours, and mean square, ``(episodes, 2)``; NaN where there are no neighbours."""
+    if values.shape[1] < 2:
+        return numpy.full((len(values), 2), math.nan)
+    return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
+
+
+def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Measures of the loop, beside those of the estimate.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
@@ -29,22 +77,17 @@ def metrics(run: Any, bootstrap: Bootstrap) -> list[Measure]:
     response averaged over episodes, whose noise falls with the root of their number, and ``mean_output``
     when settled; times that are not reached are cut off at the end of the window "transient".
     """
-    if "output" not in run or numpy.isnan(run["output"].values).all():
+    if not gathered.each:
         return []
-    attrs = run.attrs
-    task = make_task(attrs["environment"], "gain", attrs["scenario"], **keywords_of(run))
-    assert isinstance(task, UavAutopilot)
-    name = str(run["policy"].values)
+    each, task, windows = gathered.each, _task(evaluation), _slices(evaluation)
+    name = str(evaluation["policy"].values)
     unit, control_unit = task.components[task.output].unit, {"P": "m/s^2", "U": "deg"}[task.parameters.plant]
-    output, control = run["output"].values, run["control_signal"].values
-    tracking = output - run["command"].values
-    windows = {w: slice(first - 1, last) for w, (first, last) in windows_of(run).items()}
-    tracking_variance, control_variance = _variances(tracking, bootstrap), _variances(control, bootstrap)
+    tracking_variance, control_variance = (
+        _variance(gathered.averaged, of, bootstrap.episodes) for of in ("tracking", "control")
+    )
     theory = stationary(task, name)
-    # References estimate outside the task and tell of no innovation.
-    told = "innovation" in run and not numpy.isnan(run["innovation"].values).all()
     found: list[Measure] = []
-    for window, times in windows.items():
+    for i, (window, times) in enumerate(windows.items()):
 
         def add(metric: str, estimate: Estimate, unit: str, window: str = window) -> None:
             found.append(Measure(metric, "", window, estimate, unit))
@@ -55,50 +98,38 @@ def metrics(run: Any, bootstrap: Bootstrap) -> list[Measure]:
             bootstrap.interval(control_variance[:, times].mean(axis=1)),
             f"({control_unit})^2",
         )
-        add("tracking_rmse", bootstrap.estimate((tracking[:, times] ** 2).mean(axis=1), numpy.sqrt), unit)
+        add("tracking_rmse", bootstrap.estimate(each["tracking_square"][:, i], numpy.sqrt), unit)
         if theory is not None and window == "steady":
             add("output_variance_theory", _exact(theory.output_variance), f"({unit})^2")
             add("control_variance_theory", _exact(theory.control_variance), f"({control_unit})^2")
             add("cost_theory", _exact(theory.cost), "1")
-        if told:
-            correlation = _correlation(run["innovation"].values[:, times], bootstrap)
+        if "innovation" in each:
+            product, power = numpy.moveaxis(bootstrap.means(each["innovation"][:, i]), -1, 0)
+            correlation = bootstrap.interval(product / numpy.maximum(power, 1e-300))
             found.append(Measure("innovation_autocorrelation", "lag 1", window, correlation, "1"))
-    far = (numpy.abs(tracking) > LOST_SIGMAS * math.sqrt(task.cost_unit)).any(axis=1)
-    found.append(Measure("lost_loops", "", "all", bootstrap.estimate(far.astype(float)), "1"))
+    found.append(Measure("lost_loops", "", "all", bootstrap.estimate(each["far"].astype(float)), "1"))
     if task.parameters.step_size:
-        found += _step_response(task, output, windows, unit, bootstrap)
+        found += _step_response(task, gathered, windows, unit, bootstrap)
     return found
+
+
+def _variance(averaged: Arrays, of: str, episodes: int) -> numpy.ndarray:
+    """Unbiased variance across episodes at each time, of the data and of every resample."""
+    biased = averaged[f"{of}_square"] - averaged[of] ** 2
+    return numpy.asarray(biased * (episodes / max(episodes - 1, 1)))
 
 
 def _exact(value: float) -> Estimate:
     return Estimate(value, value, value)
 
 
-def _variances(values: numpy.ndarray, bootstrap: Bootstrap) -> numpy.ndarray:
-    """Unbiased variance across episodes at each time, of the data and of every resample."""
-    episodes = len(values)
-    mean = values.mean(axis=0)
-    around = values - mean
-    biased = bootstrap.means(around**2) - bootstrap.means(around) ** 2
-    return biased * (episodes / max(episodes - 1, 1))
-
-
-def _correlation(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
-    """Autocorrelation at lag one, pooled over episodes."""
-    if values.shape[1] < 2:
-        return Estimate(math.nan, math.nan, math.nan)
-    product = bootstrap.means((values[:, 1:] * values[:, :-1]).mean(axis=1))
-    power = bootstrap.means((values**2).mean(axis=1))
-    return bootstrap.interval(product / numpy.maximum(power, 1e-300))
-
-
 def _step_response(
-    task: UavAutopilot, output: numpy.ndarray, windows: Mapping[str, slice], unit: str, bootstrap: Bootstrap
+    task: UavAutopilot, gathered: Gathered, windows: Mapping[str, slice], unit: str, bootstrap: Bootstrap
 ) -> list[Measure]:
     p = task.parameters
     T, first = p.value("sampling_interval"), p.step_time - 1
-    last = windows["transient"].stop if "transient" in windows else output.shape[1]
-    response = bootstrap.means(output[:, first:last]) / p.step_size
+    last = windows["transient"].stop if "transient" in windows else None
+    response = gathered.averaged["output"][:, first:last] / p.step_size
     length = response.shape[1]
     if length < 2:
         return []
@@ -113,6 +144,9 @@ def _step_response(
         Measure("settling_time", "", "transient", bootstrap.interval(settling * T), "s"),
     ]
     if "steady" in windows:
-        settled = bootstrap.estimate(output[:, windows["steady"]].mean(axis=1))
+        settled = bootstrap.estimate(gathered.each["settled"])
         found.append(Measure("mean_output", "", "steady", settled, unit))
     return found
+
+
+METRICS = OwnMetrics(gather, measures)

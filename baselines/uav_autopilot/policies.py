@@ -20,7 +20,7 @@ from .estimators import (
     SteadyKalman,
     VariationalBayesKalman,
 )
-from .metrics import metrics
+from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 
 
@@ -215,5 +215,5 @@ BASELINES = Baselines(
         "steady-kalman",
         "known-noise-bound",
     ),
-    metrics=metrics,
+    metrics=METRICS,
 )
