@@ -1,0 +1,573 @@
+"""What the full comparison costs: every competitor, every algorithm with 20 training seeds, 100 000 episodes a cell.
+
+``python benchmarks/plan.py --units units.json`` measures unit costs on one core, six minutes, and prints the plan of
+docs/plan.md; what the file holds already is not measured again, so that other numbers of episodes, seeds and cores
+take seconds.
+
+Measured, in seconds of the processor, after what is compiled has been compiled: for every competitor of the full
+benchmark, and an agent of every algorithm after a short training, ``summarise`` over some episodes of the training
+distribution; the environment's own metrics; what the process that began the work does with what comes back; a few
+updates of every algorithm, and a validation; one candidate of every tuning.
+
+Extrapolated: linearly in measurements, decisions and candidates, from the training distribution to every scenario. A
+reduction takes, beside that, a part for each block of episodes, however many are in it.
+
+Items of work are those of ``filtergym benchmark --full``; a training run, or the tuning of a policy, is one item, and
+what it makes is evaluated after it. They are given out as list scheduling does (Graham: Bounds on multiprocessing
+timing anomalies, SIAM J. Appl. Math. 17, 1969, 416-429): training and tuning first, the longest first, each to the
+core that is free first. What comes back is taken, one after the other, by the process that began the work.
+"""
+
+import argparse
+import functools
+import heapq
+import json
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
+
+import numpy
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.settings import THROUGH_THE_FILTER
+from filtergym.agents.training_run import FILES, Bookkeeping, new_run
+from filtergym.baselines.catalogue import baselines_of, package_of
+from filtergym.baselines.tuning import mean_cost
+from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
+from filtergym.evaluation.bootstrap import BLOCK, RESAMPLES, Bootstrap
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.summary import Asked, Part, _resampling, summarise, told_together, write_summary
+from rich.box import MARKDOWN
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from filtergym.names import asked_of
+from filtergym.reports.benchmark import cells
+
+EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
+MEASUREMENTS = 150_000
+"""Of a competitor, in which its unit cost is measured; no more than a block of episodes."""
+WARM = 8
+"""Episodes of the call before, which compiles."""
+VALIDATIONS = 20
+"""Of a training run."""
+CANDIDATE = 256
+"""Episodes that a candidate of a tuning meets, and an eighth of those that the best and the untuned one meet."""
+GIB = 2.0**30
+MOVES = (
+    "as it is",
+    "own metrics in pieces",
+    "and pieces joined by the workers",
+    "and cells told by the workers",
+)
+"""What would be changed, one after the other."""
+
+Units = dict[str, Any]
+"""What was measured, as a file of JSON holds it."""
+
+
+def spent(call: Callable[[], Any]) -> tuple[Any, float]:
+    """What a function returns, and its seconds of the processor."""
+    began = time.process_time()
+    found = call()
+    return found, time.process_time() - began
+
+
+def algorithms(id: str) -> list[str]:
+    """Algorithms that can train on an environment."""
+
+    def fits(name: str) -> bool:
+        try:
+            new_run(id, name)
+        except ValueError:
+            return False
+        return True
+
+    return [name for name in FILES if fits(name)]
+
+
+# --- unit costs
+
+
+def start_seconds() -> dict[str, float]:
+    """What every process does before its first piece of work."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    words = "import filtergym.evaluation.summary, filtergym.agents.bptt, filtergym.agents.sb3_training"
+    subprocess.run([sys.executable, "-c", words], check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    imports = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"imports": imports, "resampling": spent(lambda: Bootstrap(EPISODES, RESAMPLES))[1]}
+
+
+def competitor_units(asked: Asked, two_sizes: bool) -> Units:
+    """Seconds of a competitor's episodes and of what becomes of them, for one measurement of one episode.
+
+    Args:
+        asked: over ``EPISODES`` episodes; the first of them are run.
+        two_sizes: measure also what a block of episodes takes, however many are in it.
+    """
+    own = asked.metrics
+    seen: dict[str, float] = {}
+
+    def aside(run: Any, _: Bootstrap) -> list[Any]:
+        """The environment's own metrics, timed apart, with a resampling of the few episodes that there are."""
+        began = time.process_time()
+        beside = Bootstrap(run.sizes["episode"], RESAMPLES)
+        seen["own"] = spent(lambda: own(run, beside))[1] if own is not None else 0.0
+        seen["held"] = run.nbytes
+        seen["aside"] = time.process_time() - began
+        return []
+
+    def first(count: int) -> tuple[Any, float]:
+        part, seconds = spent(lambda: summarise(asked._replace(last=count, metrics=aside), lambda _: None))
+        return part, seconds - seen["aside"]
+
+    T = asked.horizon
+    count = min(BLOCK, MEASUREMENTS // T)
+    first(WARM)
+    part, seconds = first(count)
+    scale = count * T
+    found: Units = {
+        "episodes": count,
+        "work": seconds / scale,
+        "own": seen["own"] / scale,
+        "held": seen["held"] / scale,
+    }
+    if two_sizes:
+        few = first(count // 4)[1]
+        found["block"] = max(0.0, seconds - (seconds - few) / (count - count // 4) * count) / T
+    # What the process that began it does: one piece, and four of them.
+    packed = pickle.dumps(part)
+    # Each with arrays of its own, as they come from other processes: shared ones would be packed once.
+    copies, read = spent(lambda: [pickle.loads(packed) for _ in range(4)])
+    four, adding = spent(lambda: functools.reduce(Part.and_of, copies))
+    further = len(pickle.dumps(four)) - len(packed)
+    resampling = _resampling(EPISODES)
+    one, all_four = (
+        spent(lambda whole=whole: whole.finished(resampling))[1] for whole in (part, four)
+    )
+    slope = max(0.0, (all_four - one) / (3 * scale))
+    found |= {
+        "bytes": further / (3 * scale),
+        "piece_bytes": max(0.0, len(packed) / T - further / (3 * T)),
+        "read": (read / 4 + adding / 3) / len(packed),
+        "finish": slope,
+        "finish_once": max(0.0, one - slope * scale) / T,
+    }
+    return found
+
+
+def told_seconds(asked: Asked, episodes: int) -> float:
+    """What the process that began it does for one more competitor of a cell of so many episodes."""
+    whole: Any = summarise(asked._replace(episodes=8 * WARM, metrics=None), lambda _: None)
+    costs = numpy.resize(whole.contender.costs, episodes)
+    one = whole._replace(contender=whole.contender._replace(costs=costs), episodes=episodes)
+    other = one._replace(contender=one.contender._replace(name="other"))
+    other = other._replace(head=other.head.assign_coords(policy="other"))
+    _resampling(episodes)  # once for all cells
+    seconds = spent(lambda: told_together([one, other]))[1] / 2
+    with tempfile.TemporaryDirectory() as folder:
+        return seconds + spent(lambda: write_summary(Path(folder) / "one.npz", one, ""))[1]
+
+
+def training_units(id: str, algorithm: str, folder: Path) -> Units:
+    """Seconds of a training run: once, for each decision, and for each validation with what is saved then."""
+    import torch
+    from filtergym.agents.bptt import train_bptt
+    from filtergym.agents.sb3_training import train_sb3
+
+    torch.set_num_threads(1)
+    run = new_run(id, algorithm)
+    steps, values = run.steps, run.hyperparameters
+    task = make_task(id, run.control)
+    per_update = run.envs * int(values.get("n_steps", task.horizon // task.decision_interval))
+    if "learning_starts" in values:  # learning has begun when the clock starts
+        begin = int(values["learning_starts"]) + 20 * run.envs
+        run.steps = begin + 120 * run.envs
+        interval = run.steps // 2
+    else:
+        begin, interval = per_update, per_update
+        run.steps = (2 if per_update * 10 > steps else 3) * per_update
+    saving: list[float] = []
+    stamp: list[tuple[int, float, float]] = []
+    safe_point = Bookkeeping.safe_point
+
+    def timed(books: Bookkeeping, *words: Any, **named: Any) -> bool:
+        known = len(books.run.validation)
+        stop, seconds = spent(lambda: safe_point(books, *words, **named))
+        if len(books.run.validation) > known:
+            saving.append(seconds)
+        return stop
+
+    def progress(done: int) -> None:
+        if not stamp and done >= begin:
+            stamp.append((done, time.process_time(), sum(saving)))
+
+    train = train_bptt if algorithm in THROUGH_THE_FILTER else train_sb3
+    began = time.process_time()
+    with mock.patch.object(Bookkeeping, "safe_point", timed):
+        train(run, folder, interval=interval, progress=progress)
+    ended = time.process_time()
+    [(done, at, saved)] = stamp
+    decision = (ended - at - (sum(saving) - saved)) / (run.steps_done - done)
+    once = max(0.0, at - began - saved - decision * done)
+    return {"steps": steps, "decision": decision, "validation": saving[-1], "once": once}
+
+
+def tuning_seconds(id: str, name: str, kept: dict[str, Any]) -> float:
+    """Seconds of tuning a policy again with the decisions of the values that are shipped."""
+    tunable = baselines_of(id).tunable[name]
+    scenario = kept["scenario"]
+    seeds = episode_seeds("train", 0, CANDIDATE)
+    # Each candidate has other values, and so may have to be compiled.
+    middle = {value: 0.5 * (low + high) for value, (low, high) in tunable.limits.items()}
+    mean_cost(id, scenario, tunable, tunable.start, seeds)
+    seconds = spent(lambda: mean_cost(id, scenario, tunable, middle, seeds))[1]
+    task = make_task(id, tunable.control, find_scenario(catalogue()[id], scenario).name)
+    candidates = kept["environment_steps"] / (CANDIDATE * (task.horizon // task.decision_interval))
+    return (candidates + 8.0) * seconds
+
+
+def tuned_before(id: str) -> dict[str, Any]:
+    """Records of the tunings that are shipped."""
+    [path] = [Path(folder) / "tuned.json" for folder in package_of(id).__path__]
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def measured(path: Path) -> Units:
+    """Unit costs: what a file holds, and what it lacks, which is measured and written there."""
+    units: Units = json.loads(path.read_text()) if path.exists() else {}
+    work: list[tuple[tuple[str, ...], Callable[[], Any]]] = [(("start",), start_seconds)]
+    folder = tempfile.TemporaryDirectory()
+    for id in catalogue():
+        trained = {name: Path(folder.name) / short_name(id) / name for name in algorithms(id)}
+        for name, place in trained.items():
+            work.append((("training", id, name), lambda i=id, n=name, p=place: _trained(i, n, p)))
+        paper = baselines_of(id).score_paper
+        for name in (*_classical(id), *trained):
+            work.append(
+                (
+                    ("competitors", id, name),
+                    lambda i=id, n=name, t=trained, p=paper: competitor_units(_asked(i, n, t), n == p),
+                )
+            )
+        for name, kept in tuned_before(id).items():
+            work.append((("tuning", id, name), lambda i=id, n=name, k=kept: tuning_seconds(i, n, k)))
+    for part in (1, 4):  # at all episodes, and in the first environment at a quarter: is it linear?
+        for id in list(catalogue())[: 1 if part > 1 else None]:
+            work.append(
+                (
+                    ("told" if part == 1 else "told of a quarter", id),
+                    lambda i=id, e=EPISODES // part: told_seconds(
+                        _asked(i, baselines_of(i).score_paper, {}), e
+                    ),
+                )
+            )
+    missing = [(keys, call) for keys, call in work if not _there(units, keys)]
+    for keys, call in track(missing, "measuring", console=Console(stderr=True)):
+        place = units
+        for key in keys[:-1]:
+            place = place.setdefault(key, {})
+        place[keys[-1]] = call()
+        path.write_text(json.dumps(units, indent=1) + "\n")
+    folder.cleanup()
+    return units
+
+
+def _there(units: Units, keys: Sequence[str]) -> bool:
+    for key in keys:
+        if key not in units:
+            return False
+        units = units[key]
+    return True
+
+
+def _trained(id: str, name: str, folder: Path) -> Units:
+    folder.mkdir(parents=True, exist_ok=True)
+    return training_units(id, name, folder)
+
+
+def _asked(id: str, name: str, trained: dict[str, Path]) -> Asked:
+    """What is asked of a competitor, or of the agent in the folder of a short run, which is trained first if needed."""
+    where = trained.get(name, name)
+    if isinstance(where, Path) and not where.exists():
+        _trained(id, name, where)
+    alias = f"trained {name}" if isinstance(where, Path) else name  # the shipped agent has that name
+    [one] = asked_of(id, {alias: where}, None, EPISODES, drawn_episodes=1)
+    return one
+
+
+def _classical(id: str) -> list[str]:
+    """Competitors of the full benchmark without the agents that are shipped."""
+    [cell, *_] = cells(True, [id])
+    return [name for name in cell.policies if name not in shipped_agents(id)]
+
+
+# --- the plan
+
+
+class Item(NamedTuple):
+    """A piece of work."""
+
+    kind: str
+    environment: str
+    seconds: float
+    after: int = -1
+    """Item that must have ended; -1: none."""
+    parent: float = 0.0
+    """Seconds of the process that began the work, when the item has come back."""
+    sent: float = 0.0
+    """Bytes that come back."""
+
+
+def makespan(items: Sequence[Item], cores: int, start: float) -> float:
+    """When the process that began the work has taken in the last item, in seconds.
+
+    Args:
+        items: an item stands behind that which it comes after.
+        cores: processes that do items, beside the one that takes them in; one process does both.
+        start: seconds from the beginning until a process can do its first item.
+    """
+    if cores == 1:
+        return start + sum(item.seconds + item.parent for item in items)
+    later: dict[int, list[int]] = defaultdict(list)
+    for i, item in enumerate(items):
+        later[item.after].append(i)
+
+    def rank(i: int) -> tuple[bool, float, int]:
+        return items[i].kind == "evaluation", -items[i].seconds, i
+
+    ready = [rank(i) for i in later[-1]]
+    heapq.heapify(ready)
+    running: list[tuple[float, int]] = []
+    now = taken = start
+    while ready or running:
+        while ready and len(running) < cores:
+            *_, i = heapq.heappop(ready)
+            heapq.heappush(running, (now + items[i].seconds, i))
+        now, i = heapq.heappop(running)
+        taken = max(taken, now) + items[i].parent
+        for j in later[i]:
+            heapq.heappush(ready, rank(j))
+    return taken
+
+
+def run_seconds(u: Units) -> float:
+    """Of a training run."""
+    return u["once"] + u["steps"] * u["decision"] + VALIDATIONS * u["validation"]
+
+
+def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Item]:
+    """Every item of the comparison.
+
+    Args:
+        units: of :func:`measured`.
+        episodes: of a cell.
+        seeds: training runs of an algorithm.
+        moved: how many of ``MOVES`` have been made.
+    """
+    made: dict[tuple[str, str, int], int] = {}
+    count = 0
+    for id, trained in units["training"].items():
+        for name, u in trained.items():
+            seconds = run_seconds(u)
+            for seed in range(seeds):
+                made[id, name, seed] = count
+                count += 1
+                yield Item("training", id, seconds)
+    for id, tuned in units["tuning"].items():
+        for name, seconds in tuned.items():
+            made[id, f"{name}-tuned", 0] = count
+            count += 1
+            yield Item("tuning", id, seconds)
+    for cell in cells(True):
+        id = cell.environment
+        T = cell.measurements // (cell.episodes * len(cell.policies))
+        [one] = asked_of(id, cell.policies[:1], cell.scenario, episodes)
+        pieces = [
+            piece.measurements // T for piece in (one._replace(metrics=None) if moved else one).pieces()
+        ]
+        block = units["competitors"][id][baselines_of(id).score_paper]["block"]
+        told = units["told"][id] * episodes / EPISODES
+        for name, u in units["competitors"][id].items():
+            slope = max(0.0, u["work"] - block / u["episodes"]) + u["own"]
+            finish = T * (u["finish_once"] + u["finish"] * episodes)
+            sent = 0.0 if len(pieces) == 1 else T * (len(pieces) * u["piece_bytes"] + u["bytes"] * episodes)
+            # Of a competitor: putting its pieces together, and telling of it beside the others of its cell.
+            joining, done = (0.0, finish) if len(pieces) == 1 else (u["read"] * sent + finish, 0.0)
+            parent = (joining if moved < 2 else 0.0) + (told if moved < 3 else 0.0)
+            done += joining + told - parent if moved else 0.0
+            for seed in range(seeds if name in units["training"][id] else 1):
+                for part in pieces:
+                    seconds = T * (slope * part + block * -(-part // BLOCK)) + done / len(pieces)
+                    shared = parent / len(pieces), sent / len(pieces)
+                    yield Item("evaluation", id, seconds, made.get((id, name, seed), -1), *shared)
+
+
+# --- what is shown
+
+
+def titled(title: str, *heads: str) -> Table:
+    """A table whose first column is words and the others numbers."""
+    table = Table(title=title)
+    for i, head in enumerate(heads):
+        table.add_column(head, justify="right" if i else "left")
+    return table
+
+
+def number(value: float) -> str:
+    """Three digits."""
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def spread(values: Sequence[float]) -> str:
+    """Median and largest."""
+    return f"{number(float(numpy.median(values)))} ({number(max(values))})"
+
+
+def short(id: str) -> str:
+    return id.removeprefix("filtergym/").removesuffix("-v0")
+
+
+def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
+    """What was measured, and what follows for memory."""
+    table = titled(
+        f"Evaluation, median (dearest) of the competitors: µs of a core for a measurement; s for {episodes:,} episodes",
+        "environment", "competitors", "classical, µs", "learned, µs", "own metrics, µs", "joining, s", "telling, s",
+    )  # fmt: skip
+    memory = titled(
+        f"Memory of a process in the longest scenario, GiB; and what comes back of {episodes:,} episodes",
+        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} episodes", "that it needs now", "comes back, GiB",
+    )  # fmt: skip
+    training = titled(
+        "Training runs", "environment", "algorithm", "decisions", "µs a decision", "a validation, s", "a run, s", f"{seeds} seeds, h"
+    )  # fmt: skip
+    for id, found in units["competitors"].items():
+        learned = units["training"][id]
+        T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
+        work = {name: 1e6 * u["work"] for name, u in found.items()}
+        finish = [T * (u["finish_once"] + u["finish"] * episodes) for u in found.values()]
+        table.add_row(
+            short(id),
+            f"{len(found) - len(learned)} + {seeds} x {len(learned)}",
+            spread([value for name, value in work.items() if name not in learned]),
+            spread([work[name] for name in learned]),
+            spread([1e6 * u["own"] for u in found.values()]),
+            spread(finish),
+            number(units["told"][id] * episodes / EPISODES),
+        )
+        held = max(u["held"] for u in found.values()) * T / GIB
+        pieces = len(Asked("", "", None, None, episodes).pieces())
+        sent = [T * (pieces * u["piece_bytes"] + u["bytes"] * episodes) / GIB for u in found.values()]
+        own = baselines_of(id).metrics is not None
+        memory.add_row(
+            short(id), str(T), number(held * BLOCK), number(held * episodes), number(held * (episodes if own else BLOCK)), spread(sent)
+        )  # fmt: skip
+        for name, u in learned.items():
+            seconds = run_seconds(u)
+            training.add_row(
+                short(id),
+                name,
+                f"{u['steps']:,}",
+                number(1e6 * u["decision"]),
+                number(u["validation"]),
+                number(seconds),
+                number(seeds * seconds / 3600),
+            )
+    yield from (table, memory, training)
+
+
+def plan_tables(units: Units, episodes: int, seeds: int, cores: Sequence[int]) -> Iterator[Table]:
+    """Core hours, and how long it takes."""
+    hours = titled("Core hours", "environment", "tuning", "training", "evaluation", "joining and telling")
+    items = list(planned(units, episodes, seeds, 0))
+    for id in [*catalogue(), ""]:
+        own = [item for item in items if id in ("", item.environment)]
+        kinds = [sum(i.seconds for i in own if i.kind == k) for k in ("tuning", "training", "evaluation")]
+        hours.add_row(
+            short(id) or "all", *(number(s / 3600) for s in (*kinds, sum(item.parent for item in own)))
+        )
+    yield hours
+    table = titled(
+        f"{episodes:,} episodes a cell, {seeds} seeds",
+        "", "cores", "hours", "times one core", "work over cores, h", "longest chain, h", "first process, h", "most is",
+    )  # fmt: skip
+    start = sum(units["start"].values())
+    for moved, name in enumerate(MOVES):
+        items = list(planned(units, episodes, seeds, moved))
+        work = sum(item.seconds for item in items)
+        chain = max(i.seconds + (items[i.after].seconds if i.after >= 0 else 0.0) for i in items)
+        parent = sum(item.parent for item in items)
+        one = makespan(items, 1, start)
+        for n in cores:
+            taken = makespan(items, n, start)
+            bounds = {
+                "work": work / n,
+                "one chain": start + chain,
+                "the first process": parent,
+                "start": start,
+            }
+            table.add_row(
+                name,
+                f"{n:,}",
+                number(taken / 3600),
+                number(one / taken),
+                number(work / n / 3600),
+                number(chain / 3600),
+                number(parent / 3600),
+                "work" if n == 1 else max(bounds, key=lambda bound: bounds[bound]),
+            )
+            name = ""
+    yield table
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--units", type=Path, default=Path("units.json"), help="file of what was measured")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="of a cell")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="training runs of an algorithm")
+    parser.add_argument("--cores", type=int, nargs="+", default=CORES)
+    parser.add_argument("--markdown", action="store_true", help="print the tables for a page")
+    asked = parser.parse_args()
+    if min(asked.episodes, asked.seeds, *asked.cores) < 1:
+        parser.error("--episodes, --seeds and --cores must be at least 1")
+    warnings.simplefilter("ignore")  # of means over few episodes
+    units = measured(asked.units)
+    console = Console(width=160)
+    start = units["start"]
+    for table in (
+        *unit_tables(units, asked.episodes, asked.seeds),
+        *plan_tables(units, asked.episodes, asked.seeds, asked.cores),
+    ):
+        if asked.markdown:
+            console.print(f"**{table.title}**\n", highlight=False, markup=False)
+            table.box, table.title = MARKDOWN, None
+        console.print(table)
+    console.print(
+        f"A process begins with {start['imports']:.1f} s of imports and {start['resampling']:.1f} s of resampling "
+        f"{EPISODES:,} episodes, {(1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB in each; a quantile over them takes "
+        f"{8 * (1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB several times over."
+    )
+    for id, quarter in units["told of a quarter"].items():
+        console.print(
+            f"Telling of a competitor of {short(id)} takes {units['told'][id] / quarter:.2f} times what a quarter of the episodes does."
+        )
+
+
+if __name__ == "__main__":
+    main()
