@@ -39,6 +39,7 @@ from unittest import mock
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import numpy
+from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import FILES, Bookkeeping, new_run
@@ -46,6 +47,7 @@ from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.tuning import mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
 from filtergym.evaluation.bootstrap import BLOCK, RESAMPLES, Bootstrap
+from filtergym.evaluation.files import write_text
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.summary import Asked, Part, _resampling, summarise, told_together, write_summary
 from rich.box import MARKDOWN
@@ -54,7 +56,7 @@ from rich.progress import track
 from rich.table import Table
 
 from filtergym.names import asked_of
-from filtergym.reports.benchmark import cells
+from filtergym.reports.benchmark import benchmark_policies, cells
 
 EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
 MEASUREMENTS = 150_000
@@ -155,9 +157,7 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
     four, adding = spent(lambda: functools.reduce(Part.and_of, copies))
     further = len(pickle.dumps(four)) - len(packed)
     resampling = _resampling(EPISODES)
-    one, all_four = (
-        spent(lambda whole=whole: whole.finished(resampling))[1] for whole in (part, four)
-    )
+    one, all_four = (spent(lambda whole=whole: whole.finished(resampling))[1] for whole in (part, four))
     slope = max(0.0, (all_four - one) / (3 * scale))
     found |= {
         "bytes": further / (3 * scale),
@@ -169,8 +169,9 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
     return found
 
 
-def told_seconds(asked: Asked, episodes: int) -> float:
+def told_seconds(id: str, episodes: int) -> float:
     """What the process that began it does for one more competitor of a cell of so many episodes."""
+    [asked] = asked_of(id, baselines_of(id).score_paper, None, EPISODES, drawn_episodes=1)
     whole: Any = summarise(asked._replace(episodes=8 * WARM, metrics=None), lambda _: None)
     costs = numpy.resize(whole.contender.costs, episodes)
     one = whole._replace(contender=whole.contender._replace(costs=costs), episodes=episodes)
@@ -189,6 +190,7 @@ def training_units(id: str, algorithm: str, folder: Path) -> Units:
     from filtergym.agents.sb3_training import train_sb3
 
     torch.set_num_threads(1)
+    folder.mkdir(parents=True)
     run = new_run(id, algorithm)
     steps, values = run.steps, run.hyperparameters
     task = make_task(id, run.control)
@@ -246,43 +248,38 @@ def tuned_before(id: str) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def to_measure(folder: Path) -> Iterator[tuple[tuple[str, ...], Callable[[], Any]]]:
+    """Every unit cost: the keys under which it is kept, and what measures it; agents are trained in a folder."""
+    yield ("start",), start_seconds
+    for id in catalogue():
+        trained = {name: folder / short_name(id) / name for name in algorithms(id)}
+        for name, place in trained.items():
+            yield ("training", id, name), functools.partial(training_units, id, name, place)
+        for name in (*classical(id), *trained):
+            yield (
+                ("competitors", id, name),
+                functools.partial(
+                    _competitor, id, name, trained.get(name), name == baselines_of(id).score_paper
+                ),
+            )
+        for name, kept in tuned_before(id).items():
+            yield ("tuning", id, name), functools.partial(tuning_seconds, id, name, kept)
+        yield ("told", id), functools.partial(told_seconds, id, EPISODES)
+    id = next(iter(catalogue()))  # is it linear?
+    yield ("told of a quarter", id), functools.partial(told_seconds, id, EPISODES // 4)
+
+
 def measured(path: Path) -> Units:
     """Unit costs: what a file holds, and what it lacks, which is measured and written there."""
     units: Units = json.loads(path.read_text()) if path.exists() else {}
-    work: list[tuple[tuple[str, ...], Callable[[], Any]]] = [(("start",), start_seconds)]
-    folder = tempfile.TemporaryDirectory()
-    for id in catalogue():
-        trained = {name: Path(folder.name) / short_name(id) / name for name in algorithms(id)}
-        for name, place in trained.items():
-            work.append((("training", id, name), lambda i=id, n=name, p=place: _trained(i, n, p)))
-        paper = baselines_of(id).score_paper
-        for name in (*_classical(id), *trained):
-            work.append(
-                (
-                    ("competitors", id, name),
-                    lambda i=id, n=name, t=trained, p=paper: competitor_units(_asked(i, n, t), n == p),
-                )
-            )
-        for name, kept in tuned_before(id).items():
-            work.append((("tuning", id, name), lambda i=id, n=name, k=kept: tuning_seconds(i, n, k)))
-    for part in (1, 4):  # at all episodes, and in the first environment at a quarter: is it linear?
-        for id in list(catalogue())[: 1 if part > 1 else None]:
-            work.append(
-                (
-                    ("told" if part == 1 else "told of a quarter", id),
-                    lambda i=id, e=EPISODES // part: told_seconds(
-                        _asked(i, baselines_of(i).score_paper, {}), e
-                    ),
-                )
-            )
-    missing = [(keys, call) for keys, call in work if not _there(units, keys)]
-    for keys, call in track(missing, "measuring", console=Console(stderr=True)):
-        place = units
-        for key in keys[:-1]:
-            place = place.setdefault(key, {})
-        place[keys[-1]] = call()
-        path.write_text(json.dumps(units, indent=1) + "\n")
-    folder.cleanup()
+    with tempfile.TemporaryDirectory() as folder:
+        missing = [(keys, call) for keys, call in to_measure(Path(folder)) if not _there(units, keys)]
+        for keys, call in track(missing, "measuring", console=Console(stderr=True)):
+            place = units
+            for key in keys[:-1]:
+                place = place.setdefault(key, {})
+            place[keys[-1]] = call()
+            write_text(path, json.dumps(units, indent=1) + "\n")
     return units
 
 
@@ -294,25 +291,20 @@ def _there(units: Units, keys: Sequence[str]) -> bool:
     return True
 
 
-def _trained(id: str, name: str, folder: Path) -> Units:
-    folder.mkdir(parents=True, exist_ok=True)
-    return training_units(id, name, folder)
+def _competitor(id: str, name: str, trained: Path | None, two_sizes: bool) -> Units:
+    """Unit costs of a competitor, or of the agent of a short run, which is trained if it is not there."""
+    if trained is None:
+        return competitor_units(*asked_of(id, name, None, EPISODES, drawn_episodes=1), two_sizes)
+    if not trained.exists():
+        training_units(id, name, trained)
+    # A name of its own: the agent that is shipped has that of the algorithm.
+    named = {f"trained {name}": trained}
+    return competitor_units(*asked_of(id, named, None, EPISODES, drawn_episodes=1), two_sizes)
 
 
-def _asked(id: str, name: str, trained: dict[str, Path]) -> Asked:
-    """What is asked of a competitor, or of the agent in the folder of a short run, which is trained first if needed."""
-    where = trained.get(name, name)
-    if isinstance(where, Path) and not where.exists():
-        _trained(id, name, where)
-    alias = f"trained {name}" if isinstance(where, Path) else name  # the shipped agent has that name
-    [one] = asked_of(id, {alias: where}, None, EPISODES, drawn_episodes=1)
-    return one
-
-
-def _classical(id: str) -> list[str]:
+def classical(id: str) -> list[str]:
     """Competitors of the full benchmark without the agents that are shipped."""
-    [cell, *_] = cells(True, [id])
-    return [name for name in cell.policies if name not in shipped_agents(id)]
+    return [name for name in benchmark_policies(id, True) if name not in shipped_agents(id)]
 
 
 # --- the plan
@@ -357,10 +349,12 @@ def makespan(items: Sequence[Item], cores: int, start: float) -> float:
         while ready and len(running) < cores:
             *_, i = heapq.heappop(ready)
             heapq.heappush(running, (now + items[i].seconds, i))
-        now, i = heapq.heappop(running)
-        taken = max(taken, now) + items[i].parent
-        for j in later[i]:
-            heapq.heappush(ready, rank(j))
+        now = running[0][0]
+        while running and running[0][0] == now:
+            *_, i = heapq.heappop(running)
+            taken = max(taken, now) + items[i].parent
+            for j in later[i]:
+                heapq.heappush(ready, rank(j))
     return taken
 
 
@@ -407,8 +401,8 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
             sent = 0.0 if len(pieces) == 1 else T * (len(pieces) * u["piece_bytes"] + u["bytes"] * episodes)
             # Of a competitor: putting its pieces together, and telling of it beside the others of its cell.
             joining, done = (0.0, finish) if len(pieces) == 1 else (u["read"] * sent + finish, 0.0)
-            parent = (joining if moved < 2 else 0.0) + (told if moved < 3 else 0.0)
-            done += joining + told - parent if moved else 0.0
+            parent = [0.0, told, joining + told][max(0, 3 - max(moved, 1))]
+            done += joining + told - parent
             for seed in range(seeds if name in units["training"][id] else 1):
                 for part in pieces:
                     seconds = T * (slope * part + block * -(-part // BLOCK)) + done / len(pieces)
@@ -437,6 +431,13 @@ def spread(values: Sequence[float]) -> str:
     return f"{number(float(numpy.median(values)))} ({number(max(values))})"
 
 
+def shipped_seconds(id: str, algorithm: str) -> str:
+    """What the training of the agent that is shipped took, on the machine where it was made."""
+    path = PRETRAINED / short_name(id) / f"{algorithm}.json"
+    run = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+    return "" if run is None else number(run["seconds"]) + " (gated)" * bool(run.get("gated"))
+
+
 def short(id: str) -> str:
     return id.removeprefix("filtergym/").removesuffix("-v0")
 
@@ -449,10 +450,12 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
     )  # fmt: skip
     memory = titled(
         f"Memory of a process in the longest scenario, GiB; and what comes back of {episodes:,} episodes",
-        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} episodes", "that it needs now", "comes back, GiB",
+        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} episodes", "needed now",
+        "comes back of a competitor",
     )  # fmt: skip
     training = titled(
-        "Training runs", "environment", "algorithm", "decisions", "µs a decision", "a validation, s", "a run, s", f"{seeds} seeds, h"
+        "Training runs", "environment", "algorithm", "decisions", "µs a decision", "a validation, s", "a run, s",
+        "a shipped run took, s", f"{seeds} seeds, h",
     )  # fmt: skip
     for id, found in units["competitors"].items():
         learned = units["training"][id]
@@ -473,7 +476,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         sent = [T * (pieces * u["piece_bytes"] + u["bytes"] * episodes) / GIB for u in found.values()]
         own = baselines_of(id).metrics is not None
         memory.add_row(
-            short(id), str(T), number(held * BLOCK), number(held * episodes), number(held * (episodes if own else BLOCK)), spread(sent)
+            short(id), str(T), *(number(held * e) for e in (BLOCK, episodes, episodes if own else BLOCK)), spread(sent)
         )  # fmt: skip
         for name, u in learned.items():
             seconds = run_seconds(u)
@@ -484,6 +487,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
                 number(1e6 * u["decision"]),
                 number(u["validation"]),
                 number(seconds),
+                shipped_seconds(id, name),
                 number(seeds * seconds / 3600),
             )
     yield from (table, memory, training)
@@ -565,7 +569,8 @@ def main() -> None:
     )
     for id, quarter in units["told of a quarter"].items():
         console.print(
-            f"Telling of a competitor of {short(id)} takes {units['told'][id] / quarter:.2f} times what a quarter of the episodes does."
+            f"Telling of a competitor of {short(id)} takes {units['told'][id] / quarter:.2f} times what it takes of a "
+            "quarter of the episodes."
         )
 
 
