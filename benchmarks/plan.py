@@ -59,7 +59,7 @@ from filtergym.names import asked_of
 from filtergym.reports.benchmark import benchmark_policies, cells
 
 EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
-MEASUREMENTS = 150_000
+MEASUREMENTS = 100_000
 """Of a competitor, in which its unit cost is measured; no more than a block of episodes."""
 WARM = 8
 """Episodes of the call before, which compiles."""
@@ -200,8 +200,10 @@ def training_units(id: str, algorithm: str, folder: Path) -> Units:
         run.steps = begin + 120 * run.envs
         interval = run.steps // 2
     else:
-        begin, interval = per_update, per_update
-        run.steps = (2 if per_update * 10 > steps else 3) * per_update
+        # bptt tells of a whole update; the others of every step, the last before the update.
+        begin = per_update + (algorithm not in THROUGH_THE_FILTER)
+        run.steps = (2 if per_update * 20 > steps else 3) * per_update
+        interval = run.steps - per_update  # validated twice: the first time may compile
     saving: list[float] = []
     stamp: list[tuple[int, float, float]] = []
     safe_point = Bookkeeping.safe_point
