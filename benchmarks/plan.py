@@ -1,8 +1,8 @@
 """What the full comparison costs: every competitor, every algorithm with 20 training seeds, 100 000 episodes a cell.
 
-``python benchmarks/plan.py --units units.json`` measures unit costs on one core, six minutes, and prints the plan of
-docs/plan.md; what the file holds already is not measured again, so that other numbers of episodes, seeds and cores
-take seconds.
+``python benchmarks/plan.py --units units.json`` measures unit costs on one core, some seven minutes, and prints
+the plan of docs/plan.md. What the file holds is not measured again: a run that was interrupted goes on, and other
+numbers of episodes, seeds and cores take seconds.
 
 Measured, in seconds of the processor, after what is compiled has been compiled: for every competitor of the full
 benchmark, and an agent of every algorithm after a short training, ``summarise`` over some episodes of the training
@@ -317,6 +317,7 @@ class Item(NamedTuple):
 
     kind: str
     environment: str
+    name: str
     seconds: float
     after: int = -1
     """Item that must have ended; -1: none."""
@@ -382,12 +383,12 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
             for seed in range(seeds):
                 made[id, name, seed] = count
                 count += 1
-                yield Item("training", id, seconds)
+                yield Item("training", id, name, seconds)
     for id, tuned in units["tuning"].items():
         for name, seconds in tuned.items():
             made[id, f"{name}-tuned", 0] = count
             count += 1
-            yield Item("tuning", id, seconds)
+            yield Item("tuning", id, name, seconds)
     for cell in cells(True):
         id = cell.environment
         T = cell.measurements // (cell.episodes * len(cell.policies))
@@ -409,7 +410,7 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
                 for part in pieces:
                     seconds = T * (slope * part + block * -(-part // BLOCK)) + done / len(pieces)
                     shared = parent / len(pieces), sent / len(pieces)
-                    yield Item("evaluation", id, seconds, made.get((id, name, seed), -1), *shared)
+                    yield Item("evaluation", id, name, seconds, made.get((id, name, seed), -1), *shared)
 
 
 # --- what is shown
@@ -561,16 +562,28 @@ def main() -> None:
         *plan_tables(units, asked.episodes, asked.seeds, asked.cores),
     ):
         if asked.markdown:
-            console.print(f"**{table.title}**\n", highlight=False, markup=False)
-            table.box, table.title = MARKDOWN, None
-        console.print(table)
-    console.print(
+            title, table.title, table.box = table.title, None, MARKDOWN
+            with console.capture() as shown:
+                console.print(table)
+            lines = [line.rstrip() for line in shown.get().splitlines()]
+            print(f"**{title}**", "", *(line for line in lines if line), "", sep="\n")
+        else:
+            console.print(table)
+    items = list(planned(units, asked.episodes, asked.seeds, 0))
+    dear = max(items, key=lambda item: item.seconds)
+    long = max((item for item in items if item.kind == "training"), key=lambda item: item.seconds)
+    print(
+        f"{len(items):,} items of work. The longest, as it is: {dear.kind} of {dear.name} in "
+        f"{short(dear.environment)}, {dear.seconds / 3600:.2f} h; of training {long.name} in "
+        f"{short(long.environment)}, {long.seconds:.0f} s."
+    )
+    print(
         f"A process begins with {start['imports']:.1f} s of imports and {start['resampling']:.1f} s of resampling "
         f"{EPISODES:,} episodes, {(1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB in each; a quantile over them takes "
         f"{8 * (1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB several times over."
     )
     for id, quarter in units["told of a quarter"].items():
-        console.print(
+        print(
             f"Telling of a competitor of {short(id)} takes {units['told'][id] / quarter:.2f} times what it takes of a "
             "quarter of the episodes."
         )

@@ -142,6 +142,7 @@ def test_every_page_of_results_says_what_makes_it():
         ("comparison.md", "filtergym comparison results/results.json --into docs/comparison.md"),
         ("training_seeds.md", "--into docs/training_seeds.md"),
         ("speed.md", "python benchmarks/throughput.py"),
+        ("plan.md", "python benchmarks/plan.py"),
     ):
         assert words in (DOCS / name).read_text(encoding="utf-8"), name
     for report in (DOCS / "reproductions").glob("*/report.md"):

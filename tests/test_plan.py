@@ -40,15 +40,15 @@ def test_items_are_given_out_as_by_a_clock(cores):
         for i in range(30):
             after = int(rng.integers(-1, i)) if i and rng.random() < 0.5 else -1
             kind = "training" if rng.random() < 0.3 else "evaluation"
-            items.append(plan.Item(kind, "", int(rng.integers(1, 9)), after, int(rng.integers(0, 3))))
+            items.append(plan.Item(kind, "", "", int(rng.integers(1, 9)), after, int(rng.integers(0, 3))))
         assert plan.makespan(items, cores, 5) == ticking(items, cores, 5)
 
 
 def test_one_process_does_everything_one_after_the_other():
-    items = [plan.Item("evaluation", "", 3.0, -1, 0.5), plan.Item("evaluation", "", 2.0, 0, 0.25)]
+    items = [plan.Item("evaluation", "", "", 3.0, -1, 0.5), plan.Item("evaluation", "", "", 2.0, 0, 0.25)]
     assert plan.makespan(items, 1, 1.0) == 6.75
 
 
 def test_who_takes_items_in_can_be_what_all_wait_for():
-    items = [plan.Item("evaluation", "", 1.0, -1, 10.0) for _ in range(8)]
+    items = [plan.Item("evaluation", "", "", 1.0, -1, 10.0) for _ in range(8)]
     assert plan.makespan(items, 8, 0.0) == 81.0
