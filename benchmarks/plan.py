@@ -6,8 +6,8 @@ numbers of episodes, seeds and cores take seconds.
 
 Measured, in seconds of the processor, after what is compiled has been compiled: for every competitor of the full
 benchmark, and an agent of every algorithm after a short training, ``summarise`` over some episodes of the training
-distribution; the environment's own metrics; what the process that began the work does with what comes back; a few
-updates of every algorithm, and a validation; one candidate of every tuning.
+distribution; what the process that began the work does with what comes back; a few updates of every algorithm, and a
+validation; one candidate of every tuning.
 
 Extrapolated: linearly in measurements, decisions and candidates, from the training distribution to every scenario. A
 reduction takes, beside that, a part for each block of episodes, however many are in it.
@@ -47,7 +47,9 @@ from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.tuning import mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
 from filtergym.evaluation.bootstrap import BLOCK, RESAMPLES, Bootstrap
+from filtergym.evaluation.curves import DISTRIBUTED
 from filtergym.evaluation.files import write_text
+from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.summary import Asked, Part, _resampling, summarise, told_together, write_summary
 from rich.box import MARKDOWN
@@ -68,12 +70,7 @@ VALIDATIONS = 20
 CANDIDATE = 256
 """Episodes that a candidate of a tuning meets, and an eighth of those that the best and the untuned one meet."""
 GIB = 2.0**30
-MOVES = (
-    "as it is",
-    "own metrics in pieces",
-    "and pieces joined by the workers",
-    "and cells told by the workers",
-)
+MOVES = ("as it is", "pieces joined by the workers", "and cells told by the workers")
 """What would be changed, one after the other."""
 
 Units = dict[str, Any]
@@ -120,33 +117,24 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
         asked: over ``EPISODES`` episodes; the first of them are run.
         two_sizes: measure also what a block of episodes takes, however many are in it.
     """
-    own = asked.metrics
-    seen: dict[str, float] = {}
+    own, held = asked.metrics, [0]
 
-    def aside(run: Any, _: Bootstrap) -> list[Any]:
-        """The environment's own metrics, timed apart, with a resampling of the few episodes that there are."""
-        began = time.process_time()
-        beside = Bootstrap(run.sizes["episode"], RESAMPLES)
-        seen["own"] = spent(lambda: own(run, beside))[1] if own is not None else 0.0
-        seen["held"] = run.nbytes
-        seen["aside"] = time.process_time() - began
-        return []
+    def gather(run: Any) -> Gathered:
+        """Look at how much is held of the episodes."""
+        held.append(run.nbytes)
+        return own.gather(run) if own is not None else Gathered()
+
+    watched = OwnMetrics(gather, lambda *_: [])
 
     def first(count: int) -> tuple[Any, float]:
-        part, seconds = spent(lambda: summarise(asked._replace(last=count, metrics=aside), lambda _: None))
-        return part, seconds - seen["aside"]
+        return spent(lambda: summarise(asked._replace(last=count, metrics=watched), lambda _: None))
 
     T = asked.horizon
     count = min(BLOCK, MEASUREMENTS // T)
     first(WARM)
     part, seconds = first(count)
     scale = count * T
-    found: Units = {
-        "episodes": count,
-        "work": seconds / scale,
-        "own": seen["own"] / scale,
-        "held": seen["held"] / scale,
-    }
+    found: Units = {"episodes": count, "work": seconds / scale, "held": held[-1] / scale}
     if two_sizes:
         few = first(count // 4)[1]
         found["block"] = max(0.0, seconds - (seconds - few) / (count - count // 4) * count) / T
@@ -155,13 +143,16 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
     # Each with arrays of its own, as they come from other processes: shared ones would be packed once.
     copies, read = spent(lambda: [pickle.loads(packed) for _ in range(4)])
     four, adding = spent(lambda: functools.reduce(Part.and_of, copies))
-    further = len(pickle.dumps(four)) - len(packed)
+    further = (len(pickle.dumps(four)) - len(packed)) / 3
+    # Distributions are told of so many measurements and no more; costs and the like are kept of all episodes.
+    distributed = sum(len(pickle.dumps(v)) for key, v in part.drawn.kept.items() if key != "mean_cost")
     resampling = _resampling(EPISODES)
-    one, all_four = (spent(lambda whole=whole: whole.finished(resampling))[1] for whole in (part, four))
+    one, all_four = (spent(lambda whole=whole: whole.finished(resampling, None))[1] for whole in (part, four))
     slope = max(0.0, (all_four - one) / (3 * scale))
     found |= {
-        "bytes": further / (3 * scale),
-        "piece_bytes": max(0.0, len(packed) / T - further / (3 * T)),
+        "distributed": distributed / scale,
+        "bytes": max(0.0, further - distributed) / count,
+        "piece_bytes": max(0.0, len(packed) - further) / T,
         "read": (read / 4 + adding / 3) / len(packed),
         "finish": slope,
         "finish_once": max(0.0, one - slope * scale) / T,
@@ -361,6 +352,25 @@ def makespan(items: Sequence[Item], cores: int, start: float) -> float:
     return taken
 
 
+def distributed(episodes: int, T: int) -> int:
+    """Episodes whose distribution is told."""
+    return min(episodes, max(BLOCK, DISTRIBUTED // T))
+
+
+def sent_bytes(u: Units, pieces: int, episodes: int, T: int) -> float:
+    """What comes back of a competitor."""
+    return (
+        pieces * T * u["piece_bytes"]
+        + episodes * u["bytes"]
+        + distributed(episodes, T) * T * u["distributed"]
+    )
+
+
+def finish_seconds(u: Units, episodes: int, T: int) -> float:
+    """Of turning what all episodes come to into measures and curves."""
+    return T * (u["finish_once"] + u["finish"] * distributed(episodes, T))
+
+
 def run_seconds(u: Units) -> float:
     """Of a training run."""
     return u["once"] + u["steps"] * u["decision"] + VALIDATIONS * u["validation"]
@@ -393,18 +403,18 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
         id = cell.environment
         T = cell.measurements // (cell.episodes * len(cell.policies))
         [one] = asked_of(id, cell.policies[:1], cell.scenario, episodes)
-        pieces = [
-            piece.measurements // T for piece in (one._replace(metrics=None) if moved else one).pieces()
-        ]
+        pieces = [piece.measurements // T for piece in one.pieces()]
         block = units["competitors"][id][baselines_of(id).score_paper]["block"]
         told = units["told"][id] * episodes / EPISODES
         for name, u in units["competitors"][id].items():
-            slope = max(0.0, u["work"] - block / u["episodes"]) + u["own"]
-            finish = T * (u["finish_once"] + u["finish"] * episodes)
-            sent = 0.0 if len(pieces) == 1 else T * (len(pieces) * u["piece_bytes"] + u["bytes"] * episodes)
+            slope = max(0.0, u["work"] - block / u["episodes"])
+            finish, sent = finish_seconds(u, episodes, T), 0.0
             # Of a competitor: putting its pieces together, and telling of it beside the others of its cell.
-            joining, done = (0.0, finish) if len(pieces) == 1 else (u["read"] * sent + finish, 0.0)
-            parent = [0.0, told, joining + told][max(0, 3 - max(moved, 1))]
+            joining, done = 0.0, finish
+            if len(pieces) > 1:
+                sent = sent_bytes(u, len(pieces), episodes, T)
+                joining, done = u["read"] * sent + finish, 0.0
+            parent = (joining + told, told, 0.0)[moved]
             done += joining + told - parent
             for seed in range(seeds if name in units["training"][id] else 1):
                 for part in pieces:
@@ -449,12 +459,11 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
     """What was measured, and what follows for memory."""
     table = titled(
         f"Evaluation, median (dearest) of the competitors: µs of a core for a measurement; s for {episodes:,} episodes",
-        "environment", "competitors", "classical, µs", "learned, µs", "own metrics, µs", "joining, s", "telling, s",
+        "environment", "competitors", "classical, µs", "learned, µs", "joining, s", "telling, s",
     )  # fmt: skip
     memory = titled(
         f"Memory of a process in the longest scenario, GiB; and what comes back of {episodes:,} episodes",
-        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} episodes", "needed now",
-        "comes back of a competitor",
+        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} at once", "comes back of a competitor",
     )  # fmt: skip
     training = titled(
         "Training runs", "environment", "algorithm", "decisions", "µs a decision", "a validation, s", "a run, s",
@@ -464,23 +473,20 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        finish = [T * (u["finish_once"] + u["finish"] * episodes) for u in found.values()]
+        pieces = len(Asked("", "", None, None, episodes).pieces())
+        sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
+        joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(
             short(id),
             f"{len(found) - len(learned)} + {seeds} x {len(learned)}",
             spread([value for name, value in work.items() if name not in learned]),
             spread([work[name] for name in learned]),
-            spread([1e6 * u["own"] for u in found.values()]),
-            spread(finish),
+            spread(joining),
             number(units["told"][id] * episodes / EPISODES),
         )
         held = max(u["held"] for u in found.values()) * T / GIB
-        pieces = len(Asked("", "", None, None, episodes).pieces())
-        sent = [T * (pieces * u["piece_bytes"] + u["bytes"] * episodes) / GIB for u in found.values()]
-        own = baselines_of(id).metrics is not None
-        memory.add_row(
-            short(id), str(T), *(number(held * e) for e in (BLOCK, episodes, episodes if own else BLOCK)), spread(sent)
-        )  # fmt: skip
+        sizes = spread([size / GIB for size in sent.values()])
+        memory.add_row(short(id), str(T), *(number(held * e) for e in (BLOCK, episodes)), sizes)
         for name, u in learned.items():
             seconds = run_seconds(u)
             training.add_row(
@@ -579,8 +585,7 @@ def main() -> None:
     )
     print(
         f"A process begins with {start['imports']:.1f} s of imports and {start['resampling']:.1f} s of resampling "
-        f"{EPISODES:,} episodes, {(1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB in each; a quantile over them takes "
-        f"{8 * (1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB several times over."
+        f"{EPISODES:,} episodes, {(1 + RESAMPLES) * asked.episodes / GIB:.2g} GiB in each."
     )
     for id, quarter in units["told of a quarter"].items():
         print(
