@@ -6,6 +6,7 @@ few numbers of it or what is only averaged over the episodes; and what follows f
 
 import functools
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy
@@ -52,7 +53,8 @@ class Taken(NamedTuple):
         )
 
 
-class OwnMetrics(NamedTuple):
+@dataclass(frozen=True)
+class OwnMetrics:
     """The metrics of an environment."""
 
     gather: Callable[[xarray.Dataset], Gathered]

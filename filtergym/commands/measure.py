@@ -213,10 +213,20 @@ def evaluate_policies(
     refusal = _unwritten(errors, errors, netcdf) if out is not None else "nobody asked"
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
     everything = bool(task.flights) or estimates is not None or not refusal
-    of_all: Any = (cls.id, names, flown, episodes, seed, split, control)
-    drawn = int(out is not None and estimates is None)
-    options: dict[str, Any] = {"trust": trust, "backend": backend, "threads": threads, **keywords}
-    options |= {"drawn_episodes": drawn}
+    options: dict[str, Any] = {
+        "env": cls.id,
+        "competitors": names,
+        "scenario": flown,
+        "episodes": episodes,
+        "seed": seed,
+        "split": split,
+        "control": control,
+        "trust": trust,
+        "drawn_episodes": int(out is not None and estimates is None),
+        "backend": backend,
+        "threads": threads,
+        **keywords,
+    }
     curves, kept = None, []
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
@@ -225,11 +235,9 @@ def evaluate_policies(
             bar.update(line, advance=done)
 
         if everything:
-            dataset = evaluate(
-                *of_all, progress=tick, tracks=estimates is not None, workers=workers, **options
-            )
+            dataset = evaluate(progress=tick, tracks=estimates is not None, workers=workers, **options)
         else:
-            asked = asked_of(*of_all, **options)
+            asked = asked_of(**options)
             kept = [None if out is None else kept_in(out / UNFINISHED, one) for one in asked]
             found = dict(summaries(asked, workers, tick, kept))
     if everything:
