@@ -46,7 +46,7 @@ from filtergym.agents.training_run import FILES, Bookkeeping, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.tuning import mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
-from filtergym.evaluation.bootstrap import BLOCK, RESAMPLES, Bootstrap
+from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTED
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
@@ -130,7 +130,7 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
         return spent(lambda: summarise(asked._replace(last=count, metrics=watched), lambda _: None))
 
     T = asked.horizon
-    count = min(BLOCK, MEASUREMENTS // T)
+    count = min(block_of(T), MEASUREMENTS // T)
     first(WARM)
     part, seconds = first(count)
     scale = count * T
@@ -354,7 +354,7 @@ def makespan(items: Sequence[Item], cores: int, start: float) -> float:
 
 def distributed(episodes: int, T: int) -> int:
     """Episodes whose distribution is told."""
-    return min(episodes, max(BLOCK, DISTRIBUTED // T))
+    return min(episodes, max(block_of(T), DISTRIBUTED // T))
 
 
 def sent_bytes(u: Units, pieces: int, episodes: int, T: int) -> float:
@@ -418,7 +418,7 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
             done += joining + told - parent
             for seed in range(seeds if name in units["training"][id] else 1):
                 for part in pieces:
-                    seconds = T * (slope * part + block * -(-part // BLOCK)) + done / len(pieces)
+                    seconds = T * (slope * part + block * -(-part // block_of(T))) + done / len(pieces)
                     shared = parent / len(pieces), sent / len(pieces)
                     yield Item("evaluation", id, name, seconds, made.get((id, name, seed), -1), *shared)
 
@@ -463,7 +463,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
     )  # fmt: skip
     memory = titled(
         f"Memory of a process in the longest scenario, GiB; and what comes back of {episodes:,} episodes",
-        "environment", "measurements", f"{BLOCK} episodes", f"{episodes:,} at once", "comes back of a competitor",
+        "environment", "measurements", "a block of episodes", f"{episodes:,} at once", "comes back of a competitor",
     )  # fmt: skip
     training = titled(
         "Training runs", "environment", "algorithm", "decisions", "µs a decision", "a validation, s", "a run, s",
@@ -473,7 +473,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(Asked("", "", None, None, episodes).pieces())
+        pieces = len(Asked("", "", None, None, episodes, horizon=T).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(
@@ -486,7 +486,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         )
         held = max(u["held"] for u in found.values()) * T / GIB
         sizes = spread([size / GIB for size in sent.values()])
-        memory.add_row(short(id), str(T), *(number(held * e) for e in (BLOCK, episodes)), sizes)
+        memory.add_row(short(id), str(T), *(number(held * e) for e in (block_of(T), episodes)), sizes)
         for name, u in learned.items():
             seconds = run_seconds(u)
             training.add_row(

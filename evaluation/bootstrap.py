@@ -23,7 +23,11 @@ import numpy
 
 RESAMPLES = 1000
 BLOCK = 2048
-"""Episodes that are weighted at a time; or resamples, of which one 64th."""
+"""Episodes that are weighted at a time."""
+AT_ONCE = 32
+"""Resamples whose weights of all episodes are held at a time."""
+FEWEST, MEASUREMENTS = 256, 2**20
+"""Episodes that are run at a time, at least, and their measurements."""
 CONFIDENCE = 0.95
 
 
@@ -51,6 +55,15 @@ def mean_of_sums(sums: Sums) -> numpy.ndarray:
     if there is None:
         return values
     return numpy.divide(values, there, out=numpy.full(values.shape, numpy.nan), where=there > 0.0)
+
+
+def block_of(times: int) -> int:
+    """Return how many episodes are run, and reduced, at a time: enough to be fast, few enough to stay in memory.
+
+    Args:
+        times: measurements of an episode.
+    """
+    return min(BLOCK, max(FEWEST, MEASUREMENTS // times))
 
 
 class Bootstrap:
@@ -107,8 +120,8 @@ class Bootstrap:
 
     def by_resamples(self, order: numpy.ndarray) -> Iterator[numpy.ndarray]:
         """Share of the episodes in an order, ``(some, episodes)``, of the data and some resamples after the other."""
-        for i in range(0, len(self.counts), BLOCK // 64):
-            yield self.counts[i : i + BLOCK // 64, order] / self.totals[i : i + BLOCK // 64, None]
+        for i in range(0, len(self.counts), AT_ONCE):
+            yield self.counts[i : i + AT_ONCE, order] / self.totals[i : i + AT_ONCE, None]
 
     def sums(self, values: numpy.ndarray, first: int = 0) -> Sums:
         """Add up what some episodes contribute to :meth:`means`.

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import BLOCK, Bootstrap, Sums, added, mean_of_sums
+from .bootstrap import Bootstrap, Sums, added, block_of, mean_of_sums
 from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
@@ -60,7 +60,7 @@ def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
           gains that a bank records, likewise;
         * ``mean_cost`` (policy): over episodes.
 
-        Errors exceeded, actions and gains are those of the first ``DISTRIBUTED`` measurements, or of the first 2048
+        Errors exceeded, actions and gains are those of the first ``DISTRIBUTED`` measurements, or of the first 256
         episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every quantity
         (the groups of components where there are any, else the first three components), ``elapsed`` (s) of every
         measurement, where they come regularly, and windows as the dataset has them. Attributes environment, scenario,
@@ -140,10 +140,13 @@ def drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Dra
     Args:
         run: one policy's part of an evaluation.
         bootstrap: over the episodes of the whole evaluation.
-        first: number of the run's first episode among them; a multiple of :data:`.bootstrap.BLOCK`.
+        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
-    blocks = range(0, run.sizes["episode"], BLOCK)
-    parts = [_drawn_from(run.isel(episode=slice(i, i + BLOCK)), bootstrap, first + i) for i in blocks]
+    block = block_of(run.sizes["time"])
+    parts = [
+        _drawn_from(run.isel(episode=slice(i, i + block)), bootstrap, first + i)
+        for i in range(0, run.sizes["episode"], block)
+    ]
     return functools.reduce(Drawn.and_of, parts)
 
 
@@ -151,7 +154,7 @@ def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
     sums: dict[str, Sums] = {}
     totals: dict[str, numpy.ndarray] = {}
     kept: dict[str, list[numpy.ndarray]] = {}
-    distributed = slice(max(0, max(BLOCK, DISTRIBUTED // run.sizes["time"]) - first))
+    distributed = slice(max(0, max(block_of(run.sizes["time"]), DISTRIBUTED // run.sizes["time"]) - first))
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)

@@ -18,6 +18,7 @@ from ..envs.compiled import Report
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
+from .bootstrap import block_of
 from .competitors import RANKED, Kind, check_competitor, kind_of, made
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers
@@ -29,8 +30,6 @@ LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
 DRAWN = "drawn_"
 """Begins the names of what is kept of the first episodes only."""
-CHUNK = 2048
-"""Episodes evaluated side by side: enough to be fast, few enough to stay in memory."""
 
 
 def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
@@ -207,10 +206,11 @@ def evaluate(
     if tracks and drawn_episodes:
         raise ValueError("tracks keeps every episode: leave out drawn_episodes")
     workers = workers or Workers()
+    block = block_of(next(iter(plan.tasks.values())).horizon)
     pieces = [
-        plan.piece(name, first, CHUNK, tracks, drawn_episodes, workers.alone)
+        plan.piece(name, first, block, tracks, drawn_episodes, workers.alone)
         for name in competitors
-        for first in range(0, len(plan.seeds), CHUNK)
+        for first in range(0, len(plan.seeds), block)
     ]
     if not workers.alone:
         check_sendable(plan.id, competitors)
@@ -264,25 +264,19 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
             threads=piece.threads,
             **piece.keywords,
         )
-    drawn = piece.drawn_episodes
-    chunks = []
-    for i in range(0, len(piece.seeds), CHUNK):
-        first = piece.first + i
-        chunks.append(
-            run_competitor(
-                task,
-                _made(piece.name, piece.maker, piece.kind, task),
-                piece.kind,
-                piece.seeds[i : i + CHUNK],
-                _report(task, piece.tracks, drawn > first),
-                tick,
-                piece.name,
-                first,
-                actions=True,
-                only={DRAWN: drawn - first},
-            )
-        )
-    return _in_one(chunks)
+    found: dict[str, numpy.ndarray] = run_competitor(
+        task,
+        _made(piece.name, piece.maker, piece.kind, task),
+        piece.kind,
+        piece.seeds,
+        _report(task, piece.tracks, piece.drawn_episodes > piece.first),
+        tick,
+        piece.name,
+        piece.first,
+        actions=True,
+        only={DRAWN: piece.drawn_episodes - piece.first},
+    )
+    return found
 
 
 def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:

@@ -13,7 +13,7 @@ import numpy
 import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
-from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, Sums, added, mean_of_sums
+from .bootstrap import RESAMPLES, Bootstrap, Estimate, Sums, added, block_of, mean_of_sums
 from .competitors import RANKED
 from .dataset import groups_of, seed_of, windows_of, with_windows
 from .threads import one_thread
@@ -168,11 +168,12 @@ def judge(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Judged:
     Args:
         run: one policy's part of an evaluation.
         bootstrap: over the episodes of the whole evaluation.
-        first: number of the run's first episode among them; a multiple of :data:`.bootstrap.BLOCK`.
+        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
     found: Judged | None = None
-    for i in range(0, run.sizes["episode"], BLOCK):
-        part = run.isel(episode=slice(i, i + BLOCK))
+    block = block_of(run.sizes["time"])
+    for i in range(0, run.sizes["episode"], block):
+        part = run.isel(episode=slice(i, i + block))
         averaged: dict[Key, Averaged] = {}
         for s in _statistics(part, bootstrap.episodes):
             averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first + i)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import BLOCK, Bootstrap, Sums, added, mean_of_sums
+from .bootstrap import Bootstrap, Sums, added, block_of, mean_of_sums
 from .metrics import Measure
 
 Arrays = Mapping[str, numpy.ndarray]
@@ -68,11 +68,11 @@ class OwnMetrics:
         Args:
             run: one policy's part of an evaluation.
             bootstrap: over the episodes of the whole evaluation.
-            first: number of the run's first episode among them; a multiple of :data:`.bootstrap.BLOCK`.
+            first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
         """
-        found = []
-        for i in range(0, run.sizes["episode"], BLOCK):
-            each, averaged, common = self.gather(run.isel(episode=slice(i, i + BLOCK)))
+        found, block = [], block_of(run.sizes["time"])
+        for i in range(0, run.sizes["episode"], block):
+            each, averaged, common = self.gather(run.isel(episode=slice(i, i + block)))
             sums = {key: bootstrap.sums(values, first + i) for key, values in averaged.items()}
             found.append(Taken({key: [values] for key, values in each.items()}, sums, dict(common)))
         return functools.reduce(Taken.and_of, found)

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import RESAMPLES, Bootstrap, Estimate
+from .bootstrap import RESAMPLES, Bootstrap, Estimate, block_of
 from .curves import Drawn, Finished, drawn_from, joined
-from .evaluate import CHUNK, DRAWN, check_sendable, plan_of, run_piece
+from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Judged, Measure, Record, judge, records_of
 from .own_metrics import OwnMetrics, Taken
@@ -26,8 +26,8 @@ from .rollout import Progress
 
 CURVE_RESAMPLES = 200
 """Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
-TOGETHER = 4 * CHUNK
-"""Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+TOGETHER = 4
+"""Blocks of episodes of a piece of work: enough that what comes back is little beside what was done for it."""
 
 
 class Asked(NamedTuple):
@@ -64,10 +64,11 @@ class Asked(NamedTuple):
 
     def pieces(self) -> list["Asked"]:
         """Return the pieces of work that this is: one, unless there are many episodes."""
-        if self.episodes <= TOGETHER:
+        together = TOGETHER * block_of(self.horizon)
+        if self.episodes <= together:
             return [self]
-        begins = range(0, self.episodes, TOGETHER)
-        return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
+        begins = range(0, self.episodes, together)
+        return [self._replace(first=i, last=min(i + together, self.episodes)) for i in begins]
 
 
 class Summary(NamedTuple):
@@ -145,8 +146,9 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     curves = bootstrap.fewer(CURVE_RESAMPLES)
     last = asked.episodes if asked.last is None else asked.last
     found: Part | None = None
-    for i in range(asked.first, last, CHUNK):
-        piece = plan.piece(asked.name, i, min(CHUNK, last - i), False, asked.drawn_episodes, True)
+    block = block_of(plan.tasks[asked.name].horizon)
+    for i in range(asked.first, last, block):
+        piece = plan.piece(asked.name, i, min(block, last - i), False, asked.drawn_episodes, True)
         run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
         run = run.isel(policy=0)
         own = None if asked.metrics is None else asked.metrics.take(run, bootstrap, i)

@@ -1,7 +1,5 @@
 """Episode i is episode i, bit for bit, whatever the number of episodes that are evaluated with it."""
 
-import importlib
-
 import gymnasium
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
 from filtergym import evaluate
 from filtergym.names import competitor
 
-module = importlib.import_module("filtergym.evaluation.evaluate")
 ID = "filtergym/ManeuveringTarget-v0"
 
 
@@ -32,7 +29,7 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
     everyone = evaluate(env_id, names, episodes=13, **short)
     for count in (1, 3):
         assert_same(evaluate(env_id, names, episodes=count, **short), everyone)
-    monkeypatch.setattr(module, "CHUNK", 8)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     assert_same(evaluate(env_id, names, episodes=13, **short), everyone)
 
 
@@ -46,7 +43,7 @@ residual.control = "gain"
 
 def test_random_actions_are_every_episodes_own(monkeypatch):
     makers = {"random": "random", "residual": residual}
-    monkeypatch.setattr(module, "CHUNK", 8)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     everyone = evaluate(ID, makers, episodes=17, horizon=10)
     assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
     policy = RandomPolicy(make_task(ID, "gain"))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
-from filtergym.evaluation import evaluate as evaluation
 
 import filtergym
 from filtergym.__main__ import main
@@ -157,7 +156,7 @@ def test_a_wrong_answer_is_named_with_episode_and_measurement(change, message):
 
 
 def test_episodes_are_counted_over_all_chunks(monkeypatch):
-    monkeypatch.setattr(evaluation, "CHUNK", 8)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     chunks = []
 
     class Late(Start):

@@ -52,7 +52,7 @@ class Wrong:
 
 
 def test_an_evaluation_has_the_same_bits(two, monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.evaluate.CHUNK", 16)  # several pieces of few episodes
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)  # several pieces of few episodes
     one = evaluate(ENV, NAMES, episodes=40, drawn_episodes=1)
     assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
     assert tidy_records(one) == tidy_records(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
@@ -100,10 +100,10 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     known = baselines_of(env)
     names = [known.score_paper, next(iter(known.references)), list(known.bounds)[-1]]
     shorter = {} if env == ENV else {"horizon": 60}
-    whole = evaluate(env, names, episodes=100, **shorter)
-    for module in ("evaluate", "summary"):
-        monkeypatch.setattr(f"filtergym.evaluation.{module}.CHUNK", 16)
-    monkeypatch.setattr(summary, "TOGETHER", 32)
+    dataset = evaluate(env, names, episodes=100, **shorter)
+    whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
+    monkeypatch.setattr(summary, "TOGETHER", 2)
     asked = asked_of(env, names, episodes=100, **shorter)
     assert len(asked[0].pieces()) == 4
     in_turn = dict(summaries(asked, Workers()))
@@ -115,11 +115,10 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     assert records == again
     assert curves.identical(curves_again)
     # Sums of blocks are rounded otherwise than those of all episodes at once.
-    for own, expected in zip(records, tidy_records(whole), strict=True):
-        assert own[:8] == expected[:8]
-        numbers = [np.array([r.value, r.low, r.high], dtype=float) for r in (own, expected)]
+    for own, other in zip(records, whole, strict=True):
+        assert own[:8] == other[:8]
+        numbers = [np.array([r.value, r.low, r.high], dtype=float) for r in (own, other)]
         np.testing.assert_allclose(*numbers, rtol=1e-9, atol=1e-12, err_msg=str(own))
-    expected = filtergym.evaluation.curves.curves_of(whole)
     for name in expected.data_vars:
         np.testing.assert_allclose(
             curves[name].values, expected[name].values, rtol=1e-9, atol=1e-12, err_msg=name
@@ -128,7 +127,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
 
 def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch):
     monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTED", 3000)
-    monkeypatch.setattr("filtergym.evaluation.curves.BLOCK", 16)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
     names = ["imm"]
     curves = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=100))
     few = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=30))
