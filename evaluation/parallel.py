@@ -85,7 +85,7 @@ class Workers:
     """Who does the work; ``with Workers(4) as workers`` ends what was begun for it.
 
     Args:
-        jobs: processes, of which one is this one; -1: as many as there are cores.
+        jobs: processes; 1: this one; -1: as many as there are cores.
         cluster: ``ray://HOST:PORT``, or of Dask ``tcp://HOST:PORT``; ``"ray"``: the one that runs on this machine, or
             else a new one; ``"dask"``: a new one on this machine. A new one has ``jobs`` processes, where that is more
             than one, or as many as there are cores. None: no cluster.
@@ -109,7 +109,6 @@ class Workers:
             if elsewhere and jobs != 1:
                 raise ValueError("a cluster has as many processes as it has: leave out jobs")
         self.jobs, self.cluster = jobs, cluster
-        self._cores = os.cpu_count() or 1 if jobs in (1, -1) else jobs
         self._ended = ExitStack()
         self._dask: Any = None
 
@@ -126,6 +125,15 @@ class Workers:
         if self.cluster is not None and "://" in self.cluster:
             return GUESSED
         return self._cores
+
+    @property
+    def _cores(self) -> int:
+        """How many processes a new cluster has."""
+        if self.jobs not in (1, -1):
+            return self.jobs
+        import joblib
+
+        return int(joblib.cpu_count())  # of those that this process may use
 
     def __enter__(self) -> Self:
         return self
