@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..evaluation.competitors import Policy
-from ..evaluation.own_metrics import OwnMetrics
 from .alarm import Alarm
+
+if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
+    from ..evaluation.own_metrics import OwnMetrics
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Baselines:
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
     best_constant: str = ""
     """The tunable policy that stands for the best constant action in the room table."""
-    metrics: OwnMetrics | None = None
+    metrics: "OwnMetrics | None" = None
     """The environment's own."""
 
     alarm: Callable[[Any], Alarm] | None = None
