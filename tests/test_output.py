@@ -111,6 +111,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
         raise AssertionError("the work began")
 
     monkeypatch.setattr("filtergym.commands.measure.evaluate", unexpected)
+    monkeypatch.setattr("filtergym.commands.measure.summaries", unexpected)
     monkeypatch.setattr("filtergym.reports.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
