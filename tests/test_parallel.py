@@ -305,21 +305,20 @@ def test_a_cluster_without_its_packages_is_one_sentence(command, monkeypatch):
 
 
 def test_tuning_finds_the_same_values(two):
-    from filtergym.baselines.catalogue import baselines_of
     from filtergym.baselines.tuning import tune
 
-    tunable = baselines_of(ENV).tunable["imm"]
+    tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 40 * 100
-    asked = (ENV, "imm", tunable, budget, None, 0, 40)
+    asked = (ENV, "fixed-best", tunable, budget, None, 0, 40)
     assert tune(*asked) == tune(*asked, workers=two)
 
 
 def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
     from filtergym.baselines import tuning
 
-    tunable = baselines_of(ENV).tunable["imm"]
+    tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
-    asked = (ENV, "imm", tunable, budget, None, 0, 8)
+    asked = (ENV, "fixed-best", tunable, budget, None, 0, 8)
     whole = tuning.tune(*asked)
     calls, own = [], tuning.mean_cost
 
