@@ -473,7 +473,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(Asked("", "", None, None, episodes, horizon=T).pieces())
+        pieces = len(Asked("", "", None, None, episodes).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import RESAMPLES, Bootstrap, Estimate, block_of
+from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
 from .curves import Drawn, Finished, drawn_from, joined
 from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
@@ -26,8 +26,8 @@ from .rollout import Progress
 
 CURVE_RESAMPLES = 200
 """Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
-TOGETHER = 4
-"""Blocks of episodes of a piece of work: enough that what comes back is little beside what was done for it."""
+TOGETHER = 4 * BLOCK
+"""Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
 
 
 class Asked(NamedTuple):
@@ -64,11 +64,10 @@ class Asked(NamedTuple):
 
     def pieces(self) -> list["Asked"]:
         """Return the pieces of work that this is: one, unless there are many episodes."""
-        together = TOGETHER * block_of(self.horizon)
-        if self.episodes <= together:
+        if self.episodes <= TOGETHER:
             return [self]
-        begins = range(0, self.episodes, together)
-        return [self._replace(first=i, last=min(i + together, self.episodes)) for i in begins]
+        begins = range(0, self.episodes, TOGETHER)
+        return [self._replace(first=i, last=min(i + TOGETHER, self.episodes)) for i in begins]
 
 
 class Summary(NamedTuple):

@@ -103,7 +103,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     dataset = evaluate(env, names, episodes=100, **shorter)
     whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
-    monkeypatch.setattr(summary, "TOGETHER", 2)
+    monkeypatch.setattr(summary, "TOGETHER", 32)
     asked = asked_of(env, names, episodes=100, **shorter)
     assert len(asked[0].pieces()) == 4
     in_turn = dict(summaries(asked, Workers()))
