@@ -100,12 +100,12 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     known = baselines_of(env)
     names = [known.score_paper, next(iter(known.references)), list(known.bounds)[-1]]
     shorter = {} if env == ENV else {"horizon": 60}
-    dataset = evaluate(env, names, episodes=100, **shorter)
+    dataset = evaluate(env, names, episodes=40, **shorter)
     whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
-    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
-    monkeypatch.setattr(summary, "TOGETHER", 32)
-    asked = asked_of(env, names, episodes=100, **shorter)
-    assert len(asked[0].pieces()) == 4
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    monkeypatch.setattr(summary, "TOGETHER", 16)
+    asked = asked_of(env, names, episodes=40, **shorter)
+    assert len(asked[0].pieces()) == 3
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
     in_any = dict(summaries(asked, Workers()))

@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode
 import filtergym  # noqa: F401  (registers the environments)
 
 MODES = list(AutoresetMode)
-COMPANY = [(3, mode) for mode in MODES] + list(zip((1, 8, 13), MODES, strict=True))
-"""Few in every mode; and alone, as many as fill up a batch, and more."""
+COMPANY = [*zip((3, 8, 13), MODES, strict=True), (1, AutoresetMode.SAME_STEP)]
+"""Few, as many as fill up a batch, and more, each in a mode; and alone."""
 STEPS = 13
 """Two episodes of five decisions and a part, with the steps that NEXT_STEP spends on resets."""
 
