@@ -368,6 +368,7 @@ class _Against:
             yield Measure("score", "", "all", value, "1")
 
 
+@one_thread()
 def flight_records(dataset: xarray.Dataset) -> list[Record]:
     """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
 

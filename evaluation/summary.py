@@ -23,6 +23,7 @@ from .metrics import Contender, Judged, Measure, Record, judge, records_of
 from .own_metrics import OwnMetrics, Taken
 from .parallel import Workers
 from .rollout import Progress
+from .threads import one_thread
 
 CURVE_RESAMPLES = 200
 """Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
@@ -222,9 +223,12 @@ def _summarised(
             later, done[i] = waiting[i].pop(done[i])
             added[i] = added[i].and_of(later) if i in added else later
         if done[i] == asked[i].episodes:
-            yield i, added.pop(i).finished(_resampling(asked[i].episodes), asked[i].metrics)
+            with one_thread():
+                whole = added.pop(i).finished(_resampling(asked[i].episodes), asked[i].metrics)
+            yield i, whole
 
 
+@one_thread()
 def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:
     """Return what the summaries of all competitors of an evaluation come to.
 
