@@ -8,7 +8,7 @@ best candidate is kept by its cost on the validation split only if it beats the 
 import json
 import math
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
@@ -250,8 +250,7 @@ def stored_values(id: str, policy: str) -> tuple[dict[str, float], str]:
     Raises:
         ValueError: if the policy was never tuned, or the file that should say so is broken.
     """
-    for place in _places(id):
-        table = read_table(place)
+    for place, table in _tables(id):
         if policy in table:
             return _checked_values(table[policy].get("values"), policy, id, place), str(place)
     raise ValueError(f"no tuned values of policy {policy!r}: run filtergym tune {id} --policy {policy}")
@@ -296,7 +295,7 @@ def rounded(value: float) -> float:
 
 def tuned_names(id: str) -> list[str]:
     """Return ``NAME-tuned`` of every tunable policy that has stored values."""
-    tables = [read_table(place) for place in _places(id)]
+    tables = [table for _, table in _tables(id)]
     return [
         f"{policy}-tuned" for policy in baselines_of(id).tunable if any(policy in table for table in tables)
     ]
@@ -309,14 +308,21 @@ def best_tuned_policy(id: str, control: str | None = None) -> str | None:
         id: environment id.
         control: only policies of this control; estimators have none and are left out anyway.
     """
-    found: dict[str, float] = {}
-    for policy, tunable in baselines_of(id).tunable.items():
-        if tunable.control is None or control not in (None, tunable.control):
-            continue
-        entry = next((table[policy] for table in map(read_table, _places(id)) if policy in table), None)
-        if entry is not None:
-            found[f"{policy}-tuned"] = entry.get("validation_cost", math.inf)
+    entries: dict[str, dict[str, Any]] = {}
+    for _, table in reversed(list(_tables(id))):  # one's own go before those that are shipped
+        entries |= table
+    found = {
+        f"{policy}-tuned": entries[policy].get("validation_cost", math.inf)
+        for policy, tunable in baselines_of(id).tunable.items()
+        if policy in entries and tunable.control is not None and control in (None, tunable.control)
+    }
     return min(found, key=lambda name: found[name], default=None)
+
+
+def _tables(id: str) -> Iterator[tuple[Any, dict[str, dict[str, Any]]]]:
+    """Files of tuned values and what they say, one's own first."""
+    for place in _places(id):
+        yield place, read_table(place)
 
 
 def _places(id: str) -> list[Any]:

@@ -108,10 +108,8 @@ def killing(words: list[str]) -> None:
     from filtergym.evaluation.parallel import Workers
     from ray.cluster_utils import Cluster
 
-    import filtergym as package
     from filtergym.reports.benchmark import run_benchmark
 
-    assert package
     environments = words or ["filtergym/ManeuveringTarget-v0"]
     with tempfile.TemporaryDirectory() as folder:
         run_benchmark(Path(folder) / "one", False, 0, environments)

@@ -19,6 +19,7 @@ from .metrics import (
     chi_square_band,
     consistency_degrees,
     consistency_metrics,
+    in_blocks,
     mean_over_time,
     reported_components,
     squared_errors,
@@ -27,6 +28,8 @@ from .threads import one_thread
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
+BAND_RESAMPLES = 200
+"""Of the bootstrap of curves: their bands need fewer than intervals of numbers."""
 DISTRIBUTED = 2**21
 """Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
 PERCENTILES = (10.0, 90.0)
@@ -37,7 +40,7 @@ Series = tuple[tuple[str, ...], numpy.ndarray]
 
 
 @one_thread()
-def curves_of(dataset: xarray.Dataset, resamples: int = 200) -> xarray.Dataset:
+def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarray.Dataset:
     """Reduce an evaluation to what its figures show.
 
     Args:
@@ -142,11 +145,7 @@ def drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Dra
         bootstrap: over the episodes of the whole evaluation.
         first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
-    block = block_of(run.sizes["time"])
-    parts = [
-        _drawn_from(run.isel(episode=slice(i, i + block)), bootstrap, first + i)
-        for i in range(0, run.sizes["episode"], block)
-    ]
+    parts = (_drawn_from(part, bootstrap, first + i) for i, part in in_blocks(run))
     return functools.reduce(Drawn.and_of, parts)
 
 

@@ -50,6 +50,11 @@ def windows_of(dataset: xarray.Dataset) -> dict[str, tuple[int, int]]:
     return {name: (int(first), int(last)) for name, first, last in zip(*ends, strict=True)}
 
 
+def slices_of(dataset: xarray.Dataset) -> dict[str, slice]:
+    """Windows by name, as parts of the time axis."""
+    return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
+
+
 def with_windows(dataset: xarray.Dataset, windows: Mapping[str, tuple[int, int]]) -> xarray.Dataset:
     """Return a dataset with these windows, in place of those that it has."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))

@@ -15,7 +15,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, Sums, added, block_of, mean_of_sums
 from .competitors import RANKED
-from .dataset import groups_of, seed_of, windows_of, with_windows
+from .dataset import groups_of, seed_of, slices_of, windows_of, with_windows
 from .threads import one_thread
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
@@ -116,6 +116,13 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
     )
 
 
+def in_blocks(run: xarray.Dataset) -> Iterator[tuple[int, xarray.Dataset]]:
+    """Cut a run into blocks of episodes; yields the number of each one's first episode in the run, and the block."""
+    block = block_of(run.sizes["time"])
+    for first in range(0, run.sizes["episode"], block):
+        yield first, run.isel(episode=slice(first, first + block))
+
+
 class Statistic(NamedTuple):
     """A measure before it is averaged over episodes: what each of them contributes."""
 
@@ -170,18 +177,16 @@ def judge(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Judged:
         bootstrap: over the episodes of the whole evaluation.
         first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
     """
-    found: Judged | None = None
-    block = block_of(run.sizes["time"])
-    for i in range(0, run.sizes["episode"], block):
-        part = run.isel(episode=slice(i, i + block))
-        averaged: dict[Key, Averaged] = {}
-        for s in _statistics(part, bootstrap.episodes):
-            averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first + i)
-        told = "cost" in part and str(part["kind"].values) != "bound"
-        judged = Judged(averaged, [mean_over_time(part, part["cost"].values)] if told else [])
-        found = judged if found is None else found.and_of(judged)
-    assert found is not None
-    return found
+    parts = (_judged(part, bootstrap, first + i) for i, part in in_blocks(run))
+    return functools.reduce(Judged.and_of, parts)
+
+
+def _judged(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Judged:
+    averaged: dict[Key, Averaged] = {}
+    for s in _statistics(run, bootstrap.episodes):
+        averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first)
+    told = "cost" in run and str(run["kind"].values) != "bound"
+    return Judged(averaged, [mean_over_time(run, run["cost"].values)] if told else [])
 
 
 def _itself(means: numpy.ndarray) -> numpy.ndarray:
@@ -199,9 +204,8 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 
 
 def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
-    groups, windows = groups_of(run), windows_of(run)
+    groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
-    slices = {w: slice(first - 1, last) for w, (first, last) in windows.items()}
     judged = run.attrs.get("truth", True)
     for component, unit in reported_components(run).items() if judged else ():
         squares = squared_errors(run, component, groups)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import Bootstrap, Sums, added, block_of, mean_of_sums
-from .metrics import Measure
+from .bootstrap import Bootstrap, Sums, added, mean_of_sums
+from .metrics import Measure, in_blocks
 
 Arrays = Mapping[str, numpy.ndarray]
 
@@ -70,12 +70,13 @@ class OwnMetrics:
             bootstrap: over the episodes of the whole evaluation.
             first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
         """
-        found, block = [], block_of(run.sizes["time"])
-        for i in range(0, run.sizes["episode"], block):
-            each, averaged, common = self.gather(run.isel(episode=slice(i, i + block)))
-            sums = {key: bootstrap.sums(values, first + i) for key, values in averaged.items()}
-            found.append(Taken({key: [values] for key, values in each.items()}, sums, dict(common)))
-        return functools.reduce(Taken.and_of, found)
+        parts = (self._taken(part, bootstrap, first + i) for i, part in in_blocks(run))
+        return functools.reduce(Taken.and_of, parts)
+
+    def _taken(self, run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Taken:
+        each, averaged, common = self.gather(run)
+        sums = {key: bootstrap.sums(values, first) for key, values in averaged.items()}
+        return Taken({key: [values] for key, values in each.items()}, sums, dict(common))
 
     def __call__(self, run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
         """Return the measures of one competitor.

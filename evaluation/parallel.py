@@ -26,7 +26,7 @@ from .rollout import Progress
 from .threads import one_thread
 
 RETRIES = 10
-"""How often a piece is begun again on a cluster that lost the process that ran it."""
+"""How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
 GUESSED = 16
 """Processes that a cluster elsewhere is thought to have, where work is cut for it."""
 CLUSTERS = "ray, ray://HOST:PORT, dask or tcp://HOST:PORT"

@@ -16,7 +16,7 @@ import numpy
 import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
-from .curves import Drawn, Finished, drawn_from, joined
+from .curves import BAND_RESAMPLES, Drawn, Finished, drawn_from, joined
 from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Judged, Measure, Record, judge, records_of
@@ -25,8 +25,6 @@ from .parallel import Workers
 from .rollout import Progress
 from .threads import one_thread
 
-CURVE_RESAMPLES = 200
-"""Of the bootstrap of curves, as in :func:`.curves.curves_of`."""
 TOGETHER = 4 * BLOCK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
 
@@ -143,7 +141,7 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)
-    curves = bootstrap.fewer(CURVE_RESAMPLES)
+    of_curves = bootstrap.fewer(BAND_RESAMPLES)
     last = asked.episodes if asked.last is None else asked.last
     found: Part | None = None
     block = block_of(plan.tasks[asked.name].horizon)
@@ -152,7 +150,7 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
         run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
         run = run.isel(policy=0)
         own = None if asked.metrics is None else asked.metrics.take(run, bootstrap, i)
-        part = Part(judge(run, bootstrap, i), drawn_from(run, curves, i), own, _head(run))
+        part = Part(judge(run, bootstrap, i), drawn_from(run, of_curves, i), own, _head(run))
         found = part if found is None else found.and_of(part)
     assert found is not None
     return found.finished(bootstrap, asked.metrics) if last - asked.first == asked.episodes else found

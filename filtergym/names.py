@@ -161,6 +161,8 @@ def asked_of(
         ValueError: for unknown names.
     """
     cls, known = task_class(env), baselines_of(env)
+    makers = competitors_of(env, competitors, trust=trust)
+    horizon = make_task(cls.id, control, scenario, **keywords).horizon
     return [
         Asked(
             importable_name(cls),
@@ -178,9 +180,9 @@ def asked_of(
             threads,
             keywords,
             known.metrics,
-            make_task(cls.id, control, scenario, **keywords).horizon,
+            horizon,
         )
-        for name, maker in competitors_of(env, competitors, trust=trust).items()
+        for name, maker in makers.items()
     ]
 
 

@@ -7,7 +7,7 @@ import numpy
 import xarray
 
 from ...evaluation.bootstrap import Bootstrap, Estimate
-from ...evaluation.dataset import windows_of
+from ...evaluation.dataset import slices_of, windows_of
 from ...evaluation.metrics import Measure, squared_errors
 from ...evaluation.own_metrics import Gathered, OwnMetrics
 
@@ -66,10 +66,6 @@ def _missing(run: xarray.Dataset, name: str) -> bool:
     return name not in run or bool(numpy.isnan(run[name].values).any())
 
 
-def _slices(run: xarray.Dataset) -> dict[str, slice]:
-    return {name: slice(first - 1, last) for name, (first, last) in windows_of(run).items()}
-
-
 def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
     """Whether a target is of a class, ``(..., classes)``."""
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
@@ -80,7 +76,7 @@ def gather(run: xarray.Dataset) -> Gathered:
     if _missing(run, "true_class"):
         return Gathered()
     true_class = run["true_class"].values.astype(int)
-    of_class, slices = _of_class(true_class), _slices(run).values()
+    of_class, slices = _of_class(true_class), slices_of(run).values()
     squares, by_class, variance = [], [], []
     for component in run["component"].values.tolist():
         square = squared_errors(run, component, {})
@@ -114,7 +110,7 @@ def _with_beliefs(run: xarray.Dataset, errors: Gathered) -> Gathered:
         "recognised_again": numpy.where(waited < len(seconds), waited - change, len(seconds)),
         "last_class": true_class[:, last],
         "wrong": wrong.any(axis=1),
-        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in _slices(run).values()], axis=1),
+        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in slices_of(run).values()], axis=1),
     }
     return Gathered({**errors.each, **each}, {}, {"seconds": seconds})
 

@@ -9,7 +9,7 @@ import xarray
 from ...envs.catalogue import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
-from ...evaluation.dataset import keywords_of, windows_of
+from ...evaluation.dataset import keywords_of, slices_of
 from ...evaluation.metrics import Measure
 from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
 from .theory import stationary
@@ -25,15 +25,11 @@ def _task(evaluation: xarray.Dataset) -> UavAutopilot:
     return task
 
 
-def _slices(evaluation: xarray.Dataset) -> dict[str, slice]:
-    return {w: slice(first - 1, last) for w, (first, last) in windows_of(evaluation).items()}
-
-
 def gather(run: xarray.Dataset) -> Gathered:
     """Return what the metrics need of each episode; nothing of a bound, and of a reference no innovation."""
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return Gathered()
-    task, slices = _task(run), _slices(run)
+    task, slices = _task(run), slices_of(run)
     output, control = run["output"].values, run["control_signal"].values
     tracking = output - run["command"].values
     # Variances across episodes are those of the mean square less the squared mean: both are averages.
@@ -79,7 +75,7 @@ def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Datase
     """
     if not gathered.each:
         return []
-    each, task, windows = gathered.each, _task(evaluation), _slices(evaluation)
+    each, task, windows = gathered.each, _task(evaluation), slices_of(evaluation)
     name = str(evaluation["policy"].values)
     unit, control_unit = task.components[task.output].unit, {"P": "m/s^2", "U": "deg"}[task.parameters.plant]
     tracking_variance, control_variance = (

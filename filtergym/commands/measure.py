@@ -210,9 +210,9 @@ def evaluate_policies(
     task = make_task(cls.id, control, flown, **keywords)
     measurements = len(set(names)) * episodes * task.horizon
     errors = measurements * len(task.components) * 8
-    refusal = _unwritten(errors, errors, netcdf) if out is not None else "nobody asked"
+    refusal = _unwritten(errors, errors, netcdf)
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
-    everything = bool(task.flights) or estimates is not None or not refusal
+    everything = bool(task.flights) or estimates is not None or (out is not None and not refusal)
     options: dict[str, Any] = {
         "env": cls.id,
         "competitors": names,
@@ -256,10 +256,10 @@ def evaluate_policies(
     tables += results_tables(records, console.width) if judged else [recorded_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])
-    whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
-    if not refusal:
-        refusal = _unwritten(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
     if out is not None and curves is not None:
+        whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
+        if not refusal:
+            refusal = _unwritten(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
             records_as_csv(waiting / "records.csv", [*records, *of_flights])

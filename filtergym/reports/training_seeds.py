@@ -29,6 +29,7 @@ from ..evaluation.figures import draw_learning_curves
 from ..evaluation.files import whole_file
 from ..evaluation.metrics import reported_components, score, squared_errors
 from ..evaluation.parallel import Workers
+from ..evaluation.summary import Asked
 from ..names import competitor
 from .tables import shown_components, with_interval
 
@@ -223,7 +224,9 @@ def episode_means(
     agents = {member.name: member.agent for member in runs}
     importable = importable_name(task_class(id))
     found: dict[str, Means | None] = {}
-    missing: list[tuple[_Asked, Path | None]] = []
+    missing: list[tuple[str, Path | None]] = []
+    work: list[Asked] = []
+    horizon = make_task(id, None, scenario).horizon
     for name, (maker, control) in policies.items():
         key = json.dumps(
             [installed_versions(), id, task_class(id).interface, scenario, episodes, seed, split, name]
@@ -231,22 +234,20 @@ def episode_means(
         kept = None if waiting is None else _kept_file(waiting, key, agents.get(name))
         found[name] = None if kept is None else _read_means(kept)
         if found[name] is None:
-            missing.append(
-                (
-                    _Asked(importable, name, name in agents, maker, scenario, episodes, seed, split, control),
-                    kept,
-                )
-            )
+            missing.append((name, kept))
+            # An agent's name may be that of a competitor.
+            known_as = "agent" if name in agents else name
+            asked = Asked(importable, known_as, maker, scenario, episodes, seed, split, control)
+            work.append(asked._replace(horizon=horizon))
     workers = workers or Workers()
     if not workers.alone:
-        check_sendable(importable, {asked.name: asked.maker for asked, _ in missing})
-    horizon = make_task(id, None, scenario).horizon
-    work = [asked for asked, _ in missing]
-    for i, measured in workers.run(_means_of, work, [episodes * horizon] * len(work), progress):
-        asked, kept = missing[i]
+        for asked in work:
+            check_sendable(importable, {asked.name: asked.maker})
+    for i, measured in workers.run(_means_of, work, [asked.measurements for asked in work], progress):
+        name, kept = missing[i]
         if kept is not None:
             _write_means(kept, *measured)
-        found[asked.name] = measured
+        found[name] = measured
     cost: dict[str, numpy.ndarray] = {}
     squares: dict[str, dict[str, numpy.ndarray]] = {}
     units: dict[str, str] = {}
@@ -262,25 +263,10 @@ Means = tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]]
 """Cost and squared errors of every episode, and units of the components."""
 
 
-class _Asked(NamedTuple):
-    """A run or an opponent over episodes of a scenario."""
-
-    environment: str
-    name: str
-    trained: bool
-    maker: Any
-    scenario: str | None
-    episodes: int
-    seed: int
-    split: str
-    control: str | None
-
-
-def _means_of(asked: _Asked, tick: Callable[[int], None]) -> Means:
-    known_as = "agent" if asked.trained else asked.name
+def _means_of(asked: Asked, tick: Callable[[int], None]) -> Means:
     dataset = evaluate(
         asked.environment,
-        {known_as: asked.maker},
+        {asked.name: asked.maker},
         asked.scenario,
         asked.episodes,
         asked.seed,
