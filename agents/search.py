@@ -276,7 +276,7 @@ def write_best(search: Search, folder: Path, study: optuna.Study) -> None:
     if not any(trial.state == TrialState.COMPLETE for trial in ended_trials(study)):
         return
     best = study.best_trial
-    run = load_run(run_folder(folder, best.number, search.seeds[0]), trust=True)  # by this search
+    run = load_run(run_folder(folder, best.number, search.seeds[0]))
     values = dict(run.hyperparameters)
     of_environment = {"control": run.control, "scenario": run.scenario, **values.pop("env_kwargs", {})}
     section = {"n_envs": run.envs, "n_timesteps": run.steps, **values, "env_kwargs": of_environment}

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
@@ -29,6 +29,7 @@ from ..envs.catalogue import (
     catalogue,
     find_mixture,
     find_scenario,
+    import_task,
     importable_name,
     make_task,
     nearest,
@@ -344,7 +345,7 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     Args:
         folder: of the run.
         trust: import the module that registers the environment, which executes it. An environment of filtergym, or one
-            whose module is imported already, takes no trust.
+            whose module is imported already, such as one that the command line names, takes no trust.
 
     Raises:
         ValueError: if there is none, it is not one, or its environment takes ``trust``.
@@ -359,9 +360,12 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     except ValueError as error:
         raise ValueError(f"{path} is not the record of a run: {error}") from error
     module, colon, _ = run.environment.partition(":")
-    if colon and module not in sys.modules:
+    if not colon:
+        return run
+    if module not in sys.modules:
         check_trust(f"{path} asks for an import of module {module!r}", trust)
-    return run
+        import_task(run.environment)
+    return replace(run, environment=importable_name(task_class(run.environment)))
 
 
 def best_agent(folder: Path) -> Path:

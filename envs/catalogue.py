@@ -11,7 +11,9 @@ import importlib
 import math
 import pkgutil
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -73,8 +75,39 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
     return f"choose from {', '.join(valid if choices is None else choices)}" if valid else "there are none"
 
 
+_SEARCHED: list[str] = []
+"""Folders in which modules that a user names are looked for, after ``sys.path``."""
+FOUND_IN: list[str] = []
+"""Those of them in which one was found; other processes are told, see :mod:`..evaluation.parallel`."""
+
+
+@contextmanager
+def modules_from(folder: str) -> Iterator[None]:
+    """Let modules that a user names be found in a folder, too, and nothing else: a file there is no library."""
+    _SEARCHED.append(folder)
+    try:
+        yield
+    finally:
+        _SEARCHED.remove(folder)
+        FOUND_IN.clear()
+
+
+@contextmanager
+def on_path(folders: Iterable[str]) -> Iterator[None]:
+    """Let folders stand at the end of ``sys.path`` for a while, where none of them hides a library."""
+    further = [folder for folder in folders if folder not in sys.path]
+    sys.path.extend(further)
+    try:
+        yield
+    finally:
+        sys.path[:] = [path for path in sys.path if path not in further]
+
+
 def imported(module: str, refusal: str) -> ModuleType:
-    """Import a module that a user has named.
+    """Import a module that a user has named: the one function that imports by a name, and doors alone call it.
+
+    A door is an argument of the command line or of a function that the user calls. What was read from a file goes
+    through :func:`task_class`, which imports nothing.
 
     Args:
         module: its name, with dots.
@@ -86,37 +119,78 @@ def imported(module: str, refusal: str) -> ModuleType:
     try:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError("a module is named by words with dots between them")
-        return importlib.import_module(module)
+        with on_path(_SEARCHED):
+            found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
         raise ValueError(f"{refusal}: {type(error).__name__}: {error}") from error
+    places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
+    FOUND_IN.extend(
+        folder
+        for folder in _SEARCHED
+        if folder not in FOUND_IN and any(Path(place).is_relative_to(folder) for place in places)
+    )
+    return found
 
 
-def task_class(id: str) -> type[Task]:
-    """Return the task of an environment id; ``filtergym/`` may be left out.
+def import_task(id: str) -> type[Task]:
+    """Return the task of an id that a user has given, as :func:`task_class`; ``module:id`` imports the module first.
 
-    ``module:id`` imports the module first, which registers the environment, as ``gymnasium.make`` does.
+    The module registers the environment, as for ``gymnasium.make``.
 
     Raises:
         ValueError: if there is none, or its module cannot be imported.
+    """
+    if isinstance(id, str):
+        module, colon, own = id.partition(":")
+        if colon:
+            imported(module, f"cannot import {module!r}, which registers environment {own!r}")
+    return task_class(id)
+
+
+def task_class(id: str) -> type[Task]:
+    """Return the task of an environment id, and import nothing; ``filtergym/`` may be left out.
+
+    Raises:
+        ValueError: if there is none; of ``module:id``, if the module has not been imported.
     """
     if not isinstance(id, str):
         raise ValueError(
             f"an environment is named by its id, such as 'filtergym/ManeuveringTarget-v0', got {id!r}"
         )
-    module, colon, own = id.partition(":")
-    if colon:
-        imported(module, f"cannot import {module!r}, which registers environment {own!r}")
-        id = own
+    module, colon, own = id.rpartition(":")
     known = catalogue()
-    for candidate in (id, f"filtergym/{id}", f"filtergym/{id}-v0"):
+    for candidate in (own, f"filtergym/{own}", f"filtergym/{own}-v0"):
         if candidate in known:
             return known[candidate]
-    raise nearest("environment", id, known)
+    if colon and module not in sys.modules:
+        raise ValueError(
+            f"unknown environment {own!r}: import {module!r} yourself, or name the environment on the command line, as "
+            f"{id!r}; a name that was read from a file imports nothing"
+        )
+    raise nearest("environment", own, known)
+
+
+class ImportableName(str):
+    """Id of an environment with the module that registers it, ``module:id``, as this process knows it.
+
+    Sent to another process of ours, where it is unpickled, it imports the module. Written to a file and read again it
+    is an ordinary string, which imports nothing.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _import_name, (str(self),)
+
+    def __deepcopy__(self, memo: Any) -> "ImportableName":
+        return self
+
+
+def _import_name(name: str) -> ImportableName:
+    return ImportableName(importable_name(import_task(name)))
 
 
 def importable_name(cls: type[Task]) -> str:
     """Id by which another process finds an environment: of a user's with the module that registers it."""
-    return f"{cls.__module__}:{cls.id}" if cls.id in ADDED else cls.id
+    return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in ADDED else cls.id
 
 
 def short_name(id: str) -> str:
@@ -240,6 +314,7 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     if not several:
         raise ValueError("name at least one file of recordings, got none")
     if environment is not None:
+        environment = import_task(environment).id
         check_names(task_class(environment), keywords)
     files = [file for one in several for file in files_of(one)]
     found: list[Recording] = []

@@ -15,13 +15,14 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import cloudpickle
 
+from ..envs.catalogue import FOUND_IN, on_path
 from .rollout import Progress
 from .threads import one_thread
 
@@ -40,6 +41,8 @@ class Place(NamedTuple):
 
     folder: str
     paths: list[str]
+    named_in: list[str]
+    """Folders of modules that the user has named, where nothing else is looked for."""
 
 
 class Outcome(NamedTuple):
@@ -57,15 +60,20 @@ class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands beh
     """Traceback of an error in another process."""
 
 
-def _done(index: int, packed: bytes, place: Place) -> Outcome:
+def _done(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
     """Do a piece of work, in a process that may know nothing yet."""
     if os.getcwd() != place.folder:
         with suppress(OSError):  # another machine may not have it
             os.chdir(place.folder)
+    # Engines search the working directory, too, where a file is no library, unless this command does.
+    unwanted = {"", place.folder} - set(place.paths)
+    sys.path[:] = [path for path in sys.path if path not in unwanted]
     sys.path.extend(path for path in place.paths if path not in sys.path and Path(path).is_dir())
     with warnings.catch_warnings(record=True) as noted, one_thread():
         try:
-            function, item = pickle.loads(packed)  # only now: its modules may lie on those paths
+            function = pickle.loads(packed)  # only now: its modules may lie on those paths
+            with on_path(place.named_in):
+                item = pickle.loads(packed_item)
             found = Outcome(index, function(item, lambda measurements: None), None, "", [])
         except Exception as error:
             found = Outcome(index, None, _sendable(error), traceback.format_exc(), [])
@@ -171,20 +179,22 @@ class Workers:
                     result = function(item, tick)
                 yield index, result
             return
-        place = Place(os.getcwd(), list(sys.path))
-        calls = ((index, cloudpickle.dumps((function, item)), place) for index, item in enumerate(items))
+        place = Place(os.getcwd(), list(sys.path), list(FOUND_IN))
+        packed = cloudpickle.dumps(function)
+        calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         told: set[tuple[str, type[Warning]]] = set()
-        for outcome in spread(calls):
-            for text, category in outcome.warnings:
-                if (text, category) not in told:
-                    told.add((text, category))
-                    warnings.warn(text, category, stacklevel=2)
-            if outcome.error is not None:
-                raise outcome.error from Elsewhere(outcome.traceback)
-            if sizes is not None:
-                tick(sizes[outcome.number])
-            yield outcome.number, outcome.result
+        with _safe_path():
+            for outcome in spread(calls):
+                for text, category in outcome.warnings:
+                    if (text, category) not in told:
+                        told.add((text, category))
+                        warnings.warn(text, category, stacklevel=2)
+                if outcome.error is not None:
+                    raise outcome.error from Elsewhere(outcome.traceback)
+                if sizes is not None:
+                    tick(sizes[outcome.number])
+                yield outcome.number, outcome.result
 
     def results(
         self,
@@ -295,6 +305,20 @@ class Workers:
             ray.init("auto", **quiet)
         except ConnectionError:
             ray.init(num_cpus=self._cores, include_dashboard=False, **quiet)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let processes that begin meanwhile not search the working directory for libraries; :func:`_done` tells paths."""
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop("PYTHONSAFEPATH", None)
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 def _missing(error: ImportError) -> ValueError:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, opened, task_class
+from ..envs.catalogue import find_scenario, import_task, opened
 from ..envs.recording import MOST_NUMBERS, Recording, measured_once
 from ..envs.recording_files import differing
 from ..envs.task import Episode, Task, named_arrays
@@ -46,7 +46,7 @@ def record(
     Raises:
         ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
     """
-    cls = task_class(env)
+    cls = import_task(env)
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     chosen = find_scenario(cls, opened(cls, scenario), keywords)

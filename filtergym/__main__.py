@@ -1,10 +1,15 @@
 """The command line: ``filtergym`` or ``python -m filtergym``."""
 
+import sys
+
+if __name__ == "__main__" and not sys.flags.safe_path:
+    del sys.path[0]  # the working directory, where Python would look for every library that is still to come
+
 import functools
 import os
-import sys
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Annotated, Any
 
 import gymnasium
@@ -15,6 +20,7 @@ from . import __version__
 from .commands import improve, measure, report
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
+from .envs.catalogue import modules_from
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "list": measure.list_environments,
@@ -80,13 +86,10 @@ def main() -> None:
     A user's mistake, or what the operating system refuses, ends in one sentence and exit code 2; what nobody expected
     in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
     """
-    if not sys.flags.safe_path and os.getcwd() not in sys.path:
-        # Modules of one's own are found, as by ``python -m filtergym``; last, so that none of them hides a library.
-        sys.path.append(os.getcwd())
     debug = "--debug" in sys.argv
     open_output()
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
             warnings.showwarning = _show_warning
             # Under one name, however it was started: the shell asks for completions of that.
             application()([word for word in sys.argv[1:] if word != "--debug"], prog_name="filtergym")

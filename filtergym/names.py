@@ -11,7 +11,7 @@ from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
-from .envs.catalogue import importable_name, imported, make_task, nearest, task_class
+from .envs.catalogue import import_task, importable_name, imported, make_task, nearest, task_class
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .envs.mixture import MixedLanes
 from .evaluation import metrics
@@ -41,7 +41,7 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
     Raises:
         ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
-    id = task_class(env).id
+    id = import_task(env).id
     if isinstance(name, Path):
         found = learned_policy(id, str(name.absolute()), trust)
         if found is None:
@@ -51,7 +51,7 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
         return found
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return gated(inner, competitor(env, inner, trust=trust))
+        return gated(inner, competitor(id, inner, trust=trust))
     if name in baselines.own_names(id):
         return baselines.own_competitor(id, name)
     learned = learned_policy(id, name, trust)
@@ -128,12 +128,12 @@ def competitors_of(
     if isinstance(competitors, str | Path):
         competitors = [competitors]
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
-    id = task_class(env).id
+    id = import_task(env).id
     for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
         if named[name] not in (name, competitor(id, name)):
             raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
     return {
-        name: competitor(env, entry, trust=trust)
+        name: competitor(id, entry, trust=trust)
         if isinstance(entry, str | Path)
         else with_normalisation(entry)
         for name, entry in named.items()
@@ -160,7 +160,8 @@ def asked_of(
     Raises:
         ValueError: for unknown names.
     """
-    cls, known = task_class(env), baselines_of(env)
+    cls = import_task(env)
+    known = baselines_of(cls.id)
     makers = competitors_of(env, competitors, trust=trust)
     horizon = make_task(cls.id, control, scenario, **keywords).horizon
     return [
@@ -213,7 +214,7 @@ def make_policy(
         ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
     """
     if isinstance(env, str):
-        cls, task = task_class(env), None
+        cls, task = import_task(env), None
     else:
         task = _task_of(env)
         cls = task_class(task.id)

@@ -20,7 +20,7 @@ from . import __version__
 from .agents.training_run import training_scenarios
 from .baselines.catalogue import baselines_of
 from .baselines.tuning import best_tuned_policy
-from .envs.catalogue import check_names, find_scenario, task_class
+from .envs.catalogue import check_names, find_scenario, import_task
 from .evaluation.files import whole_files
 from .evaluation.rollout import Progress
 from .evaluation.seeds import episode_seeds
@@ -56,7 +56,7 @@ def default_policies(env: str, control: str | None = None) -> list[str]:
         env: environment id.
         control: leave out those that do not act in it.
     """
-    id = task_class(env).id
+    id = import_task(env).id
     paper = baselines_of(id).score_paper
     names = [paper, best_tuned_policy(id, control), RANDOM]
     own = getattr(competitor(id, paper), "control", None) if paper else None
@@ -116,7 +116,7 @@ def write_datasets(
         raise ValueError(
             f"Minari data sets need more packages: pip install 'filtergym[offline]' ({error})"
         ) from error
-    cls = task_class(env)
+    cls = import_task(env)
     asked = list(policies or default_policies(cls.id, control))
     chosen = [str(policy) for policy in asked]
     if episodes < 1:

@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+import subprocess
 import sys
 import zipfile
 
@@ -155,11 +156,52 @@ def test_a_module_in_the_working_directory_is_found(tmp_path, monkeypatch, comma
     assert "registers environment 'mine/Middle-v0': ZeroDivisionError" in errors
 
 
-def test_a_file_of_ones_own_hides_no_library(tmp_path, monkeypatch, command):
+LIBRARIES = (
+    "dask",
+    "distributed",
+    "lz4",
+    "psutil",
+    "plotly",
+    "jinja2",
+    "yaml",
+    "pyarrow",
+    "numbagg",
+    "tensorboard",
+)
+"""That the commands, what they use, or their processes would import; some are not installed."""
+
+
+def test_a_file_of_ones_own_is_no_library(tmp_path):
+    """Not even where the library is missing; what is named is found, in every process, and what it imports, too."""
+    for name in LIBRARIES:
+        (tmp_path / f"{name}.py").write_text(f"open('sprung', 'a').write('{name} ')\nraise ImportError")
+    (tmp_path / "sibling.py").write_text("ACTION = (0.0,)")
+    (tmp_path / "middle.py").write_text(
+        "from filtergym.evaluation.competitors import ConstantPolicy\n"
+        "from sibling import ACTION\n"
+        "class Middle(ConstantPolicy):\n    control, action = 'gain', ACTION\n"
+    )
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "filtergym").write_text("from filtergym.__main__ import main\nmain()\n")
+    short = ("--episodes", "2", "--set", "horizon=8", "--jobs", "2", "--backend", "numpy", "--out", "out")
+    for start, *words in (
+        ("bin/filtergym", "evaluate", ID, "--policy", "middle:Middle", "--policy", "imm", *short),
+        ("-mfiltergym", "report", "out"),
+    ):
+        done = subprocess.run(
+            [sys.executable, start, *words], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert not (tmp_path / "sprung").exists(), (words, (tmp_path / "sprung").read_text())
+    assert "middle:Middle" in (tmp_path / "out" / "records.csv").read_text()
+
+
+def test_the_path_is_what_it_was_when_nothing_of_the_folder_was_named(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    command("list", ID)
-    assert sys.path[-1] == str(tmp_path)
+    before = list(sys.path)
+    for words in (("list", ID), ("evaluate", ID, "--policy", "os:path"), ("list", "nowhere:mine/Turns-v0")):
+        command(*words)
+        assert sys.path == before
 
 
 def test_what_nobody_expected_is_a_sentence(monkeypatch, command):

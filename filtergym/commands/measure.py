@@ -58,6 +58,7 @@ from .terminal import (
     complete_environment,
     complete_policy,
     console,
+    import_environments,
     one_of,
     pair,
     parsed_settings,
@@ -76,6 +77,7 @@ def list_environments(
         typer.Argument(
             help="Environment ids, default all; module:id for one that a module registers.",
             autocompletion=complete_environment,
+            callback=import_environments,
         ),
     ] = None,
 ) -> None:
@@ -97,6 +99,7 @@ def evaluate_policies(
             help="Environment id; `filtergym list` shows them. module:id for one that a module registers. A recording "
             "names its own.",
             autocompletion=complete_environment,
+            callback=import_environments,
         ),
     ] = None,
     policy: Annotated[
@@ -422,7 +425,11 @@ def benchmark(
     seed: Experiment = 0,
     environment: Annotated[
         list[str] | None,
-        typer.Option(help="Only this environment; repeatable.", autocompletion=complete_environment),
+        typer.Option(
+            help="Only this environment; repeatable.",
+            autocompletion=complete_environment,
+            callback=import_environments,
+        ),
     ] = None,
     split: Annotated[
         str, typer.Option(help="test; or validation, for development: training scenarios only.")

@@ -25,6 +25,16 @@ def complete_environment(incomplete: str) -> list[str]:
     return found or [short for id in ids if (short := id.removeprefix("filtergym/")).startswith(incomplete)]
 
 
+def import_environments(given: Any) -> Any:
+    """Import the modules of environments that the command line names as ``module:id``; returns what was given."""
+    from ..envs.catalogue import import_task
+
+    for word in [given] if isinstance(given, str) else given or ():
+        if ":" in word:
+            import_task(word)
+    return given
+
+
 def _environments_of(ctx: typer.Context) -> list[str]:
     """Ids of the environment that the words so far name, or of all if they name none."""
     from ..envs.catalogue import catalogue, task_class
@@ -33,8 +43,6 @@ def _environments_of(ctx: typer.Context) -> list[str]:
     # An option that still lacks its value keeps click from telling the arguments: then the words as shells give them.
     words = os.environ.get("_TYPER_COMPLETE_ARGS") or os.environ.get("COMP_WORDS", "")
     for word in [named] if isinstance(named, str) else words.split():
-        if ":" in word:  # a module, which is a program: nobody asked to run it
-            continue
         with suppress(ValueError):
             return [task_class(word).id]
     return list(catalogue())
@@ -81,6 +89,7 @@ Environment = Annotated[
     typer.Argument(
         help="Environment id; `filtergym list` shows them. module:id for one that a module registers.",
         autocompletion=complete_environment,
+        callback=import_environments,
     ),
 ]
 ScenarioName = Annotated[

@@ -1,0 +1,309 @@
+"""A name that was read from a file imports nothing, whatever file it is and whichever way it comes in."""
+
+import csv
+import importlib
+import json
+import shutil
+import sys
+import warnings
+from contextlib import suppress
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import xarray
+from filtergym.agents.learned_policy import PRETRAINED, read_header
+from filtergym.agents.training_run import load_run
+from filtergym.baselines.tuning import stored_values
+from filtergym.evaluation.summary import read_summary
+
+import filtergym
+from filtergym import evaluate, make_policy, read_recording, record, tidy_records
+from filtergym.names import competitor
+from filtergym.reports.results import read_results
+
+ENV = "filtergym/ManeuveringTarget-v0"
+AGENT = PRETRAINED / "ManeuveringTarget-v0" / "ppo"
+TRAP = "import_trap"
+NAME, CLASS = f"{TRAP}:mine/Trap-v0", f"{TRAP}:Trap"
+SHORT = ("--episodes", "2", "--set", "horizon=8")
+
+
+class Executed:
+    """Imports the trap where it is unpickled."""
+
+    def __reduce__(self):
+        return importlib.import_module, (TRAP,)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Working directory with the trap in it, which is on the path, too."""
+    (tmp_path / f"{TRAP}.py").write_text("class Trap:\n    pass\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    sys.modules.pop(TRAP, None)
+
+
+def everywhere(value, kept=()):
+    """Put the name of the trap in place of every string of a JSON value, but for those of some keys."""
+    if isinstance(value, dict):
+        return {
+            NAME if key == ENV else key: item if key in kept else everywhere(item, kept)
+            for key, item in value.items()
+        }
+    if isinstance(value, list):
+        return [everywhere(item, kept) for item in value]
+    return NAME if isinstance(value, str) else value
+
+
+def write_table(path, columns):
+    """Write columns as CSV, JSON or Parquet, by the suffix."""
+    if path.suffix == ".csv":
+        with path.open("w", newline="") as file:
+            csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])
+    elif path.suffix == ".json":
+        path.write_text(json.dumps({name: list(values) for name, values in columns.items()}))
+    else:
+        pyarrow = pytest.importorskip("pyarrow")
+        importlib.import_module("pyarrow.parquet").write_table(pyarrow.table(columns), path)
+
+
+def flown_ways(folder, command):
+    """Recordings and flights: NetCDF, CSV, JSON, Parquet."""
+    own = record(ENV, episodes=2, horizon=8, backend="numpy")
+    own.write(folder / "own.nc")
+    with xarray.open_dataset(folder / "own.nc", engine="scipy") as data:
+        data = data.load()
+    names = data.assign_coords(recording=("episode", np.array([CLASS, NAME])))
+    contents = {
+        "environment": data.assign_attrs(environment=NAME),
+        "every": names.assign_attrs(
+            dict.fromkeys(("environment", "parameters", "source", "licence", "history"), NAME)
+        ),
+        "parameters": names.assign_attrs(
+            parameters=json.dumps({"horizon": NAME, NAME: NAME}), source=NAME, control=CLASS
+        ),
+    }
+    paths = []
+    for name, content in contents.items():
+        paths.append(folder / f"{name}.nc")
+        content.to_netcdf(paths[-1], engine="scipy", format="NETCDF3_64BIT")
+    plots = {"time": [5.0 * i for i in range(8)]} | {n: [1e3 * i for i in range(8)] for n in ("x", "y")}
+    plots |= {
+        "sigma_x": [100.0] * 8,
+        "sigma_y": [100.0] * 8,
+        "environment": [NAME] * 8,
+        "recording": [NAME] * 8,
+    }
+    tracks = {name: plots[name] for name in ("time", "x", "y")} | {
+        name: [NAME] * 8 for name in ("flight", "callsign", "icao24", "environment")
+    }
+    for table in (plots, tracks):
+        for suffix in (".csv", ".json", ".parquet"):
+            paths.append(folder / f"{len(table)}{suffix}")
+            write_table(paths[-1], table)
+    for path in paths:
+        for words in (
+            ("evaluate", "--recording", path, "--policy", "imm"),
+            ("evaluate", ENV, "--recording", path, "--policy", "imm"),
+            ("evaluate", ENV, "--scenario", path, "--policy", "imm", *SHORT),
+            ("animate", ENV, "--scenario", path, "--policy", "imm", "--every", 100, "--out", "gif"),
+            ("record", ENV, "--scenario", path, "--out", "again.nc", *SHORT),
+            ("offline", ENV, "--scenario", path, "--split", "test", "--policy", "imm", *SHORT),
+            ("train", ENV, "--scenario", path, "--algo", "bptt", "--steps", 8, "--envs", 2, "--out", "run"),
+            ("tune", ENV, "--scenario", path, "--policy", "imm", "--budget", 1),
+        ):
+            yield f"{' '.join(map(str, words[:3]))} {path.name}", lambda words=words: command(*words)
+        for call in (
+            lambda path: read_recording(path),
+            lambda path: read_recording(path, ENV),
+            lambda path: filtergym.read_flights(path),
+            lambda path: evaluate(ENV, ["imm"], path, episodes=2),
+            lambda path: evaluate(ENV, ["imm"], str(path), episodes=2),
+            lambda path: gym.make(ENV, scenario=str(path)).reset(seed=0),
+            lambda path: gym.make_vec(ENV, num_envs=2, scenario=str(path)).reset(seed=0),
+            lambda path: gym.make(ENV).reset(seed=0, options={"scenario": str(path)}),
+            lambda path: make_policy(ENV, "imm", scenario=str(path)),
+        ):
+            yield f"{call.__code__.co_names} {path.name}", lambda path=path, call=call: call(path)
+    said = {"time": [0.0, 50.0], "position": [[0.0, 0.0], [1e4, 0.0]], "name": NAME, "flight": NAME}
+    yield "scenario from JSON", lambda: gym.make(ENV, scenario=json.loads(json.dumps(said)))
+    yield "recording from JSON", lambda: gym.make(ENV, scenario={"measurements": {}, "environment": NAME})
+
+
+def spec_ways(folder):
+    """Specifications of environments, as data sets of Minari hold them."""
+    text = gym.make(ENV, horizon=8).spec.to_json()
+    for said in (
+        text.replace(f'"task": "{ENV}"', f'"task": "{NAME}"'),
+        text.replace(f'"{ENV}"', f'"{NAME}"'),
+    ):
+        assert said != text
+        spec = gym.envs.registration.EnvSpec.from_json(said)
+        yield "gym.make(spec)", lambda spec=spec: gym.make(spec)
+        yield "gym.make_vec(spec)", lambda spec=spec: gym.make_vec(spec, num_envs=2)
+
+
+def minari_ways(folder, command):
+    minari = pytest.importorskip("minari")
+    words = ("offline", ENV, "--policy", "imm", "--out", folder / "sets", *SHORT)
+    assert command(*words)[0] == 0
+    [file] = (folder / "sets").rglob("metadata.json")
+    told = json.loads(file.read_text())
+    name = told["dataset_id"]
+    told |= {"algorithm_name": CLASS, "author": [CLASS], "description": NAME}
+    for key in ("env_spec", "eval_env_spec"):
+        if key in told:
+            told[key] = told[key].replace(f'"task": "{ENV}"', f'"task": "{NAME}"')
+    assert NAME in told["env_spec"]
+    file.write_text(json.dumps(told))
+    yield "minari.load_dataset", lambda: minari.load_dataset(name)[0]
+    yield "recover_environment", lambda: minari.load_dataset(name).recover_environment()
+    yield "recover_environment, eval", lambda: minari.load_dataset(name).recover_environment(eval_env=True)
+    yield "offline again", lambda: command(*words)
+
+
+def agent_ways(folder, command):
+    """Files of agents (safetensors) and folders of training runs (JSON)."""
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    with safe_open(AGENT.with_suffix(".safetensors"), framework="numpy") as file:
+        header, arrays = dict(file.metadata()), {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    told = json.loads(header["run"])
+    runs = [
+        told | {"environment": NAME},
+        told | {"residual_to": CLASS, "gated": True},
+        told | {"environment": f"{TRAP}:{ENV}", "control": CLASS, "scenario": NAME, "command": NAME},
+        everywhere(told),
+    ]
+    paths = []
+    for i, run in enumerate(runs):
+        for j, own in enumerate((header, header | {"environment": NAME}, everywhere(header))):
+            paths.append(folder / f"agent-{i}{j}.safetensors")
+            save_file(arrays, paths[-1], {**own, "run": json.dumps(run), "fields": header["fields"]})
+        for whole in (True, False):
+            best = folder / f"run-{i}{whole}" / "best"
+            best.mkdir(parents=True)
+            if whole:
+                shutil.copyfile(paths[-3], best / "agent.safetensors")
+            shutil.copytree(best, best.parent / "checkpoint")
+            for place in (best.parent, best.parent / "checkpoint"):
+                (place / "run.json").write_text(json.dumps(run))
+            paths.append(best.parent)
+    for path in paths:
+        for words in (
+            ("evaluate", ENV, "--policy", path, *SHORT),
+            ("evaluate", ENV, "--policy", f"gated:{path}", *SHORT),
+            ("offline", ENV, "--policy", path, "--out", "others", *SHORT),
+            ("train", ENV, "--residual-to", path, "--algo", "ppo", "--steps", 8, "--envs", 2, "--out", "new"),
+        ):
+            yield f"{' '.join(map(str, words[:3]))} {path.name}", lambda words=words: command(*words)
+        yield f"competitor {path.name}", lambda path=path: competitor(ENV, path)
+        yield f"make_policy {path.name}", lambda path=path: make_policy(ENV, path)
+        yield f"evaluate() {path.name}", lambda path=path: evaluate(ENV, [path], episodes=2, horizon=8)
+        if path.suffix:
+            yield f"read_header {path.name}", lambda path=path: read_header(path)
+            continue
+        for words in (
+            ("export", path),
+            ("seeds", path, *SHORT[:2]),
+            ("train", ENV, "--out", path, "--algo", "bptt", "--resume"),
+        ):
+            yield f"{words[0]} {path.name}", lambda words=words: command(*words)
+        yield f"load_run {path.name}", lambda path=path: load_run(path)
+
+
+def settings_ways(folder, command):
+    """YAML of hyperparameters and search spaces, JSON of tuned values."""
+    rest = ("--algo", "ppo", "--steps", 8, "--envs", 2, "--out", "trained")
+    for i, text in enumerate(
+        (
+            f"{NAME}:\n  n_steps: 8\n",
+            f"{ENV}:\n  policy: '{CLASS}'\n  policy_kwargs: {{features_extractor_class: '{CLASS}'}}\n",
+            f"{ENV}:\n  env_wrapper: '{CLASS}'\n  callback: '{CLASS}'\n  normalize: '{CLASS}'\n",
+            f"env: {{control: '{CLASS}', scenario: '{NAME}', reward: '{NAME}'}}\n",
+            f"env: {{scenario: '{NAME}'}}\nalgo: {{policy: '{CLASS}', learning_rate: '{CLASS}'}}\n",
+            f"env: !!python/name:{TRAP}.Trap\n",
+            f"algo: !!python/object/apply:{TRAP}.Trap []\n",
+            f"learning_rate: !!python/module:{TRAP}\n",
+            f"{CLASS}: {{kind: '{CLASS}', low: 0, high: 1}}\nlearning_rate: '{CLASS}'\n",
+        )
+    ):
+        path = folder / f"{i}.yml"
+        path.write_text(text)
+        yield f"train --config {i}", lambda path=path: command("train", ENV, "--config", path, *rest)
+        search = ("search", ENV, "--space", path, "--trials", 1, "--steps", 8, "--out", "searched")
+        yield f"search --space {i}", lambda search=search: command(*search)
+    (folder / "tuned").mkdir(exist_ok=True)
+    for content in (
+        {CLASS: {"values": {}}, "imm": {"values": {NAME: 1.0}, "command": NAME}},
+        {"imm": everywhere({"values": {"gain": "x"}, "environment": "", "policy": "", "scenario": ""})},
+    ):
+        (folder / "tuned" / "ManeuveringTarget-v0.json").write_text(json.dumps(content))
+        yield "list, tuned", lambda: command("list", ENV)
+        yield "evaluate, tuned", lambda: command("evaluate", ENV, "--policy", "imm-tuned", *SHORT)
+        yield "tune", lambda: command("tune", ENV, "--policy", "imm", "--budget", 1)
+        yield "stored_values", lambda: stored_values(ENV, "imm")
+    shutil.rmtree(folder / "tuned")
+
+
+def results_ways(folder, command):
+    """Results, evaluations and kept parts of them: JSON, NetCDF, and NumPy's."""
+    assert command("evaluate", ENV, "--policy", "imm", *SHORT, "--out", "out")[0] == 0
+    told = json.loads((folder / "out" / "results.json").read_text())
+    for i, content in enumerate(
+        (
+            json.loads(json.dumps(told).replace(ENV, NAME)),
+            json.loads(json.dumps(told).replace('"imm"', f'"{CLASS}"')),
+            everywhere(told, kept=("format", "dims", "dtype")),
+        )
+    ):
+        path = folder / f"results-{i}.json"
+        path.write_text(json.dumps(content))
+        for words in (("report", path, "--out", "report.html"), ("comparison", path)):
+            yield f"{words[0]} {i}", lambda words=words: command(*words)
+        yield f"read_results {i}", lambda path=path: read_results(path)
+    with xarray.open_dataset(folder / "out" / "results.nc", engine="scipy") as data:
+        data = data.load()
+    for attrs in (
+        {"environment": NAME},
+        dict.fromkeys(data.attrs, NAME),
+        {"paper": CLASS, "reference": CLASS},
+    ):
+        yield "tidy_records", lambda attrs=attrs: tidy_records(data.assign_attrs(attrs))
+        data.assign_attrs(attrs).to_netcdf(folder / "told.nc", engine="scipy", format="NETCDF3_64BIT")
+        yield "an evaluation as scenario", lambda: gym.make(ENV, scenario=str(folder / "told.nc"))
+        yield "an evaluation as recording", lambda: read_recording(folder / "told.nc")
+    for words in (json.dumps({"made_by": NAME, "name": CLASS, "kind": CLASS}), [Executed()]):
+        np.savez(folder / "kept.npz", words=np.array(words), head=np.array([Executed()]))
+        yield "read_summary", lambda: read_summary(folder / "kept.npz", NAME)
+    name = "unfinished/ManeuveringTarget-v0.paper.2.test0.json"
+    for content in (folder / "results-0.json", folder / "results-2.json"):
+        (folder / "begun" / "unfinished").mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(content, folder / "begun" / name)
+        yield "told of a benchmark", lambda: read_results(folder / "begun" / name)
+
+
+def test_a_name_that_was_read_from_a_file_imports_nothing(folder, command, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "sets"))
+    tried, executed = 0, []
+    for ways in (flown_ways, minari_ways, agent_ways, settings_ways, results_ways, None):
+        for name, way in spec_ways(folder) if ways is None else ways(folder, command):
+            with suppress(Exception), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                way()
+            tried += 1
+            if sys.modules.pop(TRAP, None) is not None:
+                executed.append(name)
+    assert not executed
+    assert tried > 250
+    # Who names it himself imports it: the trap works.
+    assert "is no competitor" in command("evaluate", ENV, "--policy", CLASS)[2]
+    assert sys.modules.pop(TRAP)
+    assert "unknown environment 'mine/Trap-v0'" in command("evaluate", NAME, "--policy", "imm")[2]
+    assert sys.modules.pop(TRAP)
+    sentence = f"unknown environment 'mine/Trap-v0': import '{TRAP}' yourself"
+    assert sentence in command("evaluate", "--recording", "environment.nc", "--policy", "imm")[2]
