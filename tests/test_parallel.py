@@ -3,6 +3,9 @@
 import importlib
 import inspect
 import json
+import os
+import signal
+import subprocess
 import sys
 from contextlib import suppress
 
@@ -246,6 +249,36 @@ def test_a_lost_process_is_one_sentence(two):
     with pytest.raises(ValueError, match="ended from outside"):
         list(two.run(ended, [1]))
     assert list(two.run(warned, [])) == []
+
+
+BEGINNER = """
+import time
+from filtergym.evaluation.parallel import Workers
+
+def work(seconds, tick):
+    if seconds:
+        print("busy", flush=True)
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    for _ in Workers(2).run(work, [600, 0]):
+        print("idle", flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="groups of processes are ended otherwise")
+def test_workers_end_with_a_process_that_is_killed(tmp_path):
+    """Whoever is left holds the pipe open: workers, busy and idle, and who tracks their resources."""
+    (tmp_path / "beginner.py").write_text(BEGINNER)
+    words = [sys.executable, tmp_path / "beginner.py"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, start_new_session=True) as process:
+        try:
+            assert {process.stdout.readline(), process.stdout.readline()} == {b"busy\n", b"idle\n"}
+            process.kill()
+            assert process.communicate(timeout=30)[0] == b""
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def test_paths_of_this_process_are_found(two, tmp_path, monkeypatch):
