@@ -64,9 +64,8 @@ def _end_with(parent: int) -> None:
 
     def watch() -> None:
         if sys.platform == "win32":
-            from multiprocessing.connection import wait
-
             from _winapi import SYNCHRONIZE, OpenProcess
+            from multiprocessing.connection import wait
 
             wait([OpenProcess(SYNCHRONIZE, False, parent)])
         else:
