@@ -28,6 +28,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from ..envs.catalogue import task_class
+from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merged, read_section
 from .training_run import FILES, TrainingRun, Validated, load_run, new_run, opened_run
@@ -144,10 +145,10 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
     storage = optuna.storages.JournalStorage(JournalFileBackend(str(writable_folder(folder) / "journal.log")))
     pruner = optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS)
     study = optuna.create_study(study_name="filtergym", storage=storage, pruner=pruner, load_if_exists=True)
-    asked = json.loads(json.dumps(asdict(search)))
+    asked = {**json.loads(json.dumps(asdict(search))), "code": code_digest()}
     has = study.user_attrs.get("search", asked)
     for name, wanted in asked.items():
-        if has[name] != wanted:
+        if has.get(name) != wanted:
             raise ValueError(
                 f"{folder} holds a search with {name} {has[name]!r}, not {wanted!r}: choose another folder"
             )

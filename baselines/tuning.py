@@ -11,7 +11,6 @@ import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import metadata
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ import numpy
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, short_name, task_class
 from ..envs.task import Episode, Task
+from ..evaluation.code import code_digest
 from ..evaluation.competitors import Kind
 from ..evaluation.files import append_line, write_text
 from ..evaluation.parallel import Workers
@@ -173,7 +173,8 @@ def tune(
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
         workers: who shares the episodes of a candidate; candidates follow each other, since the search learns from
             each. Default: this process.
-        waiting: file that keeps the costs of candidates until the search has ended, from which a second call goes on.
+        waiting: file that keeps the costs of candidates until the search has ended, from which a second call goes on;
+            not of an environment of one's own, whose code may have changed meanwhile.
 
     Raises:
         ValueError: for a held-out scenario, a budget too small for one generation, or a file that cannot be written.
@@ -201,9 +202,18 @@ def tune(
     best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
     spent = 0
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
-    versions = [metadata.version(library) for library in ("filtergym", "numpy", "scipy")]
-    search = [cls.id, chosen.name, policy, limited, dict(tunable.start), seed, episodes, backend, versions]
-    met = _Met(waiting, search)
+    search = [
+        cls.id,
+        chosen.name,
+        policy,
+        limited,
+        dict(tunable.start),
+        seed,
+        episodes,
+        backend,
+        code_digest(),
+    ]
+    met = _Met(None if package_of(cls.id) is None else waiting, search)
 
     def objective(vector: numpy.ndarray) -> float:
         nonlocal best, spent

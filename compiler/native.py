@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import threading
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -10,9 +9,8 @@ from typing import Any
 from . import cache
 from .emission import emitted
 from .library import Library, fastest
-from .program import Program
+from .program import LOCK, Program
 
-_LOCK = threading.Lock()
 _ENGINES: list[Any] = []
 """What owns the code; it is never given back, as somebody may be about to call it."""
 
@@ -54,11 +52,11 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         lane_first: of every argument whether it is written as ``(N, rows)``.
         library: where functions come from; default: the fastest for this processor.
     """
-    binding, (name, features) = llvm(), processor()
-    library = library or fastest(features)
-    text = emitted(program, lane_first, library)
-    version = ".".join(map(str, binding.llvm_version_info))
-    with _LOCK:
+    with LOCK:
+        binding, (name, features) = llvm(), processor()
+        library = library or fastest(features)
+        text = emitted(program, lane_first, library)
+        version = ".".join(map(str, binding.llvm_version_info))
         return _loaded(text, cache.key(text, name, features, version), library)
 
 

@@ -4,6 +4,7 @@ An expression is a number: its place in the :class:`Graph`. One that is made aga
 subexpressions), one of constants is computed at once, and what no result needs never enters a program.
 """
 
+import os
 import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
@@ -48,6 +49,11 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "hypot": numpy.hypot,
 }
 """What a library computes, by the names of C's."""
+LOCK = threading.RLock()
+"""Held by whoever traces or compiles."""
+if hasattr(os, "register_at_fork"):
+    # A child has none of the other threads, and what one of them holds it would wait for without end.
+    os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 _COMPUTE = OPERATIONS | FUNCTIONS
 
 
@@ -62,11 +68,9 @@ class Graph:
         arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
         values: value of a constant, None of what varies.
         tables: what ``take`` reads, ``(length,)`` each.
-        lock: held by whoever adds expressions.
     """
 
     def __init__(self) -> None:
-        self.lock = threading.RLock()
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []

@@ -102,6 +102,19 @@ def stepped(
     return following, OWN_PAY[kind](task, after), task.observe(following)
 
 
+class _Once:
+    """A property that is computed once, as of functools from Python 3.12 on: before, it holds a lock that a fork would
+    leave to a child for ever.
+    """
+
+    def __init__(self, compute: Callable[[Any], Any]) -> None:
+        self.compute, self.__doc__ = compute, compute.__doc__
+
+    def __get__(self, holder: Any, owner: type) -> Any:
+        found = holder.__dict__[self.compute.__name__] = self.compute(holder)
+        return found
+
+
 class Programs:
     """What is traced of a task, for all that have its parameters.
 
@@ -126,22 +139,22 @@ class Programs:
             )
         return self._functions[function]
 
-    @functools.cached_property
+    @_Once
     def acted(self) -> Function:
         """The action; a part of the bank that it leaves alone is not written again."""
         return self.function(_acted, unchanged=None)
 
-    @functools.cached_property
+    @_Once
     def advanced(self) -> Function:
         """The world; a part of the truth that stays is not written again."""
         return self.function(_advanced, unchanged=len(leaves(self.begun[0].example()[0])))
 
-    @functools.cached_property
+    @_Once
     def predicted(self) -> Function:
         """The bank at the next measurement."""
         return self.function(_predicted, turned=True)
 
-    @functools.cached_property
+    @_Once
     def begun(self) -> tuple[Specialised, Specialised]:
         """World and bank at the start of the track."""
         noise = self.traced.noise
@@ -149,13 +162,13 @@ class Programs:
         world = self.function(_world_begun).specialised(uniforms, normals)
         return world, self.function(_bank_started).specialised(world.example()[1])
 
-    @functools.cached_property
+    @_Once
     def first(self) -> Parts:
         """Parts of the way from the start of the track over the first measurement."""
         world, bank = self.begun
         return self._parts(world.example()[0], bank.example())
 
-    @functools.cached_property
+    @_Once
     def later(self) -> Parts:
         """Parts of the way from an action to the next.
 

@@ -12,6 +12,8 @@ process or a machine is lost. joblib's backend for Ray is a pool of actors, and 
 import os
 import pickle
 import sys
+import threading
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -58,6 +60,23 @@ class Outcome(NamedTuple):
 
 class Elsewhere(Exception):  # noqa: N818  (no error of its own: what stands behind one)
     """Traceback of an error in another process."""
+
+
+def _end_with(parent: int) -> None:
+    """Let this process end with the one that began it, which may be killed and could not tell it."""
+
+    def watch() -> None:
+        if sys.platform == "win32":
+            from _winapi import SYNCHRONIZE, OpenProcess
+            from multiprocessing.connection import wait
+
+            wait([OpenProcess(SYNCHRONIZE, False, parent)])
+        else:
+            while os.getppid() == parent:
+                time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _done(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
@@ -212,11 +231,17 @@ class Workers:
     def _over_processes(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
         import joblib
         from joblib.externals.loky.process_executor import TerminatedWorkerError
+        from joblib.parallel import LokyBackend
+
+        class Processes(LokyBackend):
+            def configure(self, *given: Any, **options: Any) -> Any:
+                own = {"initializer": _end_with, "initargs": (os.getpid(),)}
+                return super().configure(*given, **own, **options)
 
         # Whoever ends the work early, by an error or Ctrl-C, knows that the rest is not done.
         warnings.filterwarnings("ignore", message=".*tasks which were still being processed by the workers")
         try:
-            with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            with joblib.parallel_config(backend=Processes(), inner_max_num_threads=1):
                 # Arrays are passed whole: those that joblib maps into memory could not be written to.
                 pool = joblib.Parallel(
                     self.jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None

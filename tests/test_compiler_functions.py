@@ -318,6 +318,43 @@ def test_a_forked_process_goes_on_and_compiles_what_is_new(compiled):
     assert os.waitpid(child, 0)[1] == 0
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("work", ["tracing", "compilation"])
+def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
+    """What the thread holds nobody would give back in the child."""
+    x, graph, begun = numbers(3, 8), Graph(), threading.Event()
+
+    def pause():
+        begun.set()
+        time.sleep(0.2)  # meanwhile the main thread forks
+
+    def function(x):
+        if work == "tracing" and not begun.is_set():
+            pause()
+        return ordinary(x) / 11.0
+
+    def loaded(*given, own=native._loaded):
+        if work == "compilation" and not begun.is_set():
+            pause()
+        return own(*given)
+
+    monkeypatch.setattr(native, "_loaded", loaded)
+    thread = threading.Thread(target=Function(function, graph), args=(x,))
+    thread.start()
+    begun.wait()
+    child = os.fork()
+    if child == 0:
+        signal.alarm(10)  # what hangs ends, and fails
+        try:
+            Function(function, graph)(x)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
+
+
 SCRIPT = """
 import sys, numpy
 from filtergym.compiler import namespace

@@ -3,15 +3,22 @@
 import importlib
 import inspect
 import json
+import os
+import shutil
+import signal
+import subprocess
 import sys
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
 from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue
-from filtergym.evaluation import parallel, summary
+from filtergym.envs import registration
+from filtergym.envs.catalogue import catalogue, task_class
+from filtergym.evaluation import code, parallel, summary
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.summary import summaries, told_together
 
@@ -188,6 +195,56 @@ def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, mo
     assert waiting.kept_in(tmp_path, asked._replace(name="mine.py:Mine")) is None
 
 
+@pytest.fixture
+def edit(tmp_path, monkeypatch):
+    """Write into a copy of a package, as whose code what is kept was made."""
+    copy = tmp_path / "package"
+    shutil.copytree(Path(maneuvering_target.__file__).parent, copy)
+    monkeypatch.setattr(code, "package_folders", lambda: [copy])
+    code.code_digest.cache_clear()
+
+    def write(name, text):
+        with (copy / name).open("a") as file:
+            file.write(text)
+        code.code_digest.cache_clear()  # another process reads it anew
+
+    yield write
+    code.code_digest.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("file", "same"),
+    [("notes.txt", True), ("policies.py", False), ("tuned.json", False), ("another.py", False)],
+)
+def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
+    """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
+    [asked] = asked_of(ENV, ["imm"], episodes=4)
+    list(summaries([asked], Workers(), None, [waiting.kept_in(tmp_path, asked)]))
+    calls = []
+    monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
+    tunable, costs = baselines_of(ENV).tunable["fixed-best"], tmp_path / "costs.jsonl"
+
+    def interrupted(steps):
+        raise KeyboardInterrupt
+
+    def search():
+        with suppress(KeyboardInterrupt):
+            tuning.tune(ENV, "fixed-best", tunable, 20_000, None, 0, 8, interrupted, waiting=costs)
+        return len(calls)
+
+    assert (search(), search()) == (1, 1)
+    edit(file, " ")
+    assert (summary.read_summary(*waiting.kept_in(tmp_path, asked)) is not None) is same
+    assert search() == (1 if same else 2)
+
+
+def test_of_an_environment_of_ones_own_nothing_is_kept(tmp_path, monkeypatch):
+    """Nobody can say whether its code is what it was."""
+    [asked] = asked_of(ENV, ["imm"], episodes=4)
+    monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
+    assert waiting.kept_in(tmp_path, asked) is None
+
+
 def test_an_error_elsewhere_is_the_same_sentence(two):
     with pytest.raises(ValueError, match="estimator 'mine' failed at measurement 1") as here:
         evaluate(ENV, {"mine": Wrong}, episodes=4)
@@ -246,6 +303,36 @@ def test_a_lost_process_is_one_sentence(two):
     with pytest.raises(ValueError, match="ended from outside"):
         list(two.run(ended, [1]))
     assert list(two.run(warned, [])) == []
+
+
+BEGINNER = """
+import time
+from filtergym.evaluation.parallel import Workers
+
+def work(seconds, tick):
+    if seconds:
+        print("busy", flush=True)
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    for _ in Workers(2).run(work, [600, 0]):
+        print("idle", flush=True)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="groups of processes are ended otherwise")
+def test_workers_end_with_a_process_that_is_killed(tmp_path):
+    """Whoever is left holds the pipe open: workers, busy and idle, and who tracks their resources."""
+    (tmp_path / "beginner.py").write_text(BEGINNER)
+    words = [sys.executable, tmp_path / "beginner.py"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, start_new_session=True) as process:
+        try:
+            assert {process.stdout.readline(), process.stdout.readline()} == {b"busy\n", b"idle\n"}
+            process.kill()
+            assert process.communicate(timeout=30)[0] == b""
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def test_paths_of_this_process_are_found(two, tmp_path, monkeypatch):
@@ -314,8 +401,6 @@ def test_tuning_finds_the_same_values(two):
 
 
 def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
-    from filtergym.baselines import tuning
-
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
     asked = (ENV, "fixed-best", tunable, budget, None, 0, 8)
@@ -340,8 +425,6 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
 
 
 def test_training_seeds_are_scored_the_same(two, tmp_path):
-    import shutil
-
     from filtergym.agents.learned_policy import PRETRAINED
 
     from filtergym.reports.training_seeds import episode_means, load_runs

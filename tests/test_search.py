@@ -131,11 +131,14 @@ def test_what_cannot_be_trained_with_is_no_reason_to_stop_but_at_the_beginning(t
         search_hyperparameters(search(), tmp_path / "first", 4, train)
 
 
-def test_another_search_is_refused(tmp_path):
+def test_another_search_is_refused(tmp_path, monkeypatch):
     search_hyperparameters(search(), tmp_path, 1, pretended)
     for name, value in (("steps", 2000), ("seeds", (0,)), ("space", {"hidden_size": [2]}), ("sampling", 4)):
         with pytest.raises(ValueError, match=f"holds a search with {name} .* choose another folder"):
             search_hyperparameters(search(**{name: value}), tmp_path, 1, pretended)
+    monkeypatch.setattr("filtergym.agents.search.code_digest", lambda: "of an edited package")
+    with pytest.raises(ValueError, match=r"holds a search with code .* choose another folder"):
+        search_hyperparameters(search(), tmp_path, 1, pretended)
 
 
 @pytest.mark.parametrize("algorithm", training_run.FILES)

@@ -139,6 +139,9 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     assert scored[4:] == ["agent"]
     episode_means(asked[0], [], "random", 11, 0, "validation", waiting=tmp_path)
     assert scored[5:] == ["agent", "agent", "imm"]
+    monkeypatch.setattr("filtergym.reports.waiting.code_digest", lambda: "of an edited package")
+    episode_means(asked[0], [], "random", 11, 0, "validation", waiting=tmp_path)
+    assert scored[8:] == ["agent", "agent", "imm"]
 
 
 def test_command_fills_the_page(folders, tmp_path, command, monkeypatch):

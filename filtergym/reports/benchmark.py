@@ -24,14 +24,13 @@ from .results import (
     RESULTS,
     Result,
     drawn_components,
-    read_results,
     settings_of,
     shown_competitors,
     thinned,
     track_of,
     write_results,
 )
-from .waiting import UNFINISHED, kept_in, remove, stem_of
+from .waiting import UNFINISHED, kept_in, remove
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
@@ -166,14 +165,14 @@ def run_benchmark(
     """Run every cell, going on after an interruption with the competitors that are missing.
 
     Args:
-        folder: where ``results.json`` goes; competitors and cells wait in ``unfinished/`` until all are done.
+        folder: where ``results.json`` goes; competitors wait in ``unfinished/`` until all are done.
         full: all scenarios and policies, and more episodes.
         seed: number of the experiment.
         environments: ids; default: all.
         split: "test", or another one for development.
         started: called with the number of measurements; returns what is told of progress.
         finished: called with the result of each cell, in their order.
-        drawn: called with each cell that was run now, and its curves.
+        drawn: called with each cell and its curves.
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
         command: that runs this, kept in the results.
@@ -185,18 +184,13 @@ def run_benchmark(
     wanted = cells(full, environments, split)
     settings = settings_of(command)
     unfinished = writable_folder(folder / UNFINISHED)
-    stems = [stem_of(cell.environment, cell.scenario, cell.episodes, split, seed) for cell in wanted]
-    waiting = [unfinished / f"{stem}.json" for stem in stems]
     writable_file(folder / RESULTS)
     tick = started(sum(cell.measurements for cell in wanted))
-    results = [_waiting_result(path, cell) for cell, path in zip(wanted, waiting, strict=True)]
+    results: list[Result | None] = [None] * len(wanted)
     # What is asked for, and the cell that it belongs to.
     asked: list[tuple[Asked, int]] = []
     found: list[dict[str, Summary]] = [{} for _ in wanted]
     for i, cell in enumerate(wanted):
-        if results[i] is not None:
-            tick(cell.measurements)
-            continue
         everyone = asked_of(
             cell.environment,
             cell.policies,
@@ -215,21 +209,15 @@ def run_benchmark(
         """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
         nonlocal told
         cell = wanted[i]
-        if results[i] is None and len(found[i]) == len(cell.policies):
+        if len(found[i]) == len(cell.policies):
             everyone = [found[i].pop(name) for name in cell.policies]
             records, curves, head = told_together(everyone)
-            result = result_of(head, records, curves, shipped_agents(cell.environment))
             drawn(cell, curves)
-            write_results(waiting[i], [result], settings)
-            results[i] = result
-        if results[i] is not None:
-            remove(unfinished, [unfinished / f"{stems[i]}.{name}.npz" for name in cell.policies])
+            results[i] = result_of(head, records, curves, shipped_agents(cell.environment))
         while told < len(results) and (due := results[told]) is not None:
             finished(due)
             told += 1
 
-    for i in range(len(wanted)):
-        settle(i)
     workers = workers or Workers()
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
@@ -243,16 +231,8 @@ def run_benchmark(
     done = [result for result in results if result is not None]
     write_results(folder / RESULTS, done, settings)
     # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
-    remove(unfinished, waiting)
+    remove(unfinished, [place.path for place in kept if place is not None])
     return done
-
-
-def _waiting_result(path: Path, cell: Cell) -> Result | None:
-    """Return the result of a cell that an interrupted run has left."""
-    if not path.exists():
-        return None
-    [result], _ = read_results(path)
-    return result if {record.policy for record in result.records} == set(cell.policies) else None
 
 
 def all_records(results: Sequence[Result]) -> list[Record]:

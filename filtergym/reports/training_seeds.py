@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy
 from scipy.special import stdtrit
 
-from ..agents.training_run import TrainingRun, best_agent, installed_versions, load_run
+from ..agents.training_run import TrainingRun, best_agent, load_run
 from ..baselines.catalogue import baselines_of, paper_of
 from ..baselines.names import evaluate
 from ..baselines.reproduction import Grid, markdown_table
@@ -32,6 +32,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.summary import Asked
 from ..names import competitor
 from .tables import shown_components, with_interval
+from .waiting import made_by
 
 
 class Comparison(NamedTuple):
@@ -228,10 +229,9 @@ def episode_means(
     work: list[Asked] = []
     horizon = make_task(id, None, scenario).horizon
     for name, (maker, control) in policies.items():
-        key = json.dumps(
-            [installed_versions(), id, task_class(id).interface, scenario, episodes, seed, split, name]
-        )
-        kept = None if waiting is None else _kept_file(waiting, key, agents.get(name))
+        code = made_by(id, paper_of(id) if name in agents else name)
+        key = json.dumps([code, id, scenario, episodes, seed, split, name])
+        kept = None if waiting is None or code is None else _kept_file(waiting, key, agents.get(name))
         found[name] = None if kept is None else _read_means(kept)
         if found[name] is None:
             missing.append((name, kept))

@@ -1,6 +1,5 @@
 """What is done of long work waits in files, so that the same command goes on after whatever ended it."""
 
-import functools
 import hashlib
 import json
 from collections.abc import Iterable
@@ -10,9 +9,9 @@ from ..agents.learned_policy import pretrained_path
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
 from ..baselines.tuning import stored_values, tuned_names
-from ..envs.catalogue import short_name, task_class
+from ..envs.catalogue import importable_name, short_name, task_class
+from ..evaluation.code import code_digest
 from ..evaluation.summary import Asked, Kept
-from .results import settings_of
 
 UNFINISHED = "unfinished"
 """Folder, in that of the results, of what waits."""
@@ -39,21 +38,31 @@ def kept_in(folder: Path, asked: Asked) -> Kept | None:
         asked: a competitor over episodes.
 
     Returns:
-        None for files, modules and objects of one's own: nobody can say whether they are what they were.
+        None where :func:`made_by` says that nothing is kept.
     """
-    id = task_class(asked.environment).id
-    stands_for = _meaning(id, asked.name)
-    if stands_for is None:
+    maker = made_by(asked.environment, asked.name)
+    if maker is None:
         return None
     plain = asked._replace(maker=None, metrics=None)
-    made_by = f"{_versions()} {tuple(plain)} {stands_for}"
-    stem = stem_of(id, asked.scenario, asked.episodes, asked.split, asked.seed)
-    return Kept(folder / f"{stem}.{asked.name}.npz", made_by)
+    stem = stem_of(asked.environment, asked.scenario, asked.episodes, asked.split, asked.seed)
+    return Kept(folder / f"{stem}.{asked.name}.npz", f"{maker} {tuple(plain)}")
 
 
-@functools.cache
-def _versions() -> dict[str, str]:
-    return settings_of("").versions
+def made_by(environment: str, name: str) -> str | None:
+    """Return a digest of the code and the values that a competitor's numbers depend on.
+
+    Args:
+        environment: its id.
+        name: of the competitor.
+
+    Returns:
+        None for environments, files, modules and objects of one's own: nobody can say whether they are what they were.
+    """
+    cls = task_class(environment)
+    stands_for = _meaning(cls.id, name)
+    if stands_for is None or importable_name(cls) != cls.id:
+        return None
+    return hashlib.sha256(f"{code_digest()} {stands_for}".encode()).hexdigest()
 
 
 def _meaning(id: str, name: str) -> str | None:

@@ -1,0 +1,48 @@
+"""Which code makes numbers: what is kept of unfinished work is of use to that code only."""
+
+import functools
+import hashlib
+from collections.abc import Iterable
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from platform import python_version
+
+ROOMS = ("", ".filters", ".compiler", ".envs", ".evaluation", ".baselines", ".agents")
+"""Packages below the package."""
+SUFFIXES = frozenset((".py", ".json", ".yml", ".safetensors"))
+"""Of files that numbers depend on."""
+LIBRARIES = ("numpy", "scipy", "xarray", "llvmlite", "torch", "stable-baselines3")
+
+
+def package_folders() -> list[Path]:
+    """Return the folders of the package; of an editable installation those that one works in."""
+    package = __name__.partition(".")[0]
+    specs = [find_spec(package + room) for room in ROOMS]
+    return [Path(place) for spec in specs if spec for place in spec.submodule_search_locations or ()]
+
+
+def files_digest(folders: Iterable[Path]) -> str:
+    """Return a digest of names and contents of the files in some folders that numbers depend on."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted(path for path in folder.rglob("*") if path.suffix in SUFFIXES):
+            content = path.read_bytes()
+            digest.update(f"{path.relative_to(folder).as_posix()} {len(content)}\n".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+@functools.cache
+def code_digest() -> str:
+    """Return a digest of the package's files and of the versions of Python and of what it computes with.
+
+    A process has one: what is edited later it does not run.
+    """
+    versions = [python_version()]
+    for library in LIBRARIES:
+        try:
+            versions.append(metadata.version(library))
+        except metadata.PackageNotFoundError:
+            versions.append("")
+    return hashlib.sha256(f"{versions} {files_digest(package_folders())}".encode()).hexdigest()
