@@ -449,6 +449,10 @@ class RecordedWorld(World[Task, Replayed, Any]):
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._filled(self._measurement, self.tables.measurements, self._column(truth))
 
+    def received(self, measurement: Any) -> Any:
+        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
+        return self.simulated.received(measurement)
+
     def _column(self, truth: Replayed) -> Array:
         """Of the measurement at hand."""
         xp = self.xp

@@ -171,6 +171,17 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """True values of the task's components, ``(C, N)``."""
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
+
+        The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
+        that overlooks the availability must not take that number for a measurement. Here everything is received.
+
+        Args:
+            measurement: of :meth:`advance`.
+        """
+        return measurement
+
     def seen(self, measurement: Measurement) -> Array | None:
         """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
 

@@ -62,8 +62,9 @@ class Measurement(NamedTuple):
     """Index of the emitter type that the ESM decides for, or the number of types where it heard nothing or did not
     listen, ``(N,)``."""
     bearing_difference: Array
-    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180); 0 where there is no decision, ``(N,)``.
-    Reading: the difference and not the two bearings, because the zero of each is the true one here."""
+    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180), ``(N,)``; 0 where there is no decision, where
+    an estimator gets NaN. Reading: the difference and not the two bearings, because the zero of each is the true one
+    here."""
 
 
 class Start(NamedTuple):
@@ -247,6 +248,12 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
+
+    def received(self, measurement: Measurement) -> Measurement:
+        """Difference of bearings NaN where the ESM decided nothing."""
+        decided = measurement.decision < self.task.types
+        difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
+        return measurement._replace(bearing_difference=difference)
 
     def seen(self, measurement: Measurement) -> Array:
         """Range and range rate; nothing of the acceleration."""
