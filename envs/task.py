@@ -189,6 +189,10 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """
         return None
 
+    def stated_deviation(self, measurement: Measurement) -> Array | None:
+        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
+        return None
+
     def error_cost(self, error: Array) -> Array:
         """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
         written, and recordings of the task can be judged.
@@ -370,6 +374,10 @@ class Task(ABC):
     recorded_columns: ClassVar[Mapping[str, str]] = {}
     """Columns of a table of what sensors really said that :meth:`recorded` knows, beside ``time``, with what they are;
     empty where tables cannot be read."""
+    targets_move: ClassVar[bool] = False
+    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    longest_interval: ClassVar[float] = float("inf")
+    """Between measurements, s: what is longer in a table is taken for another unit."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]

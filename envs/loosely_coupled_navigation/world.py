@@ -213,6 +213,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         """The receiver's position."""
         return self.received(measurement).fix
 
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """As the receiver reports it."""
+        return measurement.reported_deviation + 0.0 * measurement.fix
+
     def error_cost(self, error: Array) -> Array:
         """Squared error of position, summed over the axes, over the nominal variance of a measurement."""
         return ordered_sum(error * error) / self.parameters.receiver_variance

@@ -99,6 +99,8 @@ class ManeuveringTarget(Task):
     World = RadarWorld
     of_world_only = ("flight", "track", "track_scans")
     recorded_columns = COLUMNS
+    targets_move = True
+    longest_interval = 60.0
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "

@@ -402,6 +402,11 @@ class RadarWorld(World[Task, Truth, Measurement]):
         position = self.received(measurement).position
         return self.xp.concat([position, position * math.nan])
 
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """Root of the position's variance."""
+        sigma = self.xp.sqrt(measurement.variance)
+        return self.xp.concat([sigma, sigma * math.nan])
+
     def error_cost(self, error: Array) -> Array:
         """Squared position error over the squared range sigma."""
         scaled = error[:2] * (1.0 / self.parameters.range_sigma)

@@ -259,6 +259,11 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Range and range rate; nothing of the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """Those of range and range rate."""
+        p, once = self.parameters, self.xp.ones_like(measurement.radar[0])
+        return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
+
     def error_cost(self, error: Array) -> Array:
         """Mean of the three squared errors over their scales."""
         scaled = error * self.cost_factors
