@@ -7,6 +7,9 @@ outside there is neither observation nor action: measurements go in, mean and co
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
+import numpy
+
+from ..compiler.functions import mapped
 from ..envs.observation import Array
 from ..envs.task import Episode, Task
 from ..evaluation.competitors import Kind, Policy
@@ -40,6 +43,7 @@ class LearnedEstimator:
     def update(self, measurement: Any, memory: Filtered) -> tuple[Array, Array, Filtered]:
         """Predict, show the network what comes of it, and update as it answers."""
         bank = self.task.bank
+        measurement = mapped(numpy.nan_to_num, measurement)  # banks weigh values by their availability
         state = bank.predict(memory.bank, measurement)
         shown = self.task.observe(Episode(None, measurement, state))
         action, network = self.network.predict(shown.T, memory.network)

@@ -23,6 +23,7 @@ import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
+from .plausibility import check_recording
 from .recorded_tables import read_columns
 from .recording import Recording, joined, recording_from
 from .recording_files import is_recording, names_environment, read_netcdf
@@ -293,8 +294,14 @@ def opened(cls: type[Task], scenario: Any) -> Any:
     return read_flights(scenario) if names_flights(scenario) else scenario
 
 
-def read_recording(path: Any, environment: str | None = None, **keywords: Any) -> Recording:
-    """Read recorded measurements.
+def read_recording(
+    path: Any,
+    environment: str | None = None,
+    *,
+    speeds: tuple[float, float] = (1.0, 1000.0),
+    **keywords: Any,
+) -> Recording:
+    """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
 
     Args:
         path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
@@ -302,6 +309,7 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
             folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
             broken one is left out and named in the notes.
         environment: id of the environment that it is for; default: what the file says.
+        speeds: m/s; a recording whose median speed is outside is refused. The lowest holds in ManeuveringTarget only.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:
@@ -321,7 +329,9 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(_read_recording(file, found[0].environment if found else environment, keywords))
+            found.append(
+                _read_recording(file, found[0].environment if found else environment, speeds, keywords)
+            )
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
             if len(files) == 1:
@@ -336,7 +346,9 @@ def read_recording(path: Any, environment: str | None = None, **keywords: Any) -
     return joined(found, name, left_out)
 
 
-def _read_recording(file: Path, environment: str | None, keywords: Mapping[str, Any]) -> Recording:
+def _read_recording(
+    file: Path, environment: str | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
+) -> Recording:
     """Read one file."""
     if not file.is_file():
         raise ValueError("there is no such file")
@@ -350,8 +362,9 @@ def _read_recording(file: Path, environment: str | None, keywords: Mapping[str, 
         )
     else:
         recording = read_columns(file, task_class(environment), keywords)
-    recording.scenario(task_class(recording.environment), {})
-    return recording
+    task = make_task(recording.environment, scenario=recording)
+    notes = check_recording(recording, task, speeds)
+    return dataclasses.replace(recording, notes=(*recording.notes, *notes))
 
 
 def find_scenario(

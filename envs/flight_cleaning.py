@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .parameters import Limits, check
+from .plausibility import check_speed, check_velocity, isolated, speeds_of
 from .trajectory import Trajectory
 
 
@@ -91,16 +92,8 @@ def cleaned(
     _check_units(time, position, velocity, limits)
     highest = limits.speeds[1]
 
-    def pace(apart: int) -> numpy.ndarray:
-        moved = numpy.hypot(*(position[apart:] - position[:-apart]).T)
-        return numpy.asarray(moved / (time[apart:] - time[:-apart]))
-
-    too_fast = pace(1) > highest
-    if len(time) > 2:
-        alone = numpy.zeros(len(time), dtype=bool)
-        alone[1:-1] = too_fast[:-1] & too_fast[1:] & (pace(2) <= highest)
-        keep(~alone, "outliers")
-    gaps, jumps = numpy.diff(time) > limits.longest_gap, pace(1) > highest
+    keep(~isolated(time, position, lambda elapsed: highest * elapsed), "outliers")
+    gaps, jumps = numpy.diff(time) > limits.longest_gap, speeds_of(time, position) > highest
     counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
     parts = [slice(a, b) for a, b in itertools.pairwise(ends)]
@@ -153,39 +146,12 @@ def _check_units(
     time: numpy.ndarray, position: numpy.ndarray, velocity: numpy.ndarray | None, limits: Cleaning
 ) -> None:
     """Raise ValueError with the likely cause if a flight cannot be in seconds and metres."""
-    steps = numpy.diff(time)
-    speed = float(numpy.median(numpy.hypot(*numpy.diff(position, axis=0).T) / steps))
-    step = float(numpy.median(steps))
-    lowest, highest = limits.speeds
-    if speed < lowest:
-        inside = (numpy.abs(position) <= (360.0, 90.0)).all() or (numpy.abs(position) <= (90.0, 360.0)).all()
-        if inside and 10.0 <= 111e3 * speed <= 400.0:
-            cause = "are x, y degrees? then call them longitude and latitude"
-        elif lowest <= 1e3 * speed <= highest:
-            cause = "are the times milliseconds?" if step >= 100.0 else "are x, y kilometres?"
-        else:
-            cause = "does it move at all? else allow lower speeds"
-        raise ValueError(f"median speed {speed:.2g} m/s: {cause}")
-    if speed > highest:
-        factors = {"minutes": 60.0, "hours": 3600.0, "days": 86400.0}
-        unit = next((unit for unit, factor in factors.items() if 10.0 <= speed / factor <= 400.0), None)
-        cause = (
-            f"are the times {unit}?"
-            if unit
-            else "are x, y metres and the times seconds? else allow higher speeds"
-        )
-        raise ValueError(f"median speed {speed:.4g} m/s: {cause}")
+    check_speed(time, position, limits.speeds)
+    step = float(numpy.median(numpy.diff(time)))
     if step > limits.longest_gap:
         raise ValueError(
             f"its positions are {step:g} s apart, longer than the longest gap of {limits.longest_gap:g} s: allow a "
             "longer gap"
         )
     if velocity is not None:
-        ratio = float(numpy.median(numpy.hypot(*velocity.T))) / speed
-        if not 0.8 <= ratio <= 1.25:
-            usual = {"knots": 1.944, "km/h": 3.6, "feet per second": 3.281, "km/s": 1e-3}
-            unit = next((unit for unit, factor in usual.items() if abs(ratio / factor - 1.0) < 0.05), None)
-            raise ValueError(
-                f"vx, vy are {ratio:.3g} times what the positions say: "
-                + (f"are they {unit}?" if unit else "are they m/s, and x and y metres?")
-            )
+        check_velocity("vx, vy", time, position, velocity)

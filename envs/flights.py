@@ -33,6 +33,7 @@ from .flight_tables import (
     suffix_of,
 )
 from .parameters import Limits, check
+from .plausibility import check_degrees
 from .trajectory import Trajectory, trajectory_of
 
 
@@ -440,9 +441,7 @@ def _groups(flight: Any, time: numpy.ndarray) -> dict[str, Any]:
 def _check_degrees(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]) -> None:
     """Raise ValueError without a site, and for what are no degrees."""
     for name, most in (("latitude", 90.0), ("longitude", 360.0)):
-        if (numpy.abs(values[name]) > most).any():
-            largest = float(numpy.nanmax(numpy.abs(values[name])))
-            raise ValueError(f"{name} reaches {largest:g}, and degrees are expected: is it metres?")
+        check_degrees(name, values[name], most)
     if site is None:
         raise ValueError(
             "it has latitude and longitude: give the radar's, --site LATITUDE,LONGITUDE, or in Python "

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
+from .plausibility import check_interval, ignored_columns
 from .recording import Recording, measured_once
 from .task import Task
 
@@ -177,12 +178,14 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
         )
         try:
             _check_times(own.time)
+            if "sampling_interval" not in keywords:
+                check_interval(own.interval(), cls.longest_interval)
             parts.append((own, cls.recorded(own)))
         except ValueError as error:
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _joined(path, cls, keywords, parts)
+    return _joined(path, cls, keywords, parts, list(table))
 
 
 class _Known(set[str]):
@@ -209,7 +212,8 @@ def _check_times(time: numpy.ndarray) -> None:
     if (steps <= 0.0).any():
         row = int((steps <= 0.0).argmax())
         what = "is the same in rows" if steps[row] == 0.0 else "decreases between rows"
-        raise ValueError(f"time {what} {row} and {row + 1}: rows must be in the order of their times")
+        hint = ", in UTC if the clock was changed" if steps[row] <= -1800.0 else ""
+        raise ValueError(f"time {what} {row} and {row + 1}: rows must be in the order of their times{hint}")
 
 
 def _joined(
@@ -217,10 +221,12 @@ def _joined(
     cls: type[Task],
     keywords: Mapping[str, Any],
     parts: list[tuple[Columns, Recorded]],
+    names: list[str],
 ) -> Recording:
-    """Put the recordings of a file side by side."""
+    """Put the recordings of a file, whose columns have these names, side by side."""
     task = cls(cls.Parameters(**{**parts[0][1].parameters, **keywords}), cls.controls[0])
     true = [TRUTH + component.name for component in task.components]
+    notes = tuple(ignored_columns(names, [*TIME, RECORDING, *cls.recorded_columns, *true]))
     longest = max(len(found.rows) for _, found in parts)
     for own, found in parts:
         if found.parameters != parts[0][1].parameters:
@@ -263,4 +269,5 @@ def _joined(
         parameters={**parts[0][1].parameters, **keywords},
         name=path.name.partition(".")[0],
         source=str(path),
+        notes=notes,
     )

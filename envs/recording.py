@@ -337,6 +337,7 @@ def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()
             )
         else:
             kept.append(one)
+            told += [f"{one.name}: {note}" for note in one.notes]
     untrue = [one.name for one in kept if one.truth is None]
     if untrue and len(untrue) < len(kept):
         told.append(f"{untrue[0]}: has no truth, so nobody is judged")
@@ -448,6 +449,18 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Go on to the next measurement; at the end the last one is said again."""
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._filled(self._measurement, self.tables.measurements, self._column(truth))
+
+    def received(self, measurement: Any) -> Any:
+        """Return a measurement with NaN in place of what was not received, as the task's own world does."""
+        return self.simulated.received(measurement)
+
+    def all_seen(self) -> tuple[Array | None, Array | None]:
+        """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
+        ``(C, measurements)``; None where it is no component.
+        """
+        columns = self.xp.arange(self.tables.seconds.shape[-1])
+        measurement = self._filled(self._measurement, self.tables.measurements, columns)
+        return self.simulated.seen(measurement), self.simulated.stated_deviation(measurement)
 
     def _column(self, truth: Replayed) -> Array:
         """Of the measurement at hand."""

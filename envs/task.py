@@ -171,11 +171,26 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """True values of the task's components, ``(C, N)``."""
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
+
+        The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
+        that overlooks the availability must not take that number for a measurement. Here everything is received.
+
+        Args:
+            measurement: of :meth:`advance`.
+        """
+        return measurement
+
     def seen(self, measurement: Measurement) -> Array | None:
         """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
 
         NaN where they say nothing; None, as here, where what is measured is no component at all.
         """
+        return None
+
+    def stated_deviation(self, measurement: Measurement) -> Array | None:
+        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
         return None
 
     def error_cost(self, error: Array) -> Array:
@@ -359,6 +374,10 @@ class Task(ABC):
     recorded_columns: ClassVar[Mapping[str, str]] = {}
     """Columns of a table of what sensors really said that :meth:`recorded` knows, beside ``time``, with what they are;
     empty where tables cannot be read."""
+    targets_move: ClassVar[bool] = False
+    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    longest_interval: ClassVar[float] = float("inf")
+    """Between measurements, s: what is longer in a table is taken for another unit."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]

@@ -13,7 +13,7 @@ from ..compiler.functions import mapped, padded_width
 from ..envs.compiled import Report
 from ..envs.lanes import Lanes
 from ..envs.observation import Array
-from ..envs.task import Episode, Outside, Task
+from ..envs.task import Episode, Outside, Task, named_arrays
 from .competitors import Kind
 from .stepping import SteppingPolicy
 
@@ -135,6 +135,7 @@ def run_estimator(
     filled = numpy.minimum(numpy.arange(width), len(seeds) - 1)  # the last episode is repeated
     memory: Any = None
     step = 0
+    missed = numpy.zeros(width, dtype=int)
 
     def start(episode: Episode) -> None:
         nonlocal memory
@@ -144,15 +145,17 @@ def run_estimator(
     def update(episode: Episode) -> tuple[Array, Array]:
         nonlocal memory, step
         step += 1
+        measurement = chosen_lanes(task.world.received(episode.measurement), filled)
+        missed[_lacking(measurement)] = step
         with told(f"estimator {name!r} failed at measurement {step}"):
-            answer = estimator.update(chosen_lanes(episode.measurement, filled), memory)
+            answer = estimator.update(measurement, memory)
             try:
                 mean, covariance, memory = answer
             except (TypeError, ValueError):
                 raise TypeError(
                     "update must return mean, covariance and memory, not " + type(answer).__name__
                 ) from None
-        return _checked_estimate(task, name, step, first_episode, mean, covariance, width)
+        return _checked_estimate(task, name, step, first_episode, mean, covariance, missed)
 
     _run_outside(task, start, update, seeds, record, tick)
 
@@ -178,10 +181,19 @@ def told(what: str) -> Iterator[None]:
 
 
 def _checked_estimate(
-    task: Task, name: str, step: int, first_episode: int, mean: Any, covariance: Any, width: int
+    task: Task,
+    name: str,
+    step: int,
+    first_episode: int,
+    mean: Any,
+    covariance: Any,
+    missed: numpy.ndarray,
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return an estimate as float64, or raise ValueError that names episode and measurement."""
-    count = len(task.components)
+    """Return an estimate as float64, or raise ValueError that names episode and measurement.
+
+    ``missed`` is the last measurement of which each episode did not receive everything, zero for none.
+    """
+    count, width = len(task.components), len(missed)
     found = []
     for word, values, shape in (
         ("mean", mean, (count, width)),
@@ -201,7 +213,10 @@ def _checked_estimate(
             )
         finite = numpy.asarray(numpy.isfinite(array).reshape(-1, width).all(axis=0))
         if not finite.all():
-            raise ValueError(_where(name, word, "is not finite", first_episode, finite, step))
+            last = missed[numpy.argmin(finite)]
+            hint = f"; of this episode measurement {last} was missed: what is not received is NaN, predict without it"
+            where = _where(name, word, "is not finite", first_episode, finite, step)
+            raise ValueError(where + hint if last else where)
         found.append(array)
     P = numpy.moveaxis(found[1], -1, 0)
     try:
@@ -216,6 +231,15 @@ def _checked_estimate(
     if not symmetric.all():
         raise ValueError(_where(name, "covariance", "is not symmetric", first_episode, symmetric, step))
     return found[0], found[1]
+
+
+def _lacking(measurement: Any) -> numpy.ndarray:
+    """Return which episodes have NaN in a measurement, ``(N,)``."""
+    parts = [
+        numpy.isnan(numpy.asarray(values)).reshape(-1, values.shape[-1]).any(axis=0)
+        for _, values in named_arrays(measurement)
+    ]
+    return numpy.asarray(numpy.any(parts, axis=0))
 
 
 def _where(name: str, word: str, wrong: str, first_episode: int, fine: numpy.ndarray, step: int) -> str:

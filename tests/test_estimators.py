@@ -46,8 +46,9 @@ class Raw(Recording):
     """UavAutopilot on raw readings, held during dropouts; zero for what no sensor reads."""
 
     def estimate(self, measurement, memory):
-        mean = np.zeros_like(memory[0])
-        mean[list(self.task.measured)] = measurement.reading
+        mean, measured = np.zeros_like(memory[0]), list(self.task.measured)
+        held = self.said[-1][1][measured] if self.said else 0.0
+        mean[measured] = np.where(measurement.available > 0, measurement.reading, held)
         return mean
 
 
@@ -86,7 +87,8 @@ def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
         errors = result.error.sel(policy=name).transpose("time", "component", "episode").values
         truth = np.stack(means) - errors
         there = np.stack([m.available for m in measurements])
-        noise.append(there * (np.stack([m.reading for m in measurements]) - truth[:, measured]))
+        readings = np.stack([m.reading for m in measurements])
+        noise.append(np.where(there > 0, readings - truth[:, measured], 0.0))
         truths.append(truth)
         # What it estimates is flown: the control that follows is in force until the next measurement.
         commanded = [task.autopilot(mean, m.command) for m, mean in recording.said]

@@ -324,7 +324,7 @@ WRONG = {
     "no site": (DEGREES, "give the radar's, --site LATITUDE,LONGITUDE"),
     "metres as degrees": (
         DEGREES | {"latitude": 1e3 * FIVE},
-        "latitude reaches 195000, and degrees are expected",
+        "latitude reaches 195000, and degrees from -90 to 90 are expected: is it metres",
     ),
     "sparse": (ONE | {"time": 20.0 * FIVE}, "positions are 100 s apart, longer than the longest gap of 60 s"),
     "too fast for any unit": (ONE | {"x": 1e9 * FIVE}, "median speed 1e.09 m/s: .* allow higher speeds"),

@@ -404,13 +404,15 @@ def test_range_and_azimuth_are_east_and_north(tmp_path):
 def test_several_tracks_with_truth_in_one_table(tmp_path):
     rows = {name: values * 2 for name, values in PLOTS.items()}
     truth = {
-        f"truth_{c}": np.arange(10.0).tolist()
-        for c in ("position_x", "position_y", "velocity_x", "velocity_y")
+        "truth_position_x": (1000.0 + 1000.0 * np.arange(5)).tolist() * 2,
+        "truth_position_y": (9000.0 - 150.0 * np.arange(5)).tolist() * 2,
+        "truth_velocity_x": [200.0] * 10,
+        "truth_velocity_y": [-30.0] * 10,
     }
     path = table(tmp_path / "two.csv", **rows, recording=["a"] * 5 + ["b"] * 5, **truth)
     read = read_recording(path, TARGET)
     assert read.names == ("a", "b")
-    assert read.truth[:, :, 0].tolist() == [[2.0, 3.0, 4.0], [7.0, 8.0, 9.0]]
+    assert read.truth[:, :, 0].tolist() == [[3000.0, 4000.0, 5000.0]] * 2
     assert np.isfinite(evaluate(TARGET, ["imm"], scenario=read)["cost"].values).all()
 
 

@@ -27,6 +27,7 @@ class AugmentedEstimator:
 
     def __init__(self, task: LooselyCoupledNavigation, noise: MeasurementNoise | None = None) -> None:
         self.filter = AugmentedFilter(task.parameters, MeasurementNoise() if noise is None else noise)
+        self.xp = task.xp
         self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
     def start(self, initial: Initial, N: int) -> Navigator:
@@ -37,7 +38,7 @@ class AugmentedEstimator:
         """Predict by the increment of the INS, update by the fix where there is one."""
         displacement, rates = self.filter.predict(memory.rates)
         position = memory.position + (measurement.increment - displacement)
-        innovation = measurement.available * (measurement.fix - position)
+        innovation = self.xp.where(measurement.available > 0.0, measurement.fix - position, 0.0)
         reported = measurement.reported_deviation * measurement.reported_deviation
         correction, rates = self.filter.update(rates, innovation, reported, measurement.available)
         position = position + correction

@@ -117,7 +117,7 @@ class VariationalBayes(KalmanModel):
         def update(factor: Array) -> tuple[Array, Array, kalman.Update]:
             result = self.updated(predicted, measurement._replace(variance=factor * variance))
             updated = xp.stack([result.covariance[0, 0], result.covariance[1, 1]])
-            residual = measurement.position - result.mean[:2]
+            residual = xp.where(available > 0.0, measurement.position - result.mean[:2], 0.0)
             return residual / xp.sqrt(variance), updated / variance, result
 
         noise, result = noise_adaptation.variational_bayes(

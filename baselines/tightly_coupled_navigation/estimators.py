@@ -70,7 +70,9 @@ class Huber:
 
     def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters]:
         """One cycle of the bank."""
-        filters = self.bank.predict(memory, measurement)
+        xp, readings = self.bank.xp, measurement.readings
+        readings = xp.where(xp.isnan(readings), 0.0, readings)  # the bank weighs each by its availability
+        filters = self.bank.predict(memory, measurement._replace(readings=readings))
         filters = self.bank.weigh_by_bayes(filters, memory.last_action)
         return filters.mean, filters.covariance, filters
 

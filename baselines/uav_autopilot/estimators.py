@@ -35,7 +35,8 @@ class SteadyKalman:
         """Equations (10), (11) with the gain of the algebraic Riccati equation."""
         predicted = self.xp.matmul(self.F, memory) + self.B * measurement.control
         innovation = measurement.reading - self.task.readings_of(predicted)
-        mean = predicted + self.xp.matmul(self.gain, measurement.available * innovation)
+        innovation = self.xp.where(measurement.available > 0.0, innovation, 0.0)
+        mean = predicted + self.xp.matmul(self.gain, innovation)
         return mean, self.covariance + 0.0 * measurement.number, mean
 
 
@@ -89,17 +90,18 @@ class AdaptiveKalman:
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
         mean, covariance = predicted, carried + factor * self.scaled
         noise, log_likelihood = [], 0.0 * measurement.number
+        readings = self.xp.where(measurement.available > 0.0, measurement.reading, 0.0)
         for k, i in enumerate(self.task.measured):
             available = measurement.available[k]
             R, memory = self.sensor_noise.update(
                 before.noise[k],
-                measurement.reading[k] - mean[i],
+                readings[k] - mean[i],
                 covariance[packed_covariance.position(self.n, i, i)],
                 self.task.sensor_variances[k] + 0.0 * available,
                 available,
             )
             mean, covariance, likelihood, _ = packed_covariance.update_coordinates(
-                mean, covariance, measurement.reading[k][None], (i,), R[None], available[None]
+                mean, covariance, readings[k][None], (i,), R[None], available[None]
             )
             noise.append(memory)
             log_likelihood = log_likelihood + likelihood

@@ -17,8 +17,10 @@ class Mine:
         T, (x, P) = measurement.interval[:, None, None], memory
         F, G = numpy.eye(4) + T * numpy.eye(4, k=2), numpy.eye(4, 2) * T**2 / 2 + numpy.eye(4, 2, k=-2) * T
         x, P = F @ x, F @ P @ F.mT + 2.0**2 * G @ G.mT
+        seen = measurement.available[:, None, None] > 0
         z, R = measurement.position.T[:, :, None], measurement.variance.T[:, :, None] * numpy.eye(2)
         H = numpy.eye(2, 4)
-        K = P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R) * measurement.available[:, None, None]  # none where missed
-        x, P = x + K @ (z - H @ x), P - K @ H @ P
+        # A scan that missed the target has NaN for its position: the filter then only predicts.
+        K = seen * (P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R))
+        x, P = x + K @ numpy.where(seen, z - H @ x, 0.0), P - K @ H @ P
         return x[:, :, 0].T, numpy.moveaxis(P, 0, -1), (x, P)

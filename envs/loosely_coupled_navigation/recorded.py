@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 import numpy
 
+from ..plausibility import check_extents
 from ..recorded_tables import Columns, Recorded
 from ..recording import Started
 from .parameters import AXES, LooselyCoupledNavigationParameters
@@ -49,6 +50,7 @@ def recorded(columns: Columns) -> Recorded:
     available = numpy.isfinite(fix).all(axis=1)
     if not available[1:].any():
         raise ValueError("no row has a fix on every axis")
+    check_extents(("ins", "fix"), ins, fix)
     given = {name: value for name, value in columns.given.items() if name not in ("axes", "horizon")}
     nominal = LooselyCoupledNavigationParameters(**{**parameters, **given}).receiver_variance ** 0.5
     sigma = columns.sigmas("sigma")[:, 0] if columns.has("sigma") else numpy.full(len(ins), nominal)

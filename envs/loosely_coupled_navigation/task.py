@@ -103,6 +103,7 @@ class LooselyCoupledNavigation(Task):
     World = InsGnssWorld
     of_world_only = ("duration",)
     recorded_columns = COLUMNS
+    longest_interval = 5.0
     actions = {
         "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
         "`receiver_scale` to the power of a positive, `receiver_reduction` to that of a negative action for the "

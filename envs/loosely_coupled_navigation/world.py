@@ -69,7 +69,7 @@ class Measurement(NamedTuple):
     increment: Array
     """X minus X at the measurement before, m, ``(A, N)``."""
     fix: Array
-    """Position Z by the receiver, m, zero where there is none, ``(A, N)``."""
+    """Position Z by the receiver, m, zero where there is none, where an estimator gets NaN, ``(A, N)``."""
     available: Array
     """One where the receiver has a fix, otherwise zero, ``(N,)``; the INS always speaks."""
     reported_deviation: Array
@@ -205,9 +205,17 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         """Position, ``(A, N)``."""
         return truth.reference
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Fix NaN where there is none."""
+        return measurement._replace(fix=self.xp.where(measurement.available > 0.0, measurement.fix, math.nan))
+
     def seen(self, measurement: Measurement) -> Array:
         """The receiver's position."""
-        return self.xp.where(measurement.available > 0.0, measurement.fix, measurement.fix * math.nan)
+        return self.received(measurement).fix
+
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """As the receiver reports it."""
+        return measurement.reported_deviation + 0.0 * measurement.fix
 
     def error_cost(self, error: Array) -> Array:
         """Squared error of position, summed over the axes, over the nominal variance of a measurement."""

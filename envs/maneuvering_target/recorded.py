@@ -11,6 +11,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
+from ..plausibility import check_bearings
 from ..recorded_tables import Columns, Recorded
 from ..recording import Recording, Started
 from .parameters import ManeuveringTargetParameters
@@ -150,9 +151,11 @@ def _positions(columns: Columns) -> numpy.ndarray:
     if (distance < 0.0).any():
         row = int(numpy.argmax(distance < 0.0))
         raise ValueError(f"range is a distance, and row {row} has {distance[row]:g} m")
-    if (numpy.abs(columns["azimuth"]) > 360.0).any():
-        worst = float(numpy.nanmax(numpy.abs(columns["azimuth"])))
-        raise ValueError(f"azimuth reaches {worst:g}, and degrees from -360 to 360 are expected")
+    stated = columns.given.get("bearing_sigma", ManeuveringTargetParameters.bearing_sigma)
+    sigma = (
+        float(numpy.nanmedian(columns["azimuth_sigma"])) if columns.has("azimuth_sigma") else float(stated)
+    )
+    check_bearings("azimuth", columns.time, columns["azimuth"], sigma)
     return numpy.stack([distance * numpy.sin(azimuth), distance * numpy.cos(azimuth)], axis=1)
 
 

@@ -69,8 +69,8 @@ class ManeuveringTarget(Task):
     ## Scans that miss the target or come early
 
     In the paper every scan sees the target, T seconds after the one before. With `detection_probability` below 1 some do
-    not: `available` is 0 then, the measurement zero, the filters' state the predicted one and the weights the predicted
-    ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u uniform on [0, 1): the filters
+    not: `available` is 0 then, the measurement zero (an estimator gets NaN), the filters' state the predicted one and
+    the weights the predicted ones (13), whatever the action. With `scan_jitter` j scan k comes at T (k - j u), u uniform on [0, 1): the filters
     predict over the time that has passed, and estimate and truth are those of that time. The velocity's gain is
     beta over the time since the last measurement, for which the innovation has grown.
 
@@ -99,6 +99,8 @@ class ManeuveringTarget(Task):
     World = RadarWorld
     of_world_only = ("flight", "track", "track_scans")
     recorded_columns = COLUMNS
+    targets_move = True
+    longest_interval = 60.0
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "

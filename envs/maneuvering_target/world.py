@@ -110,7 +110,7 @@ class Measurement(NamedTuple):
     scan: Array
     """Scans since the start of the track, ``(N,)``."""
     position: Array
-    """x and y, m, ``(2, N)``; zero in a scan that missed the target."""
+    """x and y, m, ``(2, N)``; zero in a scan that missed the target, where an estimator gets NaN."""
     variance: Array
     """Variances of their errors, evaluated at the measured position, m^2, ``(2, N)``; ``range_sigma`` squared in a scan
     that missed the target. Reading: those at the true position would show it."""
@@ -392,12 +392,20 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Position NaN where the scan missed the target."""
+        position = self.xp.where(measurement.available > 0.0, measurement.position, math.nan)
+        return measurement._replace(position=position)
+
     def seen(self, measurement: Measurement) -> Array:
         """The measured position; nothing of the velocity."""
-        nothing = measurement.position * math.nan
-        return self.xp.concat(
-            [self.xp.where(measurement.available > 0.0, measurement.position, nothing), nothing]
-        )
+        position = self.received(measurement).position
+        return self.xp.concat([position, position * math.nan])
+
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """Root of the position's variance."""
+        sigma = self.xp.sqrt(measurement.variance)
+        return self.xp.concat([sigma, sigma * math.nan])
 
     def error_cost(self, error: Array) -> Array:
         """Squared position error over the squared range sigma."""

@@ -111,6 +111,7 @@ class RadarEsmTracking(Task):
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
     recorded_columns = COLUMNS
+    longest_interval = 60.0
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",

@@ -62,8 +62,9 @@ class Measurement(NamedTuple):
     """Index of the emitter type that the ESM decides for, or the number of types where it heard nothing or did not
     listen, ``(N,)``."""
     bearing_difference: Array
-    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180); 0 where there is no decision, ``(N,)``.
-    Reading: the difference and not the two bearings, because the zero of each is the true one here."""
+    """Radar bearing minus ESM bearing, degrees, wrapped to [-180, 180), ``(N,)``; 0 where there is no decision, where
+    an estimator gets NaN. Reading: the difference and not the two bearings, because the zero of each is the true one
+    here."""
 
 
 class Start(NamedTuple):
@@ -248,9 +249,20 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Difference of bearings NaN where the ESM decided nothing."""
+        decided = measurement.decision < self.task.types
+        difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
+        return measurement._replace(bearing_difference=difference)
+
     def seen(self, measurement: Measurement) -> Array:
         """Range and range rate; nothing of the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
+
+    def stated_deviation(self, measurement: Measurement) -> Array:
+        """Those of range and range rate."""
+        p, once = self.parameters, self.xp.ones_like(measurement.radar[0])
+        return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])
 
     def error_cost(self, error: Array) -> Array:
         """Mean of the three squared errors over their scales."""

@@ -113,7 +113,8 @@ class Measurement(NamedTuple):
     heading, pitch and roll from the attitude reference, rad; ``(m, N)``. Their nominal standard deviations are
     those of ``task.sensors``."""
     available: Array
-    """One where a reading is there, zero where it is not and its value means nothing, ``(m, N)``."""
+    """One where a reading is there, zero where it is not and its value means nothing, where an estimator gets
+    NaN, ``(m, N)``."""
     ins_angles: Array
     """Heading, pitch, roll shown by the inertial system, ``(3, N)``, rad."""
     cn0: Array
@@ -365,6 +366,11 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             range_error=error,
         )
         return truth, Measurement(step, readings, available, ins_angles, truth.cn0, position, velocity)
+
+    def received(self, measurement: Measurement) -> Measurement:
+        """Readings NaN where they are not there."""
+        readings = self.xp.where(measurement.available > 0.0, measurement.readings, math.nan)
+        return measurement._replace(readings=readings)
 
     def _during(self, window: Array, k: Array) -> Array:
         """Whether step k lies in a window, ``(N,)``."""

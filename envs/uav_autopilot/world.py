@@ -87,7 +87,7 @@ class Measurement(NamedTuple):
     """Measurements since the start, ``(N,)``; one comes every ``sampling_interval`` seconds."""
     reading: Array
     """Of each sensor, in the unit of its coordinate, ``(m, N)``; in a dropout the last valid one, zero if there
-    was none yet."""
+    was none yet, where an estimator gets NaN."""
     available: Array
     """1 where a sensor answered, 0 in a dropout, ``(m, N)``."""
     command: Array
@@ -244,16 +244,19 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         """State of the plant, ``(n, N)``."""
         return truth.state
 
+    def received(self, measurement: Measurement) -> Measurement:
+        """Readings NaN in a dropout."""
+        reading = self.xp.where(measurement.available > 0.0, measurement.reading, math.nan)
+        return measurement._replace(reading=reading)
+
     def seen(self, measurement: Measurement) -> Array:
         """Every coordinate that has a sensor."""
         sensors = list(self.task.sensors)
-        nothing = measurement.command * math.nan
+        reading, nothing = self.received(measurement).reading, measurement.command * math.nan
         rows = [nothing] * len(self.task.components)
         for i, component in enumerate(self.task.components):
             if component.name in sensors:
-                sensor = sensors.index(component.name)
-                there = measurement.available[sensor] > 0.0
-                rows[i] = self.xp.where(there, measurement.reading[sensor], nothing)
+                rows[i] = reading[sensors.index(component.name)]
         return self.xp.stack(rows)
 
     def cost(self, truth: Truth, mean: Array) -> Array:

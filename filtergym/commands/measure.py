@@ -155,7 +155,10 @@ def evaluate_policies(
     ] = None,
     longest_gap: Annotated[float, typer.Option(help="Of flights: longest gap that is not cut, s.")] = 60.0,
     speeds: Annotated[
-        str, typer.Option(help="Of flights: speeds that are possible, m/s, from the lowest to the highest.")
+        str,
+        typer.Option(
+            help="Of flights and recordings: speeds that are possible, m/s, from the lowest to the highest."
+        ),
     ] = "1,1000",
     smoothing: Annotated[
         float,
@@ -179,7 +182,8 @@ def evaluate_policies(
     named = task_class(environment).scenarios if environment else {}
     flown: Any = scenario
     if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
-        flown = read_recording(recording or scenario, environment, **keywords)
+        limits = pair("--speeds", speeds)
+        flown = read_recording(recording or scenario, environment, speeds=limits, **keywords)
         environment = flown.environment
     if environment is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")

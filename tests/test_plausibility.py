@@ -1,0 +1,256 @@
+"""Wrong units, clocks and columns in recordings: refused or noted; what is right passes without a word."""
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filtergym.envs.catalogue import catalogue
+from filtergym.evaluation.dataset import notes_of
+from test_recording import table
+
+from filtergym import evaluate, read_recording, record
+
+TARGET, LOOSE, ESM = (
+    f"filtergym/{name}-v0" for name in ("ManeuveringTarget", "LooselyCoupledNavigation", "RadarEsmTracking")
+)
+TIME = 5.0 * np.arange(60)
+KNOT = 1.944
+
+
+def plots(**changes):
+    """Plots of an aircraft with its truth; changes are functions of a column."""
+    noise = np.random.default_rng(0).normal(0.0, 100.0, (2, len(TIME)))
+    truth = np.stack([-20e3 + 150.0 * TIME, 15e3 + 0.02 * TIME**2])
+    columns = {"time": TIME, "x": truth[0] + noise[0], "y": truth[1] + noise[1]}
+    columns |= {"truth_position_x": truth[0], "truth_position_y": truth[1]}
+    columns |= {"truth_velocity_x": np.full(60, 150.0), "truth_velocity_y": 0.04 * TIME}
+    return _changed(columns, changes)
+
+
+def polar(**changes):
+    """Ranges and azimuths of an aircraft that flies around the radar, and nothing true."""
+    angle, noise = np.radians(40.0) + 0.005 * TIME, np.random.default_rng(1).normal(size=(2, len(TIME)))
+    azimuth = np.degrees(angle) + 0.25 * noise[1]
+    return _changed({"time": TIME, "range": 30e3 + 100.0 * noise[0], "azimuth": azimuth}, changes)
+
+
+def drive(**changes):
+    """INS and receiver of a car, ten times a second, along one axis."""
+    time, noise = 0.1 * np.arange(200), np.random.default_rng(2).normal(0.0, 1.4, 200)
+    position = 15.0 * time + 5.0 * np.sin(time)
+    return _changed({"time": time, "ins": position + 0.01 * time, "fix": position + noise}, changes)
+
+
+def echoes(**changes):
+    """Ranges and range rates of an aircraft that comes nearer, with the true ones."""
+    time, noise = 0.5 * np.arange(100), np.random.default_rng(3).normal(size=(2, 100))
+    columns = {
+        "time": time,
+        "range": 60e3 - 200.0 * time + 3e3 * noise[0],
+        "range_rate": -200.0 + 50.0 * noise[1],
+    }
+    columns |= {"truth_range": 60e3 - 200.0 * time, "truth_range_rate": np.full(100, -200.0)}
+    return _changed({**columns, "truth_acceleration": np.zeros(100)}, changes)
+
+
+def _changed(columns, changes):
+    found = dict(columns)
+    for name, change in changes.items():
+        found[name] = change(columns[name]) if callable(change) else change
+    return found
+
+
+def untold(columns):
+    """Without the truth."""
+    return {name: values for name, values in columns.items() if not name.startswith("truth_")}
+
+
+def kilometres(values):
+    return 1e-3 * values
+
+
+def milliseconds(values):
+    return 1e3 * values
+
+
+def knots(values):
+    return KNOT * values
+
+
+def an_hour_later(values):
+    """A clock that is put forward in the middle."""
+    return values + 3600.0 * (values >= values[30])
+
+
+def an_hour_earlier(values):
+    return values - 3600.0 * (values >= values[30])
+
+
+RIGHT = {
+    "plots": (TARGET, plots()),
+    "polar": (TARGET, polar()),
+    "drive": (LOOSE, drive()),
+    "echoes": (ESM, echoes()),
+}
+FAR = {"truth_position_x": kilometres, "truth_position_y": kilometres, "truth_velocity_x": kilometres}
+WRONG = {
+    "plots in kilometres": (TARGET, plots(x=kilometres, y=kilometres), "are x, y kilometres"),
+    "ranges in kilometres": (TARGET, polar(range=kilometres), "are x, y kilometres"),
+    "azimuth in radians": (TARGET, polar(azimuth=np.radians), "azimuth scatters by .* is it radians"),
+    "plots in milliseconds": (
+        TARGET,
+        plots(time=milliseconds),
+        "times are 5000 s apart, .* are they milliseconds",
+    ),
+    "plots in minutes": (TARGET, plots(time=lambda t: t / 60.0), "are the times minutes"),
+    "truth in knots": (TARGET, plots(truth_velocity_x=knots, truth_velocity_y=knots), "1.94 times .* knots"),
+    "truth in kilometres": (
+        TARGET,
+        plots(**FAR, truth_velocity_y=kilometres),
+        "truth lies .* is it kilometres",
+    ),
+    "fixes in kilometres": (
+        LOOSE,
+        drive(ins=kilometres, fix=kilometres),
+        "positions scatter by .* kilometres",
+    ),
+    "fixes alone in kilometres": (LOOSE, drive(fix=kilometres), "ins extends over .* is fix kilometres"),
+    "fixes in milliseconds": (
+        LOOSE,
+        drive(time=milliseconds),
+        "times are 100 s apart, .* are they milliseconds",
+    ),
+    "echoes in kilometres": (
+        ESM,
+        echoes(range=kilometres, truth_range=kilometres, truth_range_rate=kilometres),
+        "positions scatter by .* kilometres",
+    ),
+    "echoes in milliseconds": (
+        ESM,
+        echoes(time=milliseconds),
+        "times are 500 s apart, .* are they milliseconds",
+    ),
+    "true range rate in knots": (
+        ESM,
+        echoes(truth_range_rate=knots),
+        "truth_range_rate are 1.94 times .* knots",
+    ),
+    "one sigma": (TARGET, plots(sigma=np.ones(60)), "column sigma, .* did you mean .*sigma_x"),
+    "another word for sigma": (
+        TARGET,
+        polar(range_std=np.ones(60)),
+        "column range_std, .* did you mean .*range_sigma",
+    ),
+    "a slip of the pen": (
+        TARGET,
+        polar(azimuth_sigme=np.ones(60)),
+        "azimuth_sigme, .* did you mean azimuth_sigma",
+    ),
+    "summer time begins": (TARGET, untold(plots(time=an_hour_later)), "3,605 s pass .* did the clock change"),
+    "summer time ends": (TARGET, plots(time=an_hour_earlier), "time decreases .* in UTC"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_cannot_be_is_refused_in_a_sentence(case, tmp_path):
+    env, columns, sentence = WRONG[case]
+    with pytest.raises(ValueError, match=sentence) as refusal:
+        read_recording(table(tmp_path / "wrong.csv", **columns), env)
+    assert "\n" not in str(refusal.value)
+
+
+def outlier(values):
+    return np.where(np.arange(len(values)) == 20, values + 50e3, values)
+
+
+def late(values):
+    """Times of a track that was lost for ten minutes."""
+    return values + 600.0 * (values >= values[30])
+
+
+NOTED = {
+    "an outlier": (TARGET, plots(x=outlier), r"measurement 19 is off the track, by up to 4\d,\d+ m"),
+    "an outlier of a receiver": (LOOSE, drive(fix=outlier), "measurement 20 is off the track"),
+    "an outlier of a radar": (
+        ESM,
+        echoes(range=lambda r: r + 4.0 * (outlier(r) - r)),
+        "measurement 20 is off the track",
+    ),
+    "a value twice": (
+        TARGET,
+        plots(**{c: lambda v: np.where(np.arange(60) == 9, v[8], v) for c in "xy"}),
+        "measurement 8 is the same as before",
+    ),
+    "other columns": (
+        TARGET,
+        plots(mode_a=np.ones(60), velocity=np.ones(60)),
+        "not read: columns mode_a, velocity",
+    ),
+    "a long gap": (
+        TARGET,
+        untold(plots(time=late, x=lambda x: x + 150.0 * 600.0 * (np.arange(60) >= 30))),
+        "nothing was received for 605 s between measurements 28 and 149",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", NOTED)
+def test_what_is_noteworthy_is_said(case, tmp_path):
+    env, columns, sentence = NOTED[case]
+    path = table(tmp_path / "log.csv", **columns)
+    [note] = read_recording(path, env).notes
+    assert re.search(sentence, note), note
+    assert note in notes_of(evaluate(env, ["random"], read_recording(path, env)))
+    again = table(tmp_path / "again.csv", **columns)
+    assert f"again: {note}" in read_recording([path, again], env).notes
+
+
+@pytest.mark.parametrize(
+    ("variable", "factor", "sentence"),
+    [
+        ("position", 1e-3, "are x, y kilometres"),
+        ("seconds", 1e3, "times are 6000 s apart, .* are they milliseconds"),
+        ("truth", 1e-3, "truth lies .* is it kilometres"),
+    ],
+)
+def test_files_are_checked_as_tables_are(variable, factor, sentence, tmp_path):
+    data = record(TARGET, "paper", episodes=2).dataset
+    data[variable] = factor * data[variable]
+    data.to_netcdf(tmp_path / "wrong.nc", engine="scipy")
+    with pytest.raises(ValueError, match=sentence):
+        read_recording(tmp_path / "wrong.nc")
+
+
+@pytest.mark.parametrize("case", RIGHT)
+def test_a_right_table_passes_without_a_note(case, tmp_path):
+    env, columns = RIGHT[case]
+    assert read_recording(table(tmp_path / "log.csv", **columns), env).notes == ()
+
+
+def test_slow_targets_are_taken_where_somebody_says_so(tmp_path):
+    columns = {
+        name: values for name, values in plots(time=lambda t: 300.0 * t).items() if "truth" not in name
+    }
+    path = table(tmp_path / "slow.csv", **columns)
+    with pytest.raises(ValueError, match="are the times milliseconds"):
+        read_recording(path, TARGET, sampling_interval=1500.0)
+    assert read_recording(path, TARGET, speeds=(0.0, 1000.0), sampling_interval=1500.0).notes == ()
+
+
+@pytest.mark.parametrize("id", [id for id in catalogue() if "Uav" not in id])
+def test_what_filtergym_writes_passes_without_a_note(id, tmp_path):
+    """All scenarios but those that simulate what is noted, and closed loops."""
+    for scenario in catalogue()[id].scenarios:
+        if scenario in ("glint", "outliers") or ("Tightly" in id and scenario not in ("matched", "urban")):
+            continue
+        record(id, scenario, episodes=10, horizon=100).write(tmp_path / "made.nc")
+        assert read_recording(tmp_path / "made.nc").notes == (), scenario
+
+
+def test_files_of_the_documentation_pass_without_a_note(tmp_path):
+    docs = Path(__file__).parent.parent / "docs"
+    assert read_recording(docs / "data" / "drive.nc").notes == ()
+    runpy.run_path(str(docs / "examples" / "plots.py"))["write_plots"](tmp_path / "plots.csv")
+    assert read_recording(tmp_path / "plots.csv", TARGET).notes == ()
