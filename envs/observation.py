@@ -173,8 +173,17 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields."""
+        """Positions of named fields.
+
+        Raises:
+            ValueError: for a name that is no field.
+        """
         positions = {field.name: i for i, field in enumerate(self.fields)}
+        missing = [name for name in names if name not in positions]
+        if missing:
+            raise ValueError(
+                f"the observation has no field {', '.join(map(repr, missing))}: choose from {', '.join(positions)}"
+            )
         return [positions[name] for name in names]
 
     @functools.cached_property
