@@ -94,7 +94,8 @@ class Block(NamedTuple):
     text: str
     """What it is."""
     parts: Sequence[str] = ()
-    """Endings that tell its components apart: the fields are ``name_part``. None: one field, ``name``."""
+    """Endings that tell its rows apart, one for each: the fields are ``name_part``. Empty where there is one row only, the
+    field ``name``."""
     shown: Compression = PLAIN
     unit: str = "1"
     """Unit of what is shown."""

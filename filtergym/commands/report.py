@@ -128,6 +128,8 @@ def page(
 ) -> None:
     """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
 
+    A field is named for its block, and where that has several rows for each of its parts.
+
     Example: filtergym page filtergym/ManeuveringTarget-v0
     """
     if into is not None:
