@@ -94,7 +94,7 @@ class Block(NamedTuple):
     text: str
     """What it is."""
     parts: Sequence[str] = ()
-    """Endings that tell its rows apart, one for each: the fields are ``name_part``. Empty where there is one row only, the
+    """Endings that tell its rows apart, one for each: the fields are ``name_part``. Empty where one row is the
     field ``name``."""
     shown: Compression = PLAIN
     unit: str = "1"
