@@ -40,6 +40,7 @@ from .training_run import (
     logger_in,
     schedule,
     task_keywords,
+    validation_interval,
 )
 from .unrolled import Unrolled
 
@@ -255,6 +256,7 @@ def train_bptt(
     """
     if resume and run.finished:
         return run
+    interval = validation_interval(run, interval)
     began = time.monotonic()
     space = make_task(run.environment, run.control, **task_keywords(run)).action_space
     if not isinstance(space, gymnasium.spaces.Box):
@@ -315,7 +317,7 @@ def train_bptt(
         books = Bookkeeping(
             run,
             folder,
-            interval or max(1, run.steps // 20),
+            interval,
             save_checkpoint,
             save_agent,
             agent if run.algorithm not in ESTIMATORS else EstimatorMaker(run.control, agent),

@@ -4,11 +4,11 @@ A file is in the safetensors form: arrays, and a header of words. ``observation_
 ``observation_scale`` normalise the observation, ``gru_*`` are a gated recurrent unit in torch's layout
 (reset, update, new), ``lstm_*`` a long short-term memory (input, forget, cell, output), ``weight_i`` and
 ``bias_i`` the layers after it. The header names the environment, the control and the fields of the
-observation, so that an agent is never shown what it was not trained on.
+observation: by their names an agent finds its columns, wherever they stand and whatever else is shown.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -62,13 +62,23 @@ class LearnedPolicy(Policy):
         arrays: float32, named as in the module's description.
         output: one of ``OUTPUTS``.
         activation: between layers, "tanh" or "relu".
+        fields: names of what it takes of an observation, in its order; default: all that the task shows.
+
+    Raises:
+        ValueError: if the task does not show one of the fields.
     """
 
     def __init__(
-        self, task: Task, arrays: Mapping[str, numpy.ndarray], output: str, activation: str = "tanh"
+        self,
+        task: Task,
+        arrays: Mapping[str, numpy.ndarray],
+        output: str,
+        activation: str = "tanh",
+        fields: Sequence[str] | None = None,
     ) -> None:
         super().__init__(task)
         self.control = task.control  # type: ignore[misc]  # as it was trained
+        self.columns = slice(None) if fields is None else task.columns(fields)
         self.arrays, self.output = arrays, output
         self.activation = ACTIVATIONS[activation]
         self.layers = [
@@ -79,7 +89,7 @@ class LearnedPolicy(Policy):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the network in float32, as it was trained."""
         a = self.arrays
-        x = (observation - a["observation_mean"]) / a["observation_scale"]
+        x = (observation[:, self.columns] - a["observation_mean"]) / a["observation_scale"]
         x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(numpy.float32)
         if "gru_input_weight" in a:
             memory = self._memory(state, start, a["gru_memory_weight"].shape[1])
@@ -229,11 +239,14 @@ class _Stored:
                 f"{self.path} was trained when fields or actions of {task.id} meant something else (its interface "
                 f"{self.header['interface']}, now {task.interface}): train it again"
             )
-        fields = [field.name for field in task.fields]
-        if fields != self.header["fields"]:
-            raise ValueError(
-                f"{self.path} was trained on other fields than {task.id} shows: {self.header['fields']}"
+        try:
+            network = LearnedPolicy(
+                task, self.arrays, self.header["output"], self.header["activation"], self.header["fields"]
             )
+        except ValueError as error:
+            raise ValueError(
+                f"{self.path} was trained on other fields than {task.id} shows: {error}"
+            ) from None
         space: Any = task.action_space
         count = int(space.n) if hasattr(space, "n") else space.shape[0]
         if (self.header["output"] == "argmax") != hasattr(space, "n") or self.header["answers"] != count:
@@ -241,7 +254,6 @@ class _Stored:
                 f"{self.path} answers with {self.header['output']} of {self.header['answers']} numbers, which is no "
                 f"action of control {task.control!r}: {space}"
             )
-        network = LearnedPolicy(task, self.arrays, self.header["output"], self.header["activation"])
         return as_trained(task, network, *self.around)
 
 

@@ -47,6 +47,7 @@ from .training_run import (
     save_run,
     schedule,
     task_keywords,
+    validation_interval,
 )
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -219,6 +220,7 @@ def train_sb3(
     """
     if resume and run.finished:
         return run
+    interval = validation_interval(run, interval)
     began = time.monotonic()
     check_algorithm(run)
     # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
@@ -246,7 +248,7 @@ def train_sb3(
         books = Bookkeeping(
             run,
             folder,
-            interval or max(1, run.steps // 20),
+            interval,
             lambda place: save_checkpoint(model, adapted, normalisation, place),
             lambda place: save_agent(policy, run, place),
             PolicyMaker(

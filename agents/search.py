@@ -29,6 +29,7 @@ from optuna.trial import TrialState
 
 from ..envs.catalogue import task_class
 from ..evaluation.code import code_digest
+from ..envs.parameters import check_integer
 from ..evaluation.files import writable_folder, write_text
 from .settings import merged, read_section
 from .training_run import FILES, TrainingRun, Validated, load_run, new_run, opened_run
@@ -142,7 +143,8 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
         ValueError: if the folder holds a search for something else.
     """
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = optuna.storages.JournalStorage(JournalFileBackend(str(writable_folder(folder) / "journal.log")))
+    writable_folder(folder).mkdir(parents=True, exist_ok=True)
+    storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / "journal.log")))
     pruner = optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS)
     study = optuna.create_study(study_name="filtergym", storage=storage, pruner=pruner, load_if_exists=True)
     asked = {**json.loads(json.dumps(asdict(search))), "code": code_digest()}
@@ -150,7 +152,7 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
     for name, wanted in asked.items():
         if has.get(name) != wanted:
             raise ValueError(
-                f"{folder} holds a search with {name} {has[name]!r}, not {wanted!r}: choose another folder"
+                f"{folder} holds a search with {name} {has.get(name)!r}, not {wanted!r}: choose another folder"
             )
     study.set_user_attr("search", asked)
     return study
@@ -183,8 +185,9 @@ def search_hyperparameters(
         report: told of every trial in words.
 
     Raises:
-        ValueError: for a folder that holds another search, or settings that cannot be trained with.
+        ValueError: for no trials, a folder that holds another search, or settings that cannot be trained with.
     """
+    check_integer("trials", trials, 1)
     study = opened_study(search, folder)
     for left in study.get_trials(deepcopy=False):
         if not left.state.is_finished():  # by a crash

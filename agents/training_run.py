@@ -37,6 +37,7 @@ from ..envs.catalogue import (
     task_class,
 )
 from ..envs.environment import DTYPES
+from ..envs.parameters import check_integer
 from ..envs.reward import REWARDS
 from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap
@@ -178,7 +179,7 @@ def new_run(
     if residual_to and control is None and "control" not in own_keywords:
         # Before the file that is shipped, which knows nothing of that policy.
         control = getattr(own_competitor(cls.id, residual_to), "control", None)
-    control = control or named["control"]
+    control = named["control"] if control is None else control
     controls = controls_of(cls, algorithm)
     if control is not None and control not in controls:
         raise nearest("control", control, controls)
@@ -195,11 +196,9 @@ def new_run(
     if of_environment or "env_kwargs" in values:
         values["env_kwargs"] = of_environment
     default_envs, default_steps = values.pop("n_envs"), values.pop("n_timesteps")
-    envs, steps = envs or int(default_envs), steps or int(default_steps)
-    if envs < 1 or steps < 1:
-        raise ValueError(f"envs and steps must be at least 1, got {envs} and {steps}")
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
+    envs = check_integer("envs", _without_point(default_envs) if envs is None else envs, 1)
+    steps = check_integer("steps", _without_point(default_steps) if steps is None else steps, 1)
+    seed = check_integer("seed", seed, 0)
     return TrainingRun(
         importable_name(cls),
         control or controls[0],
@@ -214,6 +213,11 @@ def new_run(
         residual_to=residual_to,
         gated=gated,
     )
+
+
+def _without_point(value: Any) -> Any:
+    """Return a whole number as one: files write 1e6."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, gated: bool) -> None:
@@ -651,6 +655,15 @@ def interruption() -> Iterator[Callable[[], bool]]:
         yield lambda: wished
     finally:
         restore()
+
+
+def validation_interval(run: TrainingRun, asked: int | None) -> int:
+    """Return the environment steps between two validations; default: a twentieth of the run.
+
+    Raises:
+        ValueError: for none.
+    """
+    return max(1, run.steps // 20) if asked is None else check_integer("validate_every", asked, 1)
 
 
 class Bookkeeping:

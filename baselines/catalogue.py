@@ -72,8 +72,8 @@ def add_baselines(table: Baselines) -> None:
     reference = {**table.references, **table.bounds}
     if table.score_paper not in ("", *table.policies):
         raise nearest("policy as score_paper", table.score_paper, table.policies)
-    if table.score_bound not in ("", *reference):
-        raise nearest("reference as score_bound", table.score_bound, reference)
+    if table.score_reference not in ("", *reference):
+        raise nearest("reference as score_reference", table.score_reference, reference)
     for name, maker in table.policies.items():
         control = getattr(maker, "control", None)
         if control is not None and control not in cls.controls:

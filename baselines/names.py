@@ -54,5 +54,5 @@ def evaluate(
     }
     known = baselines_of(id)
     return evaluation.evaluate(
-        id, objects, *arguments, paper=known.score_paper, reference=known.score_bound, **keywords
+        id, objects, *arguments, paper=known.score_paper, reference=known.score_reference, **keywords
     )

@@ -40,7 +40,7 @@ class Baselines:
     """Classes that keep the protocol :class:`.Estimator`."""
     score_paper: str = ""
     """The policy whose score is 0."""
-    score_bound: str = ""
+    score_reference: str = ""
     """The reference estimator or bound whose score is 1."""
     benchmark: tuple[str, ...] = ()
     """Names that the quick benchmark runs, in the order of the table."""

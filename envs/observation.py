@@ -94,7 +94,8 @@ class Block(NamedTuple):
     text: str
     """What it is."""
     parts: Sequence[str] = ()
-    """Endings that tell its components apart: the fields are ``name_part``. None: one field, ``name``."""
+    """Endings that tell its rows apart, one for each: the fields are ``name_part``. Empty where one row is the
+    field ``name``."""
     shown: Compression = PLAIN
     unit: str = "1"
     """Unit of what is shown."""
@@ -173,8 +174,17 @@ class Blocks:
         return xp.concat(values)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields."""
+        """Positions of named fields.
+
+        Raises:
+            ValueError: for a name that is no field.
+        """
         positions = {field.name: i for i, field in enumerate(self.fields)}
+        missing = [name for name in names if name not in positions]
+        if missing:
+            raise ValueError(
+                f"the observation has no field {', '.join(map(repr, missing))}: choose from {', '.join(positions)}"
+            )
         return [positions[name] for name in names]
 
     @functools.cached_property

@@ -144,6 +144,17 @@ def _integer(name: str, value: Any, limits: Limits) -> None:
         raise ValueError(f"{name} must be an integer{stated}, got {value!r}")
 
 
+def check_integer(name: str, value: Any, at_least: int) -> int:
+    """Return a whole number, of Python or NumPy, that a user gave as an argument.
+
+    Raises:
+        ValueError: with the name, the value and what was expected.
+    """
+    value = frozen(value)
+    _integer(name, value, Limits(at_least=at_least))
+    return int(value)
+
+
 def _word(name: str, value: Any, limits: Limits) -> None:
     if limits.choices and value not in limits.choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, limits.choices))}, got {value!r}")

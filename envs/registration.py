@@ -2,12 +2,20 @@
 
 import dataclasses
 import re
+from collections.abc import Callable
 from typing import Any, ClassVar, get_origin
 
-from .catalogue import ADDED, catalogue, register
-from .task import Task
+import gymnasium
+import numpy
+
+from ..compiler.functions import mapped
+from .catalogue import ADDED, catalogue, nearest, register
+from .task import Episode, Task
 
 ID = re.compile(r"[\w-]+/[\w.-]+-v\d+")
+WIDTH = 24
+"""Episodes side by side in the check of a task: a multiple of eight, as always, and hardly the number of anything else
+that it has."""
 
 
 def add_task(cls: type[Task]) -> None:
@@ -64,13 +72,110 @@ def _check_contract(cls: Any) -> None:
                 f"scenario {scenario.name!r} of {name} sets unknown parameters {', '.join(sorted(unknown))}"
             )
     expected = [n for n in Task.__annotations__ if n not in declared]
-    for control in cls.controls:
+    for control in (*cls.controls, *cls.trained_banks):
         try:
             task = cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters), control)
         except Exception as error:  # whatever a constructor stumbles over
             raise ValueError(f"{name} cannot be made with control {control!r}: {error!r}") from error
         missing = [attribute for attribute in expected if not hasattr(task, attribute)]
         if missing:
-            raise ValueError(
-                f"{name} with control {control!r} lacks the attributes {', '.join(missing)} of a task"
+            raise ValueError(f"{_named(task)} lacks the attributes {', '.join(missing)} of a task")
+        _check_action(task)
+        _check_episodes(task)
+
+
+def _check_action(task: Task) -> None:
+    """Raise ValueError for an action space, or an action of the paper's algorithm, that the engine cannot take."""
+    space: Any = task.action_space
+    flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
+    if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
+        raise ValueError(
+            f"{_named(task)} needs as action space a Box of shape (A,) with finite limits, or a Discrete from 0 on, "
+            f"got {space}"
+        )
+    paper = task.paper_policy
+    if paper.control not in task.controls:
+        raise nearest(f"control of paper_policy of {type(task).__name__}", paper.control, task.controls)
+    if paper.control == task.control and flat and len(paper.action) != space.shape[0]:
+        raise ValueError(
+            f"{_named(task)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
+        )
+
+
+def _check_episodes(task: Task) -> None:
+    """Fly some episodes for two measurements on NumPy, and compare what the task computes with what it declares.
+
+    Raises:
+        ValueError: for the first that does not fit, or raises.
+    """
+    random, noise, names = numpy.random.default_rng(0), task.noise, [c.name for c in task.components]
+    count, space = len(names), task.action_space
+
+    def measure(episode: Episode) -> Episode:
+        normals = random.standard_normal((noise.normals, WIDTH))
+        row = numpy.concatenate([normals, random.random((noise.row_uniforms, WIDTH))])
+        return ask("measure", task.measure, episode, row)
+
+    def ask(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except Exception as error:  # whatever somebody's code stumbles over
+            raise ValueError(f"{_named(task)} fails in {what}: {error!r}") from error
+
+    def check(what: str, values: Any, shape: tuple[int, ...] | None = None, finite: bool = True) -> None:
+        numbers = isinstance(values, numpy.ndarray) and values.dtype.kind in "fiub"
+        if not numbers or values.shape[-1:] != (WIDTH,) or shape not in (None, values.shape[:-1]):
+            expected = f"(..., {WIDTH})" if shape is None else str((*shape, WIDTH))
+            got = (
+                f"{values.dtype} of shape {values.shape}"
+                if hasattr(values, "dtype")
+                else type(values).__name__
             )
+            raise ValueError(
+                f"{_named(task)}: {what} must be numbers of shape {expected}, {WIDTH} episodes on the last axis, "
+                f"got {got}"
+            )
+        if finite and not numpy.isfinite(values).all():
+            raise ValueError(f"{_named(task)}: {what} must be finite")
+
+    uniforms, normals = random.random((noise.uniforms, WIDTH)), numpy.zeros((noise.initial_normals, WIDTH))
+    episode = measure(ask("begin", task.begin, uniforms, normals))
+    for block in task.bank.blocks:
+        values = ask(f"block {block.name!r}", block.value, episode.bank, episode.measurement)
+        check(f"block {block.name!r}", values)
+        rows, fields = values.size // WIDTH, max(1, len(block.parts))
+        if rows != fields:
+            raise ValueError(
+                f"{_named(task)}: block {block.name!r} has {rows} rows for {fields} "
+                f"field{'s' if fields > 1 else ''}: name in its parts one ending for each row, got {block.parts!r}"
+            )
+    shown = ask("observe", task.observe, episode)
+    check("the observation", shown, (len(task.fields),))
+    for quantity in task.bank.quantities:
+        values = ask(f"quantity {quantity.name!r}", task.reader(quantity.name), shown.T)
+        if numpy.shape(values)[:1] != (WIDTH,) or numpy.ndim(values) != 2:
+            raise ValueError(
+                f"{_named(task)}: quantity {quantity.name!r} must have shape ({WIDTH}, parts), {WIDTH} episodes on the "
+                f"first axis, got {numpy.shape(values)}"
+            )
+    if isinstance(space, gymnasium.spaces.Box):
+        action = numpy.tile(numpy.clip(0.0, space.low, space.high)[:, None], WIDTH)
+    else:
+        action = numpy.zeros(WIDTH, int)
+    episode = ask("act", task.act, episode, action)
+    about = f" of the components {', '.join(names)}"
+    shapes = {"mean": (count,), "covariance": (count, count), "error": (count,), "cost": (), "charge": ()}
+    for name, shape in shapes.items():
+        values = ask(name, getattr(task, name), episode)
+        check(name + (about if shape else ""), values, shape)
+    for name, values in ask("records", task.records, episode).items():
+        hypotheses = name == "mode_probability"
+        check(f"record {name!r}", values, (len(task.modes),) if hypotheses else (), finite=False)
+    for name, values in ask("context", task.context, episode).items():
+        check(f"context {name!r}", values)
+    episode = measure(episode)  # with what the bank gives back
+    mapped(lambda values: check("what an episode consists of", values, finite=False), tuple(episode))
+
+
+def _named(task: Task) -> str:
+    return f"{type(task).__name__} with control {task.control!r}"

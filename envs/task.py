@@ -575,7 +575,11 @@ class Task(ABC):
         return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
 
     def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields in the observation."""
+        """Positions of named fields in the observation.
+
+        Raises:
+            ValueError: for a name that is no field.
+        """
         return self._blocks.columns(names)
 
     def reader(self, name: str) -> Reader:

@@ -84,7 +84,8 @@ def check_shown(task: Task, policy: Any, name: str) -> None:
     if shown is not None and shown != (len(task.fields),):
         raise ValueError(
             f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
-            f"{len(task.fields)} fields"
+            f"{len(task.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
+            "of its run, which does"
         )
 
 

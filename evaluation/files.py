@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -20,20 +20,34 @@ def _refusals_told(place: str) -> Iterator[None]:
 
 
 def writable_folder(path: Path) -> Path:
-    """Make a folder and check that it can be written to, before any long work begins.
+    """Check that a folder can be written to, before any long work begins; where there is none it is not made yet.
 
     Raises:
         ValueError: if it cannot.
     """
     with _refusals_told(f"to folder {path}"):
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
+        there = next(place for place in (path, *path.absolute().parents) if place.exists())
+        with tempfile.TemporaryFile(dir=there):
             pass
     return path
 
 
+@contextmanager
+def _made_folder(path: Path) -> Iterator[None]:
+    """Make a folder; if what shall be written into it fails, what was made is taken away again."""
+    made = [place for place in (path, *path.parents) if not place.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for place in made:
+            with suppress(OSError):  # something else is in it
+                place.rmdir()
+        raise
+
+
 def writable_file(path: Path) -> Path:
-    """Check that a file can be written, before any long work begins; its folder is made.
+    """Check that a file can be written, before any long work begins; its folder is not made yet.
 
     Raises:
         ValueError: if it cannot, or if a folder or a device has its name.
@@ -42,8 +56,9 @@ def writable_file(path: Path) -> Path:
         if path.exists() and not path.is_file():
             raise ValueError(f"cannot write file {path}: a folder or device has that name")
         writable_folder(path.parent)
-        _partial(path).touch()
-        _partial(path).unlink()
+        if path.parent.exists():
+            _partial(path).touch()
+            _partial(path).unlink()
     return path
 
 
@@ -61,7 +76,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         ValueError: if it cannot be written.
     """
     partial = _partial(writable_file(path))
-    with _refusals_told(f"file {path}"):
+    with _refusals_told(f"file {path}"), _made_folder(path.parent):
         try:
             yield partial
             partial.replace(os.path.realpath(path))
@@ -75,7 +90,7 @@ def append_line(path: Path, line: str) -> None:
     Raises:
         ValueError: if it cannot be written.
     """
-    with _refusals_told(f"file {path}"), path.open("a", encoding="utf-8") as file:
+    with _refusals_told(f"file {path}"), _made_folder(path.parent), path.open("a", encoding="utf-8") as file:
         file.write(line + "\n")
 
 
@@ -90,6 +105,7 @@ def whole_files(folder: Path) -> Iterator[Path]:
     writable_folder(folder)
     with (
         _refusals_told(f"to folder {folder}"),
+        _made_folder(folder),
         tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-", ignore_cleanup_errors=True) as waiting,
     ):
         yield Path(waiting)
@@ -98,6 +114,7 @@ def whole_files(folder: Path) -> Iterator[Path]:
         for place in places:
             writable_file(place)
         for path, place in zip(complete, places, strict=True):
+            place.parent.mkdir(parents=True, exist_ok=True)
             path.replace(place)
 
 
@@ -139,9 +156,9 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     """
     settle_folder(folder)
     partial, old = _beside(folder)
-    with _refusals_told(f"folder {folder}"):
+    with _refusals_told(f"folder {folder}"), _made_folder(folder.parent):
         try:
-            partial.mkdir(parents=True)
+            partial.mkdir()
             yield partial
             if folder.exists():
                 folder.rename(old)

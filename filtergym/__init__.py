@@ -52,7 +52,8 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
             score.
 
     Raises:
-        ValueError: if the task does not keep the contract, its id is taken, or the table does not fit it.
+        ValueError: if the task does not keep the contract, computes arrays of other shapes than it declares, its id is
+            taken, or the table does not fit it.
     """
     add_task(task)
     if baselines is not None:

@@ -72,7 +72,7 @@ def application() -> Any:
         callback=_general,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        rich_markup_mode="rich",
+        rich_markup_mode=None,  # the extra in filtergym[fast] would be taken for a style
         result_callback=close_output,
     )
     for name, command in COMMANDS.items():

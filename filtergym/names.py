@@ -176,7 +176,7 @@ def asked_of(
             control,
             drawn_episodes,
             known.score_paper,
-            known.score_bound,
+            known.score_reference,
             backend,
             threads,
             keywords,

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
-from filtergym.envs.catalogue import catalogue, make_task
-from filtergym.evaluation.competitors import ConstantPolicy
+from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.observation import Block
+from filtergym.envs.task import named_arrays
+from filtergym.evaluation.competitors import ConstantPolicy, kind_of
+from filtergym.evaluation.rollout import run_competitor
 
 from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
+BANKS = ("banks", "trained_banks")
 SHIPPED = sorted(PRETRAINED.glob("*/*.safetensors"))
 
 OPTIMAL = {
@@ -63,6 +67,39 @@ def test_shipped_agent_does_not_beat_what_is_optimal(file):
     cost = dataset["cost"].isel(time=times).mean("time").values
     difference = cost[0] - cost[1]
     assert difference.mean() > -3.0 * difference.std() / np.sqrt(episodes) - 1e-9
+
+
+def wider(cls):
+    """An environment that shows one field more, and the others in another order."""
+
+    def further(state, measurement):
+        return np.ones(next(values for _, values in named_arrays(measurement)).shape[-1])
+
+    def with_more(bank):
+        def blocks(self):
+            return Block("further", further, "one"), *reversed(bank.blocks.fget(self))
+
+        return type(bank.__name__, (bank,), {"blocks": property(blocks)})
+
+    tables = {table: {name: with_more(b) for name, b in getattr(cls, table).items()} for table in BANKS}
+    return type(cls.__name__, (cls,), tables)
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
+def test_fields_are_found_by_their_names(file):
+    id = f"filtergym/{file.parent.name}"
+    maker = competitor(id, file.stem)
+    cls = task_class(id)
+    control = cls.controls[0] if kind_of(maker) == "estimator" else maker.control
+    interval = min(cls.Parameters().decision_interval, 5)
+    parameters = cls.Parameters(horizon=4 * interval, decision_interval=interval)
+    costs = []
+    for own in (cls, wider(cls)):
+        task = own(parameters, control)
+        found = run_competitor(task, maker(task), kind_of(maker), range(8), lambda t, e: {"cost": t.cost(e)})
+        costs.append(found["cost"])
+    assert task.fields[0].name == "further"
+    np.testing.assert_array_equal(*costs)
 
 
 def test_there_are_shipped_agents():
@@ -115,7 +152,7 @@ def test_policy_of_another_environment_is_refused(stored):
         stored_policy(ID, path)
     fields = [field.name for field in make_task(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))
-    with pytest.raises(ValueError, match="was trained on other fields"):
+    with pytest.raises(ValueError, match=r"was trained on other fields .* has no field 'range': choose from"):
         evaluate(ID, [str(path)], episodes=1)
 
 

@@ -2,7 +2,9 @@
 
 import importlib.metadata
 import importlib.util
+import inspect
 import json
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -11,11 +13,14 @@ import pytest
 from made_results import results_of
 
 from filtergym.__main__ import COMMANDS, main
+from filtergym.commands import terminal
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
 from filtergym.reports.results import read_results, settings_of, write_results
 
 ENV = "filtergym/ManeuveringTarget-v0"
+OF_OPTIONS = {"Backend": ["filtergym[fast]"], "Cluster": ["filtergym[cluster]"]}
+"""Extras in the help of options."""
 
 
 @pytest.fixture
@@ -50,7 +55,72 @@ def test_help_of_every_command_ends_with_an_example(command, monkeypatch, capsys
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 0
-    assert f"Example: filtergym {command}" in capsys.readouterr().out
+    shown, said = capsys.readouterr().out, inspect.getsource(COMMANDS[command])
+    assert f"Example: filtergym {command}" in shown
+    # The extras that a command says it takes are not swallowed as markup.
+    extras = {
+        word for option in ("Backend", "Cluster") if f": {option}" in said for word in OF_OPTIONS[option]
+    }
+    extras |= set(re.findall(r"filtergym\[\w+\]", inspect.getdoc(COMMANDS[command])))
+    assert extras == set(re.findall(r"filtergym\[\w+\]", shown))
+
+
+REFUSED = {
+    "evaluate": (ENV, "--episodes", "0", "--out", "new/out", "--json", "new/records.json"),
+    "record": (ENV, "--episodes", "0", "--out", "new/plots.nc"),
+    "offline": (ENV, "--policy", "nobody", "--out", "new"),
+    "benchmark": ("--environment", ENV, "--split", "tset", "--out", "new"),
+    "report": ("missing.json", "--out", "new/report.html"),
+    "tune": (ENV, "--policy", "imm", "--budget", "0", "--out", "new"),
+    "reproduce": ("imm-alpha-beta", "--episodes", "0", "--out", "new"),
+    "animate": (ENV, "--policy", "known-turn", "--out", "new"),
+    "train": (ENV, "--validate-every", "0", "--out", "new/run"),
+    "search": (ENV, "--trials", "0", "--out", "new"),
+    "export": ("missing", "--out", "new/agent.safetensors"),
+    "seeds": ("missing", "--out", "new/records.json"),
+}
+
+
+def test_every_command_with_out_is_among_those_that_are_refused():
+    with_out = {
+        name for name, function in COMMANDS.items() if "out" in inspect.signature(function).parameters
+    }
+    assert with_out == REFUSED.keys()
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_refused_leaves_nothing(name, run, tmp_path):
+    result = run(name, *REFUSED[name])
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1, result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_without_its_extra_is_refused_alone_and_left_out_beside_results(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "filtergym.reports.html_report", None)
+    result = run("evaluate", ENV, "--policy", "imm", "--episodes", "2", "--set", "horizon=10", "--out", "out")
+    assert result.returncode == 0
+    assert "no report: reports need more packages: pip install 'filtergym[report]'" in result.stdout
+    result = run("report", "out")
+    assert result.returncode == 2
+    assert result.stderr.startswith("Error: reports need more packages: pip install 'filtergym[report]'")
+    assert not list(tmp_path.rglob("report.html"))
+
+
+@pytest.mark.parametrize(("said", "width"), [("80", None), ("", 150), ("0", 150), ("wide", 150)])
+def test_columns_says_how_wide_what_is_piped_may_be(said, width, monkeypatch):
+    monkeypatch.setenv("COLUMNS", said)
+    assert terminal.output_width() == width
+
+
+@pytest.mark.parametrize(
+    "words", [("--steps", "0"), ("--envs", "0"), ("--validate-every", "0"), ("--set", "algo.n_envs=1.5")]
+)
+def test_a_number_of_training_that_is_zero_is_no_default(words, run):
+    pytest.importorskip("stable_baselines3")
+    result = run("train", ENV, "--out", "run", *words)
+    assert result.returncode == 2
+    assert "must be an integer of at least 1" in result.stderr
 
 
 def test_progress_bar_says_nothing_where_nobody_looks(capsys):
@@ -105,7 +175,7 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     made = {path.name for path in (tmp_path / "out").iterdir()}
     # The report takes an extra, which the core install lacks: it says so then.
     report = {"report.html"} if importlib.util.find_spec("plotly") else set()
-    assert report or "no report: it needs more packages, pip install 'filtergym[report]'" in result.stdout
+    assert report or "no report: reports need more packages" in result.stdout
     assert made == report | {
         "records.json", "records.csv", "table.tex", "results.nc", "results.json", "rmse_over_time.png",
         "error_distribution.png", "consistency.png", "mode_probabilities.png",

@@ -299,7 +299,7 @@ def test_baselines_are_named_consistently(env_id):
     known = baselines_of(env_id)
     assert known.score_paper in known.policies
     assert {maker.kind for maker in known.estimators.values()} <= {"estimator"}
-    assert known.score_bound in known.references or known.score_bound in known.bounds
+    assert known.score_reference in known.references or known.score_reference in known.bounds
     assert set(known.benchmark) <= set(known.names)
     assert len(set(known.names)) == len(known.names)
     for table in (known.references, known.bounds):

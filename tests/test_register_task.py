@@ -15,6 +15,7 @@ from filtergym.baselines.table import Baselines
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, make_task, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
+from filtergym.envs.observation import Block, Quantity
 from filtergym.envs.task import Task
 from filtergym.evaluation.competitors import ConstantPolicy
 
@@ -191,6 +192,14 @@ def broken(**attributes):
     return type("Broken", (ManeuveringTarget,), {"id": "mine/Broken-v0", **attributes})
 
 
+GAIN = ManeuveringTarget.banks["gain"]
+
+
+def rows(state, measurement):
+    """What has four rows."""
+    return GAIN.mean(None, state)
+
+
 class Stumbling(ManeuveringTarget):
     id = "mine/Stumbling-v0"
 
@@ -198,9 +207,64 @@ class Stumbling(ManeuveringTarget):
         raise KeyError("sigma")
 
 
+def with_bank(**members):
+    """A task whose bank of control ``gain`` has other members."""
+    bank = type("Gain", (GAIN,), members)
+    return broken(banks={**ManeuveringTarget.banks, "gain": bank})
+
+
+def with_world(**members):
+    return broken(World=type("World", (ManeuveringTarget.World,), members))
+
+
+def further(value, **options):
+    """Blocks of the control ``gain``, and one more."""
+    return property(lambda self: (*GAIN.blocks.fget(self), Block("more", value, "one more", **options)))
+
+
+def fail(*_):
+    raise KeyError("gamma")
+
+
 @pytest.mark.parametrize(
     ("task", "expected"),
     [
+        (
+            with_bank(blocks=further(rows)),
+            "block 'more' has 4 rows for 1 field: name in its parts one ending for",
+        ),
+        (with_bank(blocks=further(rows, parts=("a", "b"))), "block 'more' has 4 rows for 2 fields"),
+        (
+            with_bank(blocks=further(lambda *_: 1.0)),
+            r"block 'more' must be numbers of shape \(\.\.\., 24\).*got float",
+        ),
+        (with_bank(blocks=further(lambda s, _: np.nan * rows(s, _)[0])), "block 'more' must be finite"),
+        (with_bank(blocks=further(fail)), r"fails in block 'more': KeyError\('gamma'\)"),
+        (
+            with_bank(quantities=(Quantity("q", "m", "", lambda read: np.ones(3)),)),
+            r"quantity 'q' .* got \(3,\)",
+        ),
+        (
+            with_bank(mean=lambda self, s: rows(s, None).T),
+            r"mean of the comp.* shape \(4, 24\).* shape \(24, 4\)",
+        ),
+        (with_bank(covariance=lambda self, s: rows(s, None)), r"covariance of .* shape \(4, 4, 24\)"),
+        (
+            with_bank(action_space=gymnasium.spaces.Box(-np.inf, np.inf, (1,))),
+            "Box of shape .* with finite limits",
+        ),
+        (with_bank(act=fail), r"'gain' fails in act: KeyError\('gamma'\)"),
+        (with_bank(records=lambda *_: {"nis": np.ones((1, 24))}), "record 'nis' must be numbers of shape"),
+        (
+            with_world(cost=lambda self, truth, mean: mean[:1]),
+            r"cost must be .* shape \(24,\).* got .* \(1, 24\)",
+        ),
+        (with_world(state=lambda self, truth: np.ones((3, 24))), "fails in error|error of the components"),
+        (
+            with_world(context=lambda self, truth: {"level": np.ones(3)}),
+            "context 'level' must be numbers of shape",
+        ),
+        (with_world(advance=fail), "fails in measure: KeyError"),
         (ManeuveringTarget, "'filtergym/ManeuveringTarget-v0' is there already"),
         (broken(id="filtergym/UavAutopilot-v0"), "'filtergym/UavAutopilot-v0' is there already"),
         ("mine/Turns-v0", "subclass of filtergym.envs.task.Task"),

@@ -276,7 +276,7 @@ BASELINES = Baselines(
     policies={"kalman": Nominal, "matching": Matching, "random": RandomPolicy},
     references={"known-gusts": KnownGusts},
     score_paper="kalman",
-    score_bound="known-gusts",
+    score_reference="known-gusts",
     physical=("rmse", "angle"),
 )
 

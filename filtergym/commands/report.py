@@ -18,7 +18,7 @@ from ..reports.records import write_records
 from ..reports.results import read_all_results
 from ..reports.room import MARKER, measure_room, room_markdown
 from ..reports.tables import claims_table, grid_table
-from .shown import REPORT, make_report, print_results, print_verdict
+from .shown import REPORT, make_report, print_results, print_verdict, report_maker
 from .terminal import (
     Cluster,
     Columns,
@@ -50,6 +50,7 @@ def make(
 
     Example: filtergym report results --out report.html
     """
+    report_maker()  # what it lacks is said before anything else
     writable_file(out)
     found, settings = read_all_results(results)
     print_verdict(found)
@@ -127,6 +128,8 @@ def page(
     into: Annotated[Path | None, typer.Option(help="Page whose tables are replaced.")] = None,
 ) -> None:
     """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
+
+    A field is named for its block, and where that has several rows for each of its parts.
 
     Example: filtergym page filtergym/ManeuveringTarget-v0
     """
@@ -237,7 +240,7 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
-    if waiting is not None:
+    if waiting is not None and waiting.exists():
         shutil.rmtree(waiting)  # measured by this code: another time it is measured anew
     for grid in grids:
         console.print(grid_table(grid))

@@ -1,6 +1,6 @@
 """What several commands print of results, and the report that they make of them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..evaluation.files import write_text
@@ -28,18 +28,29 @@ def print_verdict(results: Sequence[Result]) -> None:
         console.print(sentence.replace("`", ""), width=min(console.width, 80), highlight=False)
 
 
+def report_maker() -> Callable[[Sequence[Result], Settings], str]:
+    """Return what makes a report.
+
+    Raises:
+        ValueError: if it takes packages that are not installed.
+    """
+    try:
+        from ..reports.html_report import report_html
+    except ImportError as error:
+        raise ValueError(f"reports need more packages: pip install 'filtergym[report]' ({error})") from error
+    return report_html
+
+
 def make_report(results: Sequence[Result], settings: Settings, out: Path) -> None:
-    """Make a report and say where it is, or what it needs.
+    """Make a report and say where it is; beside other results it may lack, and then this says why.
 
     Raises:
         ValueError: if it cannot be written.
     """
     try:
-        from ..reports.html_report import report_html
-    except ImportError as error:
-        console.print(
-            f"no report: it needs more packages, pip install 'filtergym[report]' ({error})", soft_wrap=True
-        )
+        maker = report_maker()
+    except ValueError as error:
+        console.print(f"no report: {error}", soft_wrap=True)
         return
-    write_text(out, report_html(results, settings))
+    write_text(out, maker(results, settings))
     console.print(f"report: {out} ({out.stat().st_size / 1e6:.1f} MB), opens in a browser", soft_wrap=True)

@@ -177,9 +177,16 @@ class Output(Console):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-# Wide enough for the results table where the output is a file; a terminal keeps its own width. No markup: names and
-# paths are printed as they are.
-console = Output(width=None if sys.stdout and sys.stdout.isatty() else 150, markup=False, emoji=False)
+def output_width() -> int | None:
+    """Width of what is printed, in characters; None: that of the terminal, or what COLUMNS says."""
+    said = os.environ.get("COLUMNS", "")
+    terminal = sys.stdout is not None and sys.stdout.isatty()
+    # Where the output is a file, wide enough for the table of results.
+    return None if terminal or (said.isdigit() and int(said) > 0) else 150
+
+
+# No markup: names and paths are printed as they are.
+console = Output(width=output_width(), markup=False, emoji=False)
 
 
 def open_output() -> None:

@@ -62,7 +62,7 @@ def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
     strongest, paper = classical[:STRONGEST], known.score_paper
-    wanted = dict.fromkeys((*shipped_agents(id), *strongest, paper, *tuned, known.score_bound))
+    wanted = dict.fromkeys((*shipped_agents(id), *strongest, paper, *tuned, known.score_reference))
     return [name for name in wanted if name in present]
 
 
@@ -97,8 +97,8 @@ def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
         for name in places:
             origin = f"learned {kinds[name]}" if name in learned else "classical"
             best.setdefault(origin, name)
-        if known.score_bound in kinds:
-            best["reference"] = known.score_bound
+        if known.score_reference in kinds:
+            best["reference"] = known.score_reference
         for origin, name in best.items():
             rows.append(
                 [

@@ -145,7 +145,7 @@ def _first_sentence(maker: Any) -> str:
 
 def _policies(cls: type[Task]) -> list[str]:
     known = baselines_of(cls.id)
-    roles = {known.score_paper: " (score 0)", known.score_bound: " (score 1)"}
+    roles = {known.score_paper: " (score 0)", known.score_reference: " (score 1)"}
     rows = []
     for name, maker in known.policies.items():
         rows.append(

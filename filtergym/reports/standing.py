@@ -65,8 +65,8 @@ class Opponents:
         strongest = self._strongest(run)
         if strongest:
             self._fly(strongest, "strongest classical")
-        if known.score_bound in known.references:
-            self._fly(known.score_bound, "reference")
+        if known.score_reference in known.references:
+            self._fly(known.score_reference, "reference")
 
     def _fly(self, name: str, role: str) -> None:
         self.found.append(Standing(name, role, self.measured(own_competitor(self.id, name))))

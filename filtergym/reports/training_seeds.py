@@ -316,7 +316,7 @@ def compare(
     the mean's interval is over training seeds as well (:func:`spread`).
     """
     id = task_class(runs[0].run.environment).id
-    paper, reference = paper_of(id), baselines_of(id).score_bound
+    paper, reference = paper_of(id), baselines_of(id).score_reference
     episodes = len(means.cost[paper])
     bootstrap = Bootstrap(episodes)
     cost = {name: bootstrap.means(values) for name, values in means.cost.items()}
