@@ -167,7 +167,7 @@ class TaskVecEnv(VecEnv):
         The latter are shared with this object, so pickle it before the next step.
         """
         policy = self._policy_memory, self._gate_memory, self._shown, self._start
-        lanes = self.env.lanes.snapshot()
+        lanes = self.env.fleet.snapshot()
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ class TaskVecEnv(VecEnv):
         Raises:
             ValueError: if the number of environments differs.
         """
-        self.env.lanes.restore(snapshot["lanes"])
+        self.env.fleet.restore(snapshot["lanes"])
         self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
         self._policy_memory, self._gate_memory, self._shown, self._start = snapshot["policy"]
 

@@ -58,7 +58,7 @@ def endure(id: str, control: str, scenario: str, steps: int, size: int, seed: in
     while done < steps:
         observation, reward, *_ = env.step(actions(env.single_action_space, generator, size))
         done += size
-        covariance = env.task.covariance(env.lanes.state)
+        covariance = env.task.covariance(env.fleet.only.state)
         for name, values in (("observation", observation), ("reward", reward), ("covariance", covariance)):
             if not numpy.isfinite(values).all():
                 return done, f"{name} is not finite after {done // size} steps, seed {seed}"
