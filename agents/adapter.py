@@ -55,11 +55,11 @@ def to_sb3(
         raise ValueError(
             f"Stable-Baselines3 takes NumPy arrays: use backend='numpy', got {vector_env.backend!r}"
         )
-    if vector_env.detailed_info:
+    if vector_env.options.detailed_info:
         raise ValueError(
             "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
         )
-    if vector_env.tells_context:
+    if vector_env.options.context:
         raise ValueError(
             "to_sb3 keeps no context for each environment: leave it out, or show it to critics with "
             "observation='asymmetric'"

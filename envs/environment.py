@@ -5,6 +5,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -98,55 +99,65 @@ def _no_truth(course: Course) -> str:
     return f"recording {course.names[0]!r} has no truth, so nobody knows what an estimate costs"
 
 
-class _Face:
-    """What both faces share: a task, its spaces, and the reward."""
+@dataclass(frozen=True)
+class EnvOptions:
+    """What a user of either environment may choose beside the task and its parameters; see :class:`TaskEnv`.
+
+    Raises:
+        ValueError: for a value that is none of the choices.
+    """
+
+    reward: str | None = None
+    """Kind of reward; None: the environment's own."""
+    detailed_info: bool = False
+    dtype: str = "float64"
+    context: bool = False
+    observation: str = "measured"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dtype, str) or self.dtype not in DTYPES:  # a NumPy dtype equals its name
+            raise nearest("dtype", self.dtype, DTYPES)
+        if self.observation not in OBSERVATIONS:
+            raise nearest("observation", self.observation, OBSERVATIONS)
+        check("detailed_info", self.detailed_info, bool, Limits())
+        check("context", self.context, bool, Limits())
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.observation == "asymmetric"
+
+
+class _EnvBase:
+    """What both environments share: a task, its spaces, and the reward."""
 
     task: Task
     """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
     fleet: Fleet
+    options: EnvOptions
     reward_kind: str
-    detailed_info: bool
-    dtype: str
-    """Of observations and rewards: "float64" or "float32"."""
-    tells_context: bool
-    """Whether ``info`` holds the episode's context."""
-    privileged: bool
-    """Whether observations hold what no policy can know."""
     last_decision: int
     """Actions after which an episode is truncated, where scenarios differ in length the longest one."""
     reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
     """Names that ``options`` of a reset may have."""
     _spec: EnvSpec | None = None
 
-    def _check(
-        self,
-        task: str,
-        reward_kind: str | None,
-        detailed_info: bool,
-        dtype: str,
-        context: bool,
-        observation: str,
-        names: Iterable[str],
-    ) -> None:
-        """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
+    def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
+        """Keep the options; refuse an unknown environment or parameter before anything is made."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
-        self._reward_asked = reward_kind is not None
-        if reward_kind is None:
-            reward_kind = self._class.reward
-        if reward_kind not in REWARDS:
-            raise nearest("reward", reward_kind, REWARDS)
-        if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
-            raise nearest("dtype", dtype, DTYPES)
-        if observation not in OBSERVATIONS:
-            raise nearest("observation", observation, OBSERVATIONS)
-        check("detailed_info", detailed_info, bool, Limits())
-        check("context", context, bool, Limits())
-        self.reward_kind, self.detailed_info, self.dtype = reward_kind, detailed_info, dtype
-        self.tells_context, self.privileged = context, observation == "asymmetric"
-        self._only_pays = not (detailed_info or self.privileged)
+        self.options = options
+        self.reward_kind = self._class.reward if options.reward is None else options.reward
+        if self.reward_kind not in REWARDS:
+            raise nearest("reward", self.reward_kind, REWARDS)
+        self._rewards_only = not (options.detailed_info or options.privileged)
         if self.privileged:
             self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.options.privileged
 
     def _open(
         self,
@@ -168,22 +179,22 @@ class _Face:
         self._make, self._keywords = make, dict(keywords)
         course = self._course(scenario, {})
         if not all(task.has_truth for task in course.tasks):
-            self._pay_nothing(course)
+            self._disable_reward(course)
         self.task, self._first_course, beside_paper = course.tasks[0], course, self.reward_kind == "relative"
         self.fleet = Fleet(count, course, beside_paper, longest)
         self.last_decision = self.fleet.decisions_per_episode
-        self._wrong: Array = None
+        self._scaled_errors: Array = None
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
         if self.privileged:
-            self._wrong = self.task.constant(numpy.zeros((count, len(self.task.components))))
+            self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
-    def _pay_nothing(self, course: Course) -> None:
-        """Let every reward be zero, where nobody knows the truth.
+    def _disable_reward(self, course: Course) -> None:
+        """Set every reward to zero, where nobody knows the truth.
 
         Raises:
             ValueError: if a reward was asked for, or what is privileged.
         """
-        wanted = f"reward={self.reward_kind!r}" if self._reward_asked else ""
+        wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
         wanted = "observation='asymmetric'" if self.privileged else wanted
         if wanted:
             raise ValueError(f"{_no_truth(course)}: leave out {wanted}; rewards are zero")
@@ -222,8 +233,8 @@ class _Face:
                 )
         return course
 
-    def _send(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
-        """Let the coming episodes of some lanes be of what the options of a reset name."""
+    def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
+        """Apply the scenario and the parameters of a reset to the coming episodes of these lanes."""
         if not {"scenario", "parameters"} & wanted.keys():
             return
         parameters = wanted.get("parameters")
@@ -254,7 +265,7 @@ class _Face:
 
     def _observation_space(self) -> gymnasium.Space:
         def box(size: int) -> gymnasium.spaces.Box:
-            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.dtype).type)
+            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.options.dtype).type)
 
         measured = box(len(self.task.fields))
         if not self.privileged:
@@ -266,7 +277,7 @@ class _Face:
 
     def _rounded(self, values: Array) -> Array:
         """Numbers in the type that was asked for."""
-        if self.dtype == "float64":
+        if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
@@ -277,7 +288,10 @@ class _Face:
             return shown
         xp, count = self.task.xp, self.fleet.count
         flat = [xp.reshape(values, (count, -1)) for values in self._context()[0].values()]
-        return {"observation": shown, "privileged": self._rounded(xp.concat([*flat, self._wrong], axis=1))}
+        return {
+            "observation": shown,
+            "privileged": self._rounded(xp.concat([*flat, self._scaled_errors], axis=1)),
+        }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
         """Context of all lanes, batch first, and which of them has each part of it."""
@@ -331,45 +345,45 @@ class _Face:
 
     # --- a step
 
-    def _pay(
+    def _step_lanes(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
         """Step the lanes and return the mean reward over the measurements of this decision, ``(count,)``.
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
-        if self._only_pays and watch is None:
+        if self._rewards_only and watch is None:
             return self.fleet.pay(action, self.reward_kind)
         infos: list[dict[str, Array]] = []
         answers = []
         for part, own in self.fleet.parts(action):
             infos.append({})
-            answers.append(self._pay_part(part, own, infos[-1], watch))
+            answers.append(self._step_part(part, own, infos[-1], watch))
         if self.privileged:
-            self._wrong = self.fleet.gather([wrong for _, wrong in answers])
+            self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
         info.update(self._gathered(infos)[0])
         return self.fleet.gather([paid for paid, _ in answers])
 
-    def _pay_part(
+    def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
         """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
-        if not self.detailed_info and watch is None:
+        if not self.options.detailed_info and watch is None:
             answers = lanes.decide(action, REPORTS[self.reward_kind])
             paid = mean_of([own[0] if paper is None else own[0] - paper[0] for own, paper in answers])
             _, error, covariance = answers[-1][0]
             return paid[: lanes.count], in_sigmas(error, covariance, lanes.count, lanes.task.xp)
         task = lanes.task
         rewards: list[Array] = []
-        wrong: Array = None
+        scaled: Array = None
         widened = lanes.widened(action)
 
         def record(state: Any, paper_state: Any) -> None:
-            nonlocal wrong
+            nonlocal scaled
             rewards.append(reward(self.reward_kind, task, state, lanes.paper, paper_state))
             if self.privileged:
-                wrong = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
-            if self.detailed_info:
+                scaled = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
+            if self.options.detailed_info:
                 judged = {"error": task.error(state), "cost": task.cost(state)} if task.has_truth else {}
                 batch_last = {**judged, **task.track(state), **task.records(state)}
                 for name, values in batch_last.items():
@@ -378,14 +392,14 @@ class _Face:
                 watch(state)
 
         lanes.step(lambda state: task.act(state, widened), record)
-        return mean_of(rewards)[: lanes.count], wrong
+        return mean_of(rewards)[: lanes.count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
         """Episodes that begin have no estimate yet that could be wrong."""
         if self.privileged:
             keep = numpy.ones((self.fleet.count, 1))
             keep[list(lanes)] = 0.0
-            self._wrong = self.task.xp.where(self.task.constant(keep) > 0.0, self._wrong, 0.0)
+            self._scaled_errors = self.task.xp.where(self.task.constant(keep) > 0.0, self._scaled_errors, 0.0)
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
@@ -393,7 +407,7 @@ class _Face:
         return self.task.fields
 
 
-class TaskEnv(_Face, gymnasium.Env[Any, Any]):
+class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
     """One episode of a task at a time.
 
     Args:
@@ -442,7 +456,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
+        self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
         if backend == "torch":
             raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -479,7 +493,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
                 and for a scenario or parameters that would change the spaces.
         """
         wanted, seed = _checked_options(options, self.reset_options), _checked_seed(seed)
-        self._send(wanted, [0])
+        self._apply_reset_options(wanted, [0])
         super().reset(seed=seed)
         self.fleet.seed(0, self.np_random)
         ahead = None if self._late is None else copy.deepcopy(self.np_random)
@@ -503,7 +517,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         return {name: values[0] for name, values in self._observed().items()}
 
     def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
-        if self.tells_context:
+        if self.options.context:
             info["context"] = {name: values[0] for name, values in self._context()[0].items()}
         return info
 
@@ -513,16 +527,16 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._pay(array[None], info)
+        paid = self._step_lanes(array[None], info)
         if self._late is not None:
             self._late.keep(array)
             self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
-        if self.tells_context:
+        if self.options.context:
             self._with_context(info)
-        earned = float(self._rounded(paid)[0])
-        return self._shown_alone(), earned, False, bool(self.fleet.finished[0]), info
+        reward = float(self._rounded(paid)[0])
+        return self._shown_alone(), reward, False, bool(self.fleet.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -562,7 +576,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             self._late.close()
 
 
-class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
+class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Many episodes of a task side by side, natively vectorised.
 
     Args:
@@ -627,7 +641,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
+        self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
         num_envs, max_episode_steps = frozen(num_envs), frozen(max_episode_steps)
         check("num_envs", num_envs, int, Limits(at_least=1))
         if max_episode_steps not in (None, -1):
@@ -724,7 +738,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         shortened = wanted.get("shortened_by")
         if shortened is not None:
             shortened = self._checked_shortening(shortened)
-        self._send(wanted, chosen)
+        self._apply_reset_options(wanted, chosen)
         self._seed(seeds, chosen)
         self._restart(chosen)
         if shortened is not None:
@@ -736,7 +750,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
         """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
-        if self.tells_context and lanes.any():
+        if self.options.context and lanes.any():
             values, present = self._context()
             told = {}
             for name, array in values.items():
@@ -779,7 +793,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         array = self._actions(actions)
         info: dict[str, Any] = {}
-        paid = self._pay(array, info, self._watch(array))
+        paid = self._step_lanes(array, info, self._watch(array))
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self._restart(numpy.flatnonzero(waiting).tolist())
@@ -798,7 +812,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             info = self._masked(info, ~waiting)
             self._finished = finished
-        if self.tells_context:
+        if self.options.context:
             self._with_context(info, ~self._never)
         shown, paid = self._observed(), self._rounded(paid)
         return shown, paid, self._mask(self._never), self._mask(finished), info

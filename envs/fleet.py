@@ -256,7 +256,9 @@ class Fleet:
     def gather(self, values: Sequence[Array]) -> Array:
         """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``, in a new array."""
         if isinstance(values[0], numpy.ndarray):
-            return numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
+            return (
+                numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
+            )
         if self._whole is not None:
             return self._whole.task.xp.asarray(values[0], copy=True)
         return self._parts[0].task.xp.concat(list(values))[self._where]
