@@ -118,7 +118,7 @@ def test_imm_policy_equals_the_imm_as_plain_filter(bank, seed):
     policy = InteractingMultipleModel(env.unwrapped.task)
     observation, _ = env.reset(seed=seed)
     for k in range(1, 101):
-        lanes = env.unwrapped.fleet
+        lanes = env.unwrapped.fleet.only
         np.testing.assert_allclose(lanes.state.measurement.position[:, 0], measurements[k - 1], rtol=1e-12)
         action, _ = policy.predict(observation)
         observation, _, _, truncated, info = env.step(action)

@@ -142,7 +142,7 @@ def test_same_noise_under_every_control(env_id, short, random_actions):
     for control in cls_controls:
         env = native(env_id, 2, control=control, **short)
         env.reset(seed=4)
-        lanes = env.unwrapped.fleet
+        lanes = env.unwrapped.fleet.only
         rows.append([generator.bit_generator.state["state"]["state"] for generator in lanes.generators])
     assert all(row == rows[0] for row in rows)
 
