@@ -55,11 +55,11 @@ def to_sb3(
         raise ValueError(
             f"Stable-Baselines3 takes NumPy arrays: use backend='numpy', got {vector_env.backend!r}"
         )
-    if vector_env.detailed_info:
+    if vector_env.options.detailed_info:
         raise ValueError(
             "to_sb3 keeps no detailed_info for each environment: leave it out, and evaluate instead"
         )
-    if vector_env.tells_context:
+    if vector_env.options.context:
         raise ValueError(
             "to_sb3 keeps no context for each environment: leave it out, or show it to critics with "
             "observation='asymmetric'"
@@ -167,7 +167,7 @@ class TaskVecEnv(VecEnv):
         The latter are shared with this object, so pickle it before the next step.
         """
         policy = self._policy_memory, self._gate_memory, self._shown, self._start
-        lanes = self.env.lanes.snapshot()
+        lanes = self.env.fleet.snapshot()
         return {"lanes": lanes, "returns": self.returns, "lengths": self.lengths, "policy": policy}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -176,7 +176,7 @@ class TaskVecEnv(VecEnv):
         Raises:
             ValueError: if the number of environments differs.
         """
-        self.env.lanes.restore(snapshot["lanes"])
+        self.env.fleet.restore(snapshot["lanes"])
         self.returns, self.lengths = snapshot["returns"], snapshot["lengths"]
         self._policy_memory, self._gate_memory, self._shown, self._start = snapshot["policy"]
 

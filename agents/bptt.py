@@ -163,7 +163,7 @@ def descend_episodes(
             total += float(pending.detach())
             descend()
             pending, hidden, observation = torch.zeros(()), hidden.detach(), observation.detach()
-            env.lanes.detach()
+            env.fleet.detach()
     return total / env.last_decision
 
 
@@ -221,7 +221,7 @@ def _descended(run: TrainingRun) -> str:
 
 
 def _saved_generators(env: TaskVectorEnv) -> str:
-    return json.dumps([generator.bit_generator.state for generator in env.lanes.generators])
+    return json.dumps([generator.bit_generator.state for generator in env.fleet.generators])
 
 
 def _load(folder: Path, policy: RecurrentPolicy, optimiser: torch.optim.Adam, env: TaskVectorEnv) -> int:
@@ -231,7 +231,7 @@ def _load(folder: Path, policy: RecurrentPolicy, optimiser: torch.optim.Adam, en
         kept = torch.load(folder / "checkpoint.pt", weights_only=True)
         policy.load_state_dict(kept["policy"])
         optimiser.load_state_dict(kept["optimiser"])
-        for generator, state in zip(env.lanes.generators, json.loads(kept["generators"]), strict=True):
+        for generator, state in zip(env.fleet.generators, json.loads(kept["generators"]), strict=True):
             generator.bit_generator.state = state
     except Exception as error:  # torch raises whatever a corrupt file makes it stumble over
         raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error

@@ -173,7 +173,7 @@ class Unrolled:
         gate: Gate | None = None,
         largest: float | None = None,
     ) -> None:
-        lanes: Any = env.lanes  # of one task
+        lanes: Any = env.fleet.only
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation, self._largest = min(truncation, env.last_decision), largest
         self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)

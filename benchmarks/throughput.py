@@ -237,7 +237,7 @@ def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
             env.step(action)
 
     env.reset(seed=0)
-    return Episodes(env.reset, steps, env.unwrapped.lanes.decisions_per_episode)
+    return Episodes(env.reset, steps, env.unwrapped.fleet.decisions_per_episode)
 
 
 def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episodes:

@@ -5,6 +5,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
@@ -15,8 +16,8 @@ from gymnasium.vector.utils import batch_space
 
 from .backend import host_array, is_tensor, task_on, tensor_on
 from .catalogue import ScenarioChoice, check_names, find_mixture, find_scenario, nearest, task_class
+from .fleet import Course, Fleet, check_alike
 from .lanes import Lanes, mean_of
-from .mixture import Course, MixedLanes, check_alike, lanes_of
 from .observation import Array, Field
 from .parameters import Limits, check, frozen
 from .privileged import REPORTS, context_shapes, in_sigmas
@@ -98,55 +99,65 @@ def _no_truth(course: Course) -> str:
     return f"recording {course.names[0]!r} has no truth, so nobody knows what an estimate costs"
 
 
-class _Face:
-    """What both faces share: a task, its spaces, and the reward."""
+@dataclass(frozen=True)
+class EnvOptions:
+    """What a user of either environment may choose beside the task and its parameters; see :class:`TaskEnv`.
+
+    Raises:
+        ValueError: for a value that is none of the choices.
+    """
+
+    reward: str | None = None
+    """Kind of reward; None: the environment's own."""
+    detailed_info: bool = False
+    dtype: str = "float64"
+    context: bool = False
+    observation: str = "measured"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dtype, str) or self.dtype not in DTYPES:  # a NumPy dtype equals its name
+            raise nearest("dtype", self.dtype, DTYPES)
+        if self.observation not in OBSERVATIONS:
+            raise nearest("observation", self.observation, OBSERVATIONS)
+        check("detailed_info", self.detailed_info, bool, Limits())
+        check("context", self.context, bool, Limits())
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.observation == "asymmetric"
+
+
+class _EnvBase:
+    """What both environments share: a task, its spaces, and the reward."""
 
     task: Task
     """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
-    lanes: Lanes | MixedLanes
+    fleet: Fleet
+    options: EnvOptions
     reward_kind: str
-    detailed_info: bool
-    dtype: str
-    """Of observations and rewards: "float64" or "float32"."""
-    tells_context: bool
-    """Whether ``info`` holds the episode's context."""
-    privileged: bool
-    """Whether observations hold what no policy can know."""
     last_decision: int
     """Actions after which an episode is truncated, where scenarios differ in length the longest one."""
     reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
     """Names that ``options`` of a reset may have."""
     _spec: EnvSpec | None = None
 
-    def _check(
-        self,
-        task: str,
-        reward_kind: str | None,
-        detailed_info: bool,
-        dtype: str,
-        context: bool,
-        observation: str,
-        names: Iterable[str],
-    ) -> None:
-        """Refuse keywords that are unknown or of a wrong kind, before anything is made."""
+    def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
+        """Keep the options; refuse an unknown environment or parameter before anything is made."""
         self._class = task_class(task)
         check_names(self._class, names, inspect.signature(type(self)).parameters)
-        self._reward_asked = reward_kind is not None
-        if reward_kind is None:
-            reward_kind = self._class.reward
-        if reward_kind not in REWARDS:
-            raise nearest("reward", reward_kind, REWARDS)
-        if not isinstance(dtype, str) or dtype not in DTYPES:  # a NumPy dtype equals its name
-            raise nearest("dtype", dtype, DTYPES)
-        if observation not in OBSERVATIONS:
-            raise nearest("observation", observation, OBSERVATIONS)
-        check("detailed_info", detailed_info, bool, Limits())
-        check("context", context, bool, Limits())
-        self.reward_kind, self.detailed_info, self.dtype = reward_kind, detailed_info, dtype
-        self.tells_context, self.privileged = context, observation == "asymmetric"
-        self._only_pays = not (detailed_info or self.privileged)
+        self.options = options
+        self.reward_kind = self._class.reward if options.reward is None else options.reward
+        if self.reward_kind not in REWARDS:
+            raise nearest("reward", self.reward_kind, REWARDS)
+        self._rewards_only = not (options.detailed_info or options.privileged)
         if self.privileged:
             self.metadata: dict[str, Any] = {**self.metadata, "privileged": True}
+
+    @property
+    def privileged(self) -> bool:
+        """Whether observations hold what no policy can know."""
+        return self.options.privileged
 
     def _open(
         self,
@@ -165,28 +176,25 @@ class _Face:
             count: number of lanes.
             longest: decisions after which an episode ends at the latest.
         """
-        self._make, self._keywords, self._longest = make, dict(keywords), longest
+        self._make, self._keywords = make, dict(keywords)
         course = self._course(scenario, {})
         if not all(task.has_truth for task in course.tasks):
-            self._pay_nothing(course)
+            self._disable_reward(course)
         self.task, self._first_course, beside_paper = course.tasks[0], course, self.reward_kind == "relative"
-        if len(course.tasks) > 1:
-            self.lanes = MixedLanes(count, course, beside_paper, longest)
-        else:
-            self.lanes = lanes_of(self.task, count, beside_paper, longest)
-        self.last_decision = self.lanes.decisions_per_episode
-        self._wrong: Array = None
+        self.fleet = Fleet(count, course, beside_paper, longest)
+        self.last_decision = self.fleet.decisions_per_episode
+        self._scaled_errors: Array = None
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
         if self.privileged:
-            self._wrong = self.task.constant(numpy.zeros((count, len(self.task.components))))
+            self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
-    def _pay_nothing(self, course: Course) -> None:
-        """Let every reward be zero, where nobody knows the truth.
+    def _disable_reward(self, course: Course) -> None:
+        """Set every reward to zero, where nobody knows the truth.
 
         Raises:
             ValueError: if a reward was asked for, or what is privileged.
         """
-        wanted = f"reward={self.reward_kind!r}" if self._reward_asked else ""
+        wanted = f"reward={self.reward_kind!r}" if self.options.reward is not None else ""
         wanted = "observation='asymmetric'" if self.privileged else wanted
         if wanted:
             raise ValueError(f"{_no_truth(course)}: leave out {wanted}; rewards are zero")
@@ -225,8 +233,8 @@ class _Face:
                 )
         return course
 
-    def _send(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
-        """Let the coming episodes of some lanes be of what the options of a reset name."""
+    def _apply_reset_options(self, wanted: Mapping[str, Any], chosen: Sequence[int]) -> None:
+        """Apply the scenario and the parameters of a reset to the coming episodes of these lanes."""
         if not {"scenario", "parameters"} & wanted.keys():
             return
         parameters = wanted.get("parameters")
@@ -234,13 +242,10 @@ class _Face:
             isinstance(parameters, Mapping) and all(isinstance(name, str) for name in parameters)
         ):
             raise ValueError(f"options['parameters'] maps names of parameters to values, got {parameters!r}")
-        mixed = self.lanes if isinstance(self.lanes, MixedLanes) else None
-        known: list[Course] = [self._first_course]
-        if mixed is not None:
-            known += {id(c): c for c in map(mixed.course_of, range(mixed.count))}.values()
+        known = [self._first_course, *self.fleet.courses()]
         courses = []
         for lane in chosen:
-            now = self._first_course if mixed is None else mixed.course_of(lane)
+            now = self.fleet.course_of(lane)
             asked = now.scenario, now.parameters
             if "scenario" in wanted:
                 scenario = wanted["scenario"]
@@ -252,23 +257,15 @@ class _Face:
                 found = self._course(*asked)
                 known.append(found)
             courses.append(found)
-        if mixed is None:
-            if all(course is self._first_course for course in courses):
-                return
-            mixed = MixedLanes(
-                self.lanes.count, self._first_course, self.reward_kind == "relative", self._longest
-            )
-            mixed.adopt(self.lanes)  # type: ignore[arg-type]
-            self.lanes = mixed
         for lane, course in zip(chosen, courses, strict=True):
-            mixed.send(lane, course)
-        self.last_decision = mixed.decisions_per_episode
+            self.fleet.send(lane, course)
+        self.last_decision = self.fleet.decisions_per_episode
 
     # --- what is shown
 
     def _observation_space(self) -> gymnasium.Space:
         def box(size: int) -> gymnasium.spaces.Box:
-            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.dtype).type)
+            return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.options.dtype).type)
 
         measured = box(len(self.task.fields))
         if not self.privileged:
@@ -280,43 +277,39 @@ class _Face:
 
     def _rounded(self, values: Array) -> Array:
         """Numbers in the type that was asked for."""
-        if self.dtype == "float64":
+        if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
     def _observed(self) -> Any:
         """Observations of all lanes, batch first."""
-        shown = self._rounded(self.lanes.observe())
+        shown = self._rounded(self.fleet.observe())
         if not self.privileged:
             return shown
-        xp, count = self.task.xp, self.lanes.count
+        xp, count = self.task.xp, self.fleet.count
         flat = [xp.reshape(values, (count, -1)) for values in self._context()[0].values()]
-        return {"observation": shown, "privileged": self._rounded(xp.concat([*flat, self._wrong], axis=1))}
+        return {
+            "observation": shown,
+            "privileged": self._rounded(xp.concat([*flat, self._scaled_errors], axis=1)),
+        }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
         """Context of all lanes, batch first, and which of them has each part of it."""
         found = []
-        parts = self.lanes.parts() if isinstance(self.lanes, MixedLanes) else [(self.lanes,)]
-        for (part,) in parts:
+        for (part,) in self.fleet.parts():
             context, xp = part.task.context(part.state), part.task.xp
             found.append({name: xp.moveaxis(v[..., : part.count], -1, 0) for name, v in context.items()})
-        if not isinstance(self.lanes, MixedLanes):
-            present = numpy.ones(self.lanes.count, dtype=bool)
-            # A copy: some of these arrays are the state's own, and the caller may overwrite them.
-            return {k: self.task.xp.asarray(v, copy=True) for k, v in found[0].items()}, dict.fromkeys(
-                found[0], present
-            )
-        return self._joined(found, self.lanes)
+        return self._gathered(found)
 
-    def _joined(
-        self, found: Sequence[Mapping[str, Array]], mixed: MixedLanes
+    def _gathered(
+        self, found: Sequence[Mapping[str, Array]]
     ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
         """Put together what the lanes of several tasks report, and say who reports each part of it.
 
         Where one reports more numbers than another, and where one reports nothing, NaN stands for what is missing.
         """
         xp, values, present = self.task.xp, {}, {}
-        counts = [part.count for (part,) in mixed.parts()]
+        counts = [part.count for (part,) in self.fleet.parts()]
         for name in dict.fromkeys(name for one in found for name in one):
             shapes = [tuple(one[name].shape[1:]) for one in found if name in one]
             largest = tuple(map(max, zip(*shapes, strict=True)))
@@ -331,9 +324,9 @@ class _Face:
                             one[name], xp.float64
                         )
                 padded.append(full)
-            values[name] = mixed.joined(padded)
+            values[name] = self.fleet.gather(padded)
             has = [numpy.full(count, name in one) for one, count in zip(found, counts, strict=True)]
-            present[name] = mixed.joined(has)
+            present[name] = self.fleet.gather(has)
         return values, present
 
     @property
@@ -352,68 +345,61 @@ class _Face:
 
     # --- a step
 
-    def _pay(
+    def _step_lanes(
         self, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None = None
     ) -> Array:
         """Step the lanes and return the mean reward over the measurements of this decision, ``(count,)``.
 
         ``watch`` is called with the state after the action, once for each measurement.
         """
-        if isinstance(self.lanes, Lanes):
-            if self._only_pays and watch is None:
-                return self.lanes.pay(action, self.reward_kind)
-            paid, self._wrong = self._pay_part(self.lanes, action, info, watch)
-            return paid
+        if self._rewards_only and watch is None:
+            return self.fleet.pay(action, self.reward_kind)
         infos: list[dict[str, Array]] = []
         answers = []
-        for part, own in self.lanes.parts(action):
+        for part, own in self.fleet.parts(action):
             infos.append({})
-            answers.append(self._pay_part(part, own, infos[-1], watch))
+            answers.append(self._step_part(part, own, infos[-1], watch))
         if self.privileged:
-            self._wrong = self.lanes.joined([wrong for _, wrong in answers])
-        info.update(self._joined(infos, self.lanes)[0])
-        return self.lanes.joined([paid for paid, _ in answers])
+            self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
+        info.update(self._gathered(infos)[0])
+        return self.fleet.gather([paid for paid, _ in answers])
 
-    def _pay_part(
+    def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
         """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
-        if self._only_pays and watch is None:
-            return lanes.pay(action, self.reward_kind), None
-        if not self.detailed_info and watch is None:
+        if not self.options.detailed_info and watch is None:
             answers = lanes.decide(action, REPORTS[self.reward_kind])
             paid = mean_of([own[0] if paper is None else own[0] - paper[0] for own, paper in answers])
             _, error, covariance = answers[-1][0]
             return paid[: lanes.count], in_sigmas(error, covariance, lanes.count, lanes.task.xp)
         task = lanes.task
         rewards: list[Array] = []
-        wrong: Array = None
+        scaled: Array = None
         widened = lanes.widened(action)
 
         def record(state: Any, paper_state: Any) -> None:
-            nonlocal wrong
+            nonlocal scaled
             rewards.append(reward(self.reward_kind, task, state, lanes.paper, paper_state))
             if self.privileged:
-                wrong = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
-            if self.detailed_info:
+                scaled = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
+            if self.options.detailed_info:
                 judged = {"error": task.error(state), "cost": task.cost(state)} if task.has_truth else {}
                 batch_last = {**judged, **task.track(state), **task.records(state)}
-                # A copy: some of these arrays are the state's own, and the caller may overwrite them.
                 for name, values in batch_last.items():
-                    moved = task.xp.moveaxis(values[..., : lanes.count], -1, 0)
-                    info[name] = task.xp.asarray(moved, copy=True)
+                    info[name] = task.xp.moveaxis(values[..., : lanes.count], -1, 0)
             if watch is not None:
                 watch(state)
 
         lanes.step(lambda state: task.act(state, widened), record)
-        return mean_of(rewards)[: lanes.count], wrong
+        return mean_of(rewards)[: lanes.count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
         """Episodes that begin have no estimate yet that could be wrong."""
         if self.privileged:
-            keep = numpy.ones((self.lanes.count, 1))
+            keep = numpy.ones((self.fleet.count, 1))
             keep[list(lanes)] = 0.0
-            self._wrong = self.task.xp.where(self.task.constant(keep) > 0.0, self._wrong, 0.0)
+            self._scaled_errors = self.task.xp.where(self.task.constant(keep) > 0.0, self._scaled_errors, 0.0)
 
     @property
     def observation_fields(self) -> tuple[Field, ...]:
@@ -421,7 +407,7 @@ class _Face:
         return self.task.fields
 
 
-class TaskEnv(_Face, gymnasium.Env[Any, Any]):
+class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
     """One episode of a task at a time.
 
     Args:
@@ -470,7 +456,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
         observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
+        self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
         if backend == "torch":
             raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -507,19 +493,18 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
                 and for a scenario or parameters that would change the spaces.
         """
         wanted, seed = _checked_options(options, self.reset_options), _checked_seed(seed)
-        self._send(wanted, [0])
+        self._apply_reset_options(wanted, [0])
         super().reset(seed=seed)
-        self.lanes.seed(0, self.np_random)
+        self.fleet.seed(0, self.np_random)
         ahead = None if self._late is None else copy.deepcopy(self.np_random)
-        self.lanes.restart()
+        self.fleet.restart()
         self._forget_errors([0])
-        if isinstance(self.lanes, MixedLanes):
-            self.task = self.lanes.task_of(0)
-            if self._late is not None and ahead is not None:
-                self.lanes.course_of(0).drawn(ahead)  # comes before the episode
-                if self._late.task is not self.task:
-                    self._late.close()
-                    self._picture_of(self.lanes.scenario_of(0))
+        self.task = self.fleet.task_of(0)
+        if self._late is not None and ahead is not None:
+            self.fleet.course_of(0).drawn(ahead)  # comes before the episode
+            if self._late.task is not self.task:
+                self._late.close()
+                self._picture_of(self.fleet.scenario_of(0))
         if self._late is not None and ahead is not None:
             self._late.begin(ahead)
             self._show()
@@ -528,30 +513,30 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
     def _shown_alone(self) -> Any:
         """Observation of the one episode."""
         if not self.privileged:
-            return self._rounded(self.lanes.observe()[0])
+            return self._rounded(self.fleet.observe()[0])
         return {name: values[0] for name, values in self._observed().items()}
 
     def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
-        if self.tells_context:
+        if self.options.context:
             info["context"] = {name: values[0] for name, values in self._context()[0].items()}
         return info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
-        if not self.lanes.begun:
+        if not self.fleet.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._pay(array[None], info)
+        paid = self._step_lanes(array[None], info)
         if self._late is not None:
             self._late.keep(array)
             self._show()
         if info:
             info = {name: values[0] for name, values in info.items()}
-        if self.tells_context:
+        if self.options.context:
             self._with_context(info)
-        earned = float(self._rounded(paid)[0])
-        return self._shown_alone(), earned, False, bool(self.lanes.finished[0]), info
+        reward = float(self._rounded(paid)[0])
+        return self._shown_alone(), reward, False, bool(self.fleet.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -578,7 +563,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
                 'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
             )
             return None
-        if not self.lanes.begun:
+        if not self.fleet.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first render")
         if self.render_mode == "human":
             self._show()
@@ -591,7 +576,7 @@ class TaskEnv(_Face, gymnasium.Env[Any, Any]):
             self._late.close()
 
 
-class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
+class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Many episodes of a task side by side, natively vectorised.
 
     Args:
@@ -656,7 +641,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         observation: str = "measured",
         **keywords: Any,
     ) -> None:
-        self._check(task, reward, detailed_info, dtype, context, observation, keywords)
+        self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
         num_envs, max_episode_steps = frozen(num_envs), frozen(max_episode_steps)
         check("num_envs", num_envs, int, Limits(at_least=1))
         if max_episode_steps not in (None, -1):
@@ -682,7 +667,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if render_mode is not None:
             from . import rendering
 
-            if isinstance(self.lanes, MixedLanes):
+            if self.fleet.mixed:
                 raise ValueError(
                     "a vector of environments that mix scenarios cannot be drawn: use gymnasium.make, or one scenario"
                 )
@@ -704,10 +689,10 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return [_checked_seed(one) for one in seed]
 
     def _seed(self, seeds: Sequence[int | None], lanes: Sequence[int]) -> None:
-        unseeded = not self.lanes.generators
+        unseeded = not self.fleet.generators
         for lane in range(self.num_envs) if unseeded else lanes:
             if unseeded or seeds[lane] is not None:
-                self.lanes.seed(lane, gymnasium.utils.seeding.np_random(seeds[lane])[0])
+                self.fleet.seed(lane, gymnasium.utils.seeding.np_random(seeds[lane])[0])
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -747,17 +732,17 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
                     f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
                     f"at least one True, got {mask!r}"
                 )
-            if not self.lanes.begun and not mask.all():
+            if not self.fleet.begun and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
             chosen = numpy.flatnonzero(mask).tolist()
         shortened = wanted.get("shortened_by")
         if shortened is not None:
             shortened = self._checked_shortening(shortened)
-        self._send(wanted, chosen)
+        self._apply_reset_options(wanted, chosen)
         self._seed(seeds, chosen)
         self._restart(chosen)
         if shortened is not None:
-            self.lanes.shorten(chosen, shortened[list(chosen)])
+            self.fleet.shorten(chosen, shortened[list(chosen)])
         self._finished = self._finished.copy()
         self._finished[list(chosen)] = False
         begun = numpy.isin(numpy.arange(self.num_envs), chosen)
@@ -765,7 +750,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
         """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
-        if self.tells_context and lanes.any():
+        if self.options.context and lanes.any():
             values, present = self._context()
             told = {}
             for name, array in values.items():
@@ -791,14 +776,14 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return shortened
 
     def _restart(self, lanes: Sequence[int]) -> None:
-        self.lanes.restart(lanes)
+        self.fleet.restart(lanes)
         self._forget_errors(lanes)
         if self.pictures is not None:
-            self.pictures.begin(self.lanes.state, lanes)
+            self.pictures.begin(self.fleet.only.state, lanes)
 
     def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         """Apply the actions to the measurements just shown, then show the next ones."""
-        if not self.lanes.begun:
+        if not self.fleet.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         waiting = self._finished
         if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
@@ -808,12 +793,12 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         array = self._actions(actions)
         info: dict[str, Any] = {}
-        paid = self._pay(array, info, self._watch(array))
+        paid = self._step_lanes(array, info, self._watch(array))
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self._restart(numpy.flatnonzero(waiting).tolist())
             paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
-        finished = self.lanes.finished
+        finished = self.fleet.finished
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
             info = self._masked(info, ~finished) | {
@@ -827,7 +812,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             info = self._masked(info, ~waiting)
             self._finished = finished
-        if self.tells_context:
+        if self.options.context:
             self._with_context(info, ~self._never)
         shown, paid = self._observed(), self._rounded(paid)
         return shown, paid, self._mask(self._never), self._mask(finished), info
@@ -836,7 +821,7 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return what keeps the states of this step for the pictures; None without a render mode."""
         if self.pictures is None:
             return None
-        pictures, actions, shown = self.pictures, host_array(action), host_array(self.lanes.observe())
+        pictures, actions, shown = self.pictures, host_array(action), host_array(self.fleet.observe())
         return lambda state: pictures.keep(state, actions, shown)
 
     def render(self) -> tuple[numpy.ndarray, ...] | None:
@@ -854,9 +839,9 @@ class TaskVectorEnv(_Face, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 'render was called without a render mode: use gymnasium.make_vec(..., render_mode="rgb_array")'
             )
             return None
-        if not self.lanes.begun:
+        if not self.fleet.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first render")
-        return self.pictures.frames(self.lanes.state)
+        return self.pictures.frames(self.fleet.only.state)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Forget the figures."""

@@ -13,7 +13,6 @@ from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
 from .envs.catalogue import import_task, importable_name, imported, make_task, nearest, task_class
 from .envs.environment import TaskEnv, TaskVectorEnv
-from .envs.mixture import MixedLanes
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
 from .evaluation.evaluate import check_shown, control_of
@@ -260,7 +259,7 @@ def _task_of(env: Any) -> Any:
             "this environment shows what no policy may know: make it without observation='asymmetric', or show "
             "a policy of your own observation['observation']"
         )
-    if isinstance(inner.lanes, MixedLanes):
+    if inner.fleet.mixed:
         raise ValueError(
             "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
         )

@@ -251,12 +251,12 @@ def gradient_of_bias(truncation, horizon=6):
 
     def cost(shift):
         env.reset(seed=2)
-        state = [g.bit_generator.state for g in env.lanes.generators]
+        state = [g.bit_generator.state for g in env.fleet.generators]
         policy.zero_grad()
         policy.head.bias.data += shift
         value = descend_episodes(env, policy, truncation, descend=lambda: None)
         policy.head.bias.data -= shift
-        for generator, kept in zip(env.lanes.generators, state, strict=True):
+        for generator, kept in zip(env.fleet.generators, state, strict=True):
             generator.bit_generator.state = kept
         return value, float(policy.head.bias.grad)
 

@@ -140,10 +140,10 @@ def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
     np.testing.assert_array_equal(first, second)
     for step in range(5):
         action = random_actions(plain.action_space, 1, step)[0]
-        state = looked_at.lanes.state
+        state = looked_at.fleet.only.state
         task = looked_at.task
-        expected = task.cost(task.act(state, looked_at.lanes.widened(np.asarray(action)[None])))
-        looked_at.lanes.state = state  # through the arrays, not the stepper's memory
+        expected = task.cost(task.act(state, looked_at.fleet.only.widened(np.asarray(action)[None])))
+        looked_at.fleet.only.state = state  # through the arrays, not the stepper's memory
         one, other = plain.step(action), looked_at.step(action)
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1] == other[1]
@@ -154,10 +154,10 @@ def test_snapshots_are_gone_back_to(env_id, short):
     env = gym.make_vec(env_id, num_envs=3, backend="compiled", **short).unwrapped
     actions = sampled(env, 6)
     flown(env, actions[:2])
-    snapshot = env.lanes.snapshot()
+    snapshot = env.fleet.snapshot()
     runs = []
     for _ in range(2):
-        env.lanes.restore(snapshot)
+        env.fleet.restore(snapshot)
         runs.append([np.asarray(part) for action in actions[2:] for part in env.step(action)[:2]])
     for one, other in zip(*runs, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -265,7 +265,7 @@ def test_a_report_that_cannot_be_traced_is_made_with_numpy():
     env = TaskVectorEnv(MANEUVERING.id, 3, "gain", backend="compiled", horizon=5)
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="odd of filtergym/ManeuveringTarget-v0 is not compiled"):
-        ((found, _),) = env.lanes.decide(np.zeros((3, 1)), odd)
+        ((found, _),) = env.fleet.only.decide(np.zeros((3, 1)), odd)
     assert found["largest"][0] == found["cost"].max()
     with pytest.warns(UserWarning, match="is not compiled"):
         task.run(lambda task, episode: float(episode.max()), np.ones((2, 8)))

@@ -502,7 +502,7 @@ def test_vector_and_single_environments_agree_and_end_with_their_flight(backend,
 def test_snapshots_and_shortened_episodes_know_the_flight():
     env = gym.make_vec(ID, num_envs=6, scenario=three())
     env.reset(seed=0)
-    lanes = env.unwrapped.lanes
+    lanes = env.unwrapped.fleet.only
     kept, lengths = lanes.snapshot(), lanes._lengths.copy()
     assert set(lengths.tolist()) == {32, 16, 24}
     env.reset(seed=9)

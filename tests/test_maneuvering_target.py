@@ -118,7 +118,7 @@ def test_imm_policy_equals_the_imm_as_plain_filter(bank, seed):
     policy = InteractingMultipleModel(env.unwrapped.task)
     observation, _ = env.reset(seed=seed)
     for k in range(1, 101):
-        lanes = env.unwrapped.lanes
+        lanes = env.unwrapped.fleet.only
         np.testing.assert_allclose(lanes.state.measurement.position[:, 0], measurements[k - 1], rtol=1e-12)
         action, _ = policy.predict(observation)
         observation, _, _, truncated, info = env.step(action)
@@ -622,7 +622,7 @@ def test_log_likelihood_reward_is_that_of_the_truth():
     env = gym.make(ID, control="weights", reward="log-likelihood", detailed_info=True)
     env.reset(seed=0)
     for _ in range(10):
-        state = env.unwrapped.lanes.state
+        state = env.unwrapped.fleet.only.state
         task = env.unwrapped.task
         after = task.act(state, np.full((2, 8), 0.5))
         _, reward, _, _, info = env.step(np.array([0.5, 0.5]))

@@ -128,7 +128,7 @@ def flown(control, act, seed, **keywords):
     task, said, truncated = env.unwrapped.task, [], False
     observation, _ = env.reset(seed=seed)
     while not truncated:
-        measurement = env.unwrapped.lanes.state.measurement
+        measurement = env.unwrapped.fleet.only.state.measurement
         shown = observation
         observation, _, _, truncated, info = env.step(act(task, observation))
         said.append((shown, measurement, info))
@@ -486,7 +486,7 @@ def test_the_ramp_waits_for_a_measurement():
     observation, _ = env.reset(seed=1)
     state, used, truncated = None, [], False
     while not truncated:
-        seen = env.unwrapped.lanes.state.measurement.available[0]
+        seen = env.unwrapped.fleet.only.state.measurement.available[0]
         action, state = policy.predict(observation, state)
         observation, _, _, truncated, info = env.step(action)
         if seen:
@@ -584,7 +584,7 @@ def test_pictures_leave_out_what_was_missed():
     picture = env.unwrapped.task.picture()
     missed = []
     for _ in range(8):
-        state = env.unwrapped.lanes.state
+        state = env.unwrapped.fleet.only.state
         values = picture.records(state)
         missed.append(not state.measurement.available[0])
         assert np.isnan(values["measured_x"]) == np.isnan(values["measured_y"]) == missed[-1]

@@ -26,10 +26,10 @@ def rollout(id, steps, seed=0, **keywords):
     env = gymnasium.make(id, context=True, **keywords)
     _, info = env.reset(seed=seed)
     env.action_space.seed(0)
-    contexts, states = [info["context"]], [env.unwrapped.lanes.state]
+    contexts, states = [info["context"]], [env.unwrapped.fleet.only.state]
     for _ in range(steps):
         contexts.append(env.step(env.action_space.sample())[4]["context"])
-        states.append(env.unwrapped.lanes.state)
+        states.append(env.unwrapped.fleet.only.state)
     return contexts, states
 
 

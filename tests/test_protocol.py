@@ -368,7 +368,7 @@ def test_the_fast_loop_stays_closed_without_a_render_mode():
     env = TaskVectorEnv(ID, 2, backend="compiled")
     env.reset(seed=0)
     env.step(env.action_space.sample())
-    assert env.lanes._moving, "episodes move in the memory of compiled code"
+    assert env.fleet.only._moving, "episodes move in the memory of compiled code"
     assert env.pictures is None
 
 

@@ -142,7 +142,7 @@ def test_same_noise_under_every_control(env_id, short, random_actions):
     for control in cls_controls:
         env = native(env_id, 2, control=control, **short)
         env.reset(seed=4)
-        lanes = env.unwrapped.lanes
+        lanes = env.unwrapped.fleet.only
         rows.append([generator.bit_generator.state["state"]["state"] for generator in lanes.generators])
     assert all(row == rows[0] for row in rows)
 
@@ -349,15 +349,15 @@ def test_snapshot_of_the_lanes_is_gone_back_to_as_often_as_one_likes(env_id, con
     env = native(env_id, 3, AutoresetMode.SAME_STEP, control=control, reward="relative", **short).unwrapped
     env.reset(seed=5)
     env.step(random_actions(env.single_action_space, 3, 0))
-    snapshot = env.lanes.snapshot()
+    snapshot = env.fleet.snapshot()
     runs = []
     for _ in range(2):
-        env.lanes.restore(snapshot)
+        env.fleet.restore(snapshot)
         # Through the end, whose restarts draw from the generators.
         shown = [env.step(random_actions(env.single_action_space, 3, k))[:2] for k in range(1, 5)]
-        env.lanes.restart([1])
-        runs.append([*(part for pair in shown for part in pair), env.lanes.observe()])
+        env.fleet.restart([1])
+        runs.append([*(part for pair in shown for part in pair), env.fleet.observe()])
     for one, other in zip(*runs, strict=True):
         np.testing.assert_array_equal(one, other)
     with pytest.raises(ValueError, match="the snapshot holds 3 environments, not 2"):
-        TaskVectorEnv(env_id, num_envs=2, control=control, **short).lanes.restore(snapshot)
+        TaskVectorEnv(env_id, num_envs=2, control=control, **short).fleet.restore(snapshot)

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.envs.catalogue import find_mixture, task_class
-from filtergym.envs.mixture import Course
+from filtergym.envs.fleet import Course
 
 ID = "filtergym/ManeuveringTarget-v0"
 MIXTURE = {"random": 0.6, "paper": 0.4}
@@ -42,7 +42,7 @@ def test_every_lane_is_the_single_environment_with_its_seed():
         for step, action in enumerate(actions):
             np.testing.assert_array_equal(own, rows[step][lane])
             own, _, _, truncated, _ = env.step(action[lane])
-            scenarios.add(env.unwrapped.lanes.scenario_of(0))
+            scenarios.add(env.unwrapped.fleet.scenario_of(0))
             if truncated:
                 own, _ = env.reset()
     assert scenarios == set(MIXTURE)
@@ -53,13 +53,13 @@ def test_an_episode_of_a_mixture_is_one_of_its_scenario_from_where_the_choice_le
     seen = set()
     for seed in range(6):
         shown, _ = env.reset(seed=seed)
-        name = env.unwrapped.lanes.scenario_of(0)
+        name = env.unwrapped.fleet.scenario_of(0)
         generator = gymnasium.utils.seeding.np_random(seed)[0]
         assert name == ("random" if generator.random() < 0.6 else "paper")
         alone = gymnasium.make(ID, scenario=name, **SHORT).unwrapped
-        alone.lanes.seed(0, generator)
-        alone.lanes.restart()
-        np.testing.assert_array_equal(shown, alone.lanes.observe()[0])
+        alone.fleet.seed(0, generator)
+        alone.fleet.restart()
+        np.testing.assert_array_equal(shown, alone.fleet.observe()[0])
         seen.add(name)
         assert env.unwrapped.task.parameters == alone.task.parameters
     assert len(seen) == 2
@@ -82,11 +82,11 @@ def test_copies_in_the_middle_of_an_episode_go_on_identically(way, backend):
     flown(env, actions[:4])
     other = WAYS[way](env)
     same(flown(env, actions[4:]), flown(other, actions[4:]))
-    snapshot = env.unwrapped.lanes.snapshot()
-    after = [np.asarray(env.unwrapped.lanes.observe())]
+    snapshot = env.unwrapped.fleet.snapshot()
+    after = [np.asarray(env.unwrapped.fleet.observe())]
     flown(env, actions[:8])
-    env.unwrapped.lanes.restore(snapshot)
-    same([np.asarray(env.unwrapped.lanes.observe())], after)
+    env.unwrapped.fleet.restore(snapshot)
+    same([np.asarray(env.unwrapped.fleet.observe())], after)
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -108,13 +108,13 @@ def test_restored_lanes_go_on_as_they_did():
     env.reset(seed=3)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (90, 10, 1))
     flown(env, actions[:4])
-    snapshot = env.lanes.snapshot()
+    snapshot = env.fleet.snapshot()
     runs = []
     for _ in range(2):
-        env.lanes.restore(snapshot)
+        env.fleet.restore(snapshot)
         paid = [env.step(a)[1] for a in actions]
-        env.lanes.restart([1, 4])
-        runs.append([*paid, env.lanes.observe()])
+        env.fleet.restart([1, 4])
+        runs.append([*paid, env.fleet.observe()])
     same(*runs)
 
 
@@ -146,7 +146,7 @@ def test_episodes_of_different_length_end_at_their_own():
         ID, num_envs=12, scenario={"random": 1, "cruise": 1}, autoreset_mode="SameStep", control="gain"
     )
     env.reset(seed=0)
-    lanes = env.unwrapped.lanes
+    lanes = env.unwrapped.fleet
     names = [lanes.scenario_of(lane) for lane in range(12)]
     assert set(names) == {"random", "cruise"}
     assert env.spec.max_episode_steps == 100
@@ -226,7 +226,7 @@ def test_lanes_of_a_scenario_that_is_left_are_forgotten():
     env = gymnasium.make(ID, **SHORT)
     for k in range(5):
         env.reset(seed=0, options={"parameters": {"range_sigma": 50.0 + k}})
-        assert len(env.unwrapped.lanes._parts) == 1
+        assert len(env.unwrapped.fleet._parts) == 1
 
 
 def test_a_mixture_takes_as_many_places_as_it_needs():
@@ -234,7 +234,7 @@ def test_a_mixture_takes_as_many_places_as_it_needs():
     env.reset(seed=0)
     for _ in range(30):
         env.step(np.zeros((100, 1)))
-    assert sum(part.count for part in env.lanes._parts) < 150
+    assert sum(part.count for part in env.fleet._parts) < 150
 
 
 def test_details_of_a_mixture_are_those_of_its_scenarios():

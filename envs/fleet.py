@@ -1,9 +1,11 @@
-"""Episodes of several tasks side by side: a lane flies now one, then another.
+"""The fleet of an environment: its lanes, of one task or of several side by side.
 
-A task has one set of parameters. Where scenarios are mixed, or a reset names another scenario or other parameters,
-every distinct set has a task and :class:`~.lanes.Lanes` of its own. A lane's next episode gets a free place in the
-lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody has is stepped
-all the same and never looked at: a step costs what as many environments of each task cost as ever flew it at once.
+A task has one set of parameters. As long as all episodes are of one, the fleet is that task's
+:class:`~.lanes.Lanes`, and every call goes straight to them. Where scenarios are mixed, or a reset names another
+scenario or other parameters, every distinct set has a task and lanes of its own. A lane's next episode gets a free
+place in the lanes of the task that is drawn for it; lanes grow by eight places when none is free. A place that nobody
+has is stepped all the same and never looked at: a step costs what as many environments of each task cost as ever flew
+it at once.
 
 What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the episode as
 in :mod:`.lanes`. So sub-environment i of N equals the single environment with the same seed, here too.
@@ -77,13 +79,8 @@ def check_alike(task: Task, other: Task, name: str) -> None:
             )
 
 
-def lanes_of(task: Task, count: int, beside_paper: bool, longest: int | None) -> Lanes:
-    """Make lanes of a task, with the paper's algorithm beside every episode where it is wanted."""
-    return Lanes(task, count, paper_task(task) if beside_paper else None, longest=longest)
-
-
-class MixedLanes:
-    """``count`` lanes, each with a :class:`Course` of its own; used like :class:`~.lanes.Lanes`.
+class Fleet:
+    """``count`` lanes, each with a :class:`Course` of its own.
 
     Args:
         count: number of lanes.
@@ -97,24 +94,43 @@ class MixedLanes:
         self.generators: list[numpy.random.Generator] = []
         self._courses = [course] * count
         self._beside_paper, self._longest = beside_paper, longest
-        self._parts: list[Lanes] = []
         self._part = numpy.full(count, -1)
         """Which of ``_parts`` each lane flies in; -1 before its first episode."""
         self._place = numpy.arange(count)
         """Where in it."""
-        self._names = [""] * count
+        self._names = [course.names[0]] * count
+        self._parts: list[Lanes] = []
+        self._whole: Lanes | None = None
+        """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
+        self._sent = False
+        """Whether lanes have courses that their episodes were not drawn from."""
+        if len(course.tasks) == 1:
+            self._parts, self._part[:] = [self._make_lanes(course.tasks[0], count)], 0
         self._arrange()
 
-    def adopt(self, lanes: Lanes) -> None:
-        """Go on with the episodes of lanes of one task, the first course's."""
-        self.generators = list(lanes.generators)
-        if lanes.begun:
-            lanes.grow(lanes.width)
-            self._parts, self._part[:] = [lanes], 0
-            self._names = [course.names[0] for course in self._courses]
-            self._arrange()
-
     # --- who flies where
+
+    @property
+    def only(self) -> Lanes:
+        """The lanes, where all episodes are of one task.
+
+        Raises:
+            ValueError: where they are of several.
+        """
+        if self._whole is not None:
+            return self._whole
+        if self.count > 1:
+            raise ValueError("episodes of several tasks have no common state: use parts()")
+        return self._parts[self._part[0]]
+
+    @property
+    def mixed(self) -> bool:
+        """Whether the coming episodes may be of several tasks."""
+        return len({id(task) for course in self._courses for task in course.tasks}) > 1
+
+    def courses(self) -> list[Course]:
+        """Return the different courses that lanes have."""
+        return list({id(course): course for course in self._courses}.values())
 
     def course_of(self, lane: int) -> Course:
         """Return what the coming episodes of a lane are drawn from."""
@@ -122,6 +138,7 @@ class MixedLanes:
 
     def send(self, lane: int, course: Course) -> None:
         """Draw the coming episodes of a lane from a course, from its next restart on."""
+        self._sent = self._sent or course is not self._courses[lane]
         self._courses[lane] = course
 
     def task_of(self, lane: int) -> Task:
@@ -135,19 +152,19 @@ class MixedLanes:
     @property
     def decisions_per_episode(self) -> int:
         """Decisions of the longest episode that there may be."""
-        tasks = {id(task): task for course in self._courses for task in course.tasks}.values()
+        tasks = {id(task): task for course in self.courses() for task in course.tasks}.values()
         most = max(task.horizon // task.decision_interval for task in tasks)
         return most if self._longest is None else min(most, self._longest)
 
-    def _made(self, task: Task, count: int) -> Lanes:
-        return lanes_of(task, count, self._beside_paper, self._longest)
+    def _make_lanes(self, task: Task, count: int) -> Lanes:
+        return Lanes(task, count, paper_task(task) if self._beside_paper else None, longest=self._longest)
 
     def _part_of(self, task: Task) -> Lanes:
         """Lanes of a task, made when they are first asked for."""
         for part in self._parts:
             if part.task is task or part.task.parameters == task.parameters:
                 return part
-        part = self._made(task, ROOM)
+        part = self._make_lanes(task, ROOM)
         for place in range(ROOM):
             part.seed(place, numpy.random.default_rng(0))
         part.restart()
@@ -176,15 +193,26 @@ class MixedLanes:
             source[self._place[own]] = own
             self._sources.append(source)
             first += self._parts[i].count
+        own_places = self._flying == [0] and numpy.array_equal(self._place, numpy.arange(self.count))
+        alone = len(self._parts) == 1 and self._parts[0].count == self.count and not self.mixed
+        self._whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
         """Give a lane the generator that its coming episodes are drawn from."""
         while len(self.generators) <= lane:
             self.generators.append(generator)
         self.generators[lane] = generator
+        if self._whole is not None:
+            self._whole.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
         """Start new episodes in some lanes (default: all), each of a task that is drawn for it."""
+        if self._whole is not None and not self._sent:
+            self._whole.restart(lanes)
+            return
+        if self._whole is not None:
+            self._leave(self._whole)
+        self._sent = False
         chosen = list(range(self.count) if lanes is None else lanes)
         self._part[chosen] = -1
         fresh: dict[int, list[int]] = {}
@@ -208,6 +236,14 @@ class MixedLanes:
             part.restart(free)
         self._arrange()
 
+    def _leave(self, whole: Lanes) -> None:
+        """Make room for lanes of other tasks."""
+        self._whole = None
+        if whole.begun:
+            whole.grow(whole.width)
+        else:
+            self._parts, self._part[:] = [], -1
+
     # --- what lanes do
 
     def parts(self, *values: Array) -> list[tuple[Any, ...]]:
@@ -217,25 +253,39 @@ class MixedLanes:
             for i, source in zip(self._flying, self._sources, strict=True)
         ]
 
-    def joined(self, values: Sequence[Array]) -> Array:
-        """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``."""
+    def gather(self, values: Sequence[Array]) -> Array:
+        """Put together what :meth:`parts` have returned, ``(places, ...)`` each: ``(count, ...)``, in a new array."""
         if isinstance(values[0], numpy.ndarray):
-            return numpy.concatenate(values)[self._where]
+            return (
+                numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
+            )
+        if self._whole is not None:
+            return self._whole.task.xp.asarray(values[0], copy=True)
         return self._parts[0].task.xp.concat(list(values))[self._where]
+
+    def pay(self, action: Array, kind: str) -> Array:
+        """Apply one decision and return its reward, see :meth:`.lanes.Lanes.pay`."""
+        if self._whole is not None:
+            return self._whole.pay(action, kind)
+        return self.gather([part.pay(own, kind) for part, own in self.parts(action)])
 
     def observe(self) -> Array:
         """Observation of every lane, batch first."""
-        return self.joined([part.observe() for (part,) in self.parts()])
+        if self._whole is not None:
+            return self._whole.observe()
+        return self.gather([part.observe() for (part,) in self.parts()])
 
     @property
     def decisions(self) -> numpy.ndarray:
         """Actions taken in each lane's current episode, ``(count,)``."""
-        return numpy.asarray(self.joined([part.decisions for (part,) in self.parts()]))
+        return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
 
     @property
     def finished(self) -> numpy.ndarray:
         """Lanes whose episode is over, ``(count,)`` booleans; episodes of different tasks may differ in length."""
-        return numpy.asarray(self.joined([part.finished for (part,) in self.parts()]))
+        if self._whole is not None:
+            return self._whole.finished
+        return numpy.asarray(self.gather([part.finished for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
         """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
@@ -245,18 +295,7 @@ class MixedLanes:
     @property
     def begun(self) -> bool:
         """Whether every lane has an episode."""
-        return bool((self._part >= 0).all())
-
-    @property
-    def state(self) -> Any:
-        """The episode of a single lane, padded.
-
-        Raises:
-            ValueError: if there are more.
-        """
-        if self.count > 1:
-            raise ValueError("episodes of several tasks have no common state: use parts()")
-        return self._parts[self._part[0]].state
+        return self._whole.begun if self._whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
         """Cut the gradient (torch only)."""
@@ -272,24 +311,22 @@ class MixedLanes:
         """Go on from a snapshot of lanes of the same tasks.
 
         Raises:
-            ValueError: if their number differs, or the snapshot is one of lanes of a single task.
+            ValueError: if their number differs.
         """
-        if snapshot["count"] != self.count or "parts" not in snapshot:
-            raise ValueError(
-                f"the snapshot holds {snapshot['count']} environments, not {self.count} that mix tasks"
-                if "parts" in snapshot
-                else "the snapshot is one of environments that do not mix tasks"
-            )
+        if snapshot["count"] != self.count:
+            raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         for name in _KEPT:
             setattr(self, name, copy.deepcopy(snapshot[name]))
-        self._parts = []
-        for task, count, kept in snapshot["parts"]:
-            self._parts.append(self._made(task, count))
-            self._parts[-1].restore(kept)
+        there = {(part.task, part.count): part for part in self._parts}
+        self._parts = [
+            there.get((task, count)) or self._make_lanes(task, count) for task, count, _ in snapshot["parts"]
+        ]
+        for part, (_, _, kept) in zip(self._parts, snapshot["parts"], strict=True):
+            part.restore(kept)
         for lane in numpy.flatnonzero(self._part >= 0):
             self._parts[self._part[lane]].seed(int(self._place[lane]), self.generators[lane])
         self._arrange()
 
 
-_KEPT = ("generators", "_courses", "_part", "_place", "_names")
-"""Attributes of mixed lanes that change."""
+_KEPT = ("generators", "_courses", "_part", "_place", "_names", "_sent")
+"""Attributes of a fleet that change."""
