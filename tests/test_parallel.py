@@ -343,8 +343,7 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
     import shutil
 
     from filtergym.agents.learned_policy import PRETRAINED
-
-    from filtergym.reports.training_seeds import episode_means, load_runs
+    from training_seeds import episode_means, load_runs
 
     folders = []
     for seed, shipped in ((0, "ppo"), (1, "bptt")):
@@ -367,8 +366,8 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
 
 
 def test_units_of_a_reproduction_stand_in_their_places(two):
-    from filtergym.baselines.maneuvering_target.reproduction.experiment import flown, squares_of
-    from filtergym.baselines.reproduction import gathered, later
+    from filtergym.papers.imm_alpha_beta.experiment import flown, squares_of
+    from filtergym.papers.reproduction import gathered, later
 
     asked = {
         ("imm", 1): [later(flown, "imm", 8), 3.0],
