@@ -4,7 +4,7 @@ PYTHON ?= python3
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := docs/conf.py filtergym compiler filters envs evaluation baselines agents tests benchmarks
+SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation baselines agents papers tests benchmarks
 
 # Numbers, and every library once: gymnasium, scipy, xarray, matplotlib, typer and rich, safetensors.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
@@ -76,7 +76,9 @@ check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff check $(SOURCES)
 	rm -rf $(VENV)/typed
 	$(BIN)/python -m pip install --quiet --no-deps --target $(VENV)/typed .
+	cp -r papers/. $(VENV)/typed/filtergym/papers
 	MYPYPATH=$(VENV)/typed $(BIN)/mypy -p filtergym
+	MYPYPATH=$(VENV)/typed:docs/make $(BIN)/mypy docs/make
 	$(SITE)
 
 docs: $(VENV)/.dev  ## build the documentation into site/

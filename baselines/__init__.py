@@ -1,1 +1,1 @@
-"""The papers' algorithms as policies, reference estimators and bounds; their tuning; their reproductions."""
+"""The papers' algorithms as policies, reference estimators and bounds, and their tuning."""

@@ -22,24 +22,30 @@ from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "list": measure.list_environments,
-    "evaluate": measure.evaluate_policies,
-    "record": measure.record_scenario,
-    "offline": measure.write_offline,
-    "benchmark": measure.benchmark,
-    "report": report.make,
-    "comparison": report.comparison_page,
-    "tune": improve.tune_policy,
-    "room": report.room,
-    "page": report.page,
-    "reproduce": report.reproduce,
-    "animate": measure.animate,
-    "train": improve.train,
-    "search": improve.search,
-    "export": improve.export,
-    "seeds": report.seeds,
+Commands = dict[str, Callable[..., None]]
+GROUPS: dict[str, Commands] = {
+    "Use an environment": {
+        "list": measure.list_environments,
+        "animate": measure.animate,
+        "record": measure.record_scenario,
+    },
+    "Compare": {
+        "evaluate": measure.evaluate_policies,
+        "benchmark": measure.benchmark,
+        "reproduce": report.reproduce,
+    },
+    "Tune and train": {
+        "tune": improve.tune_policy,
+        "train": improve.train,
+        "search": improve.search,
+    },
+    "Share": {
+        "report": report.make,
+        "export": improve.export,
+        "offline": measure.write_offline,
+    },
 }
+COMMANDS: Commands = {name: command for group in GROUPS.values() for name, command in group.items()}
 REPORT = (
     "--debug shows where it happened: if that is not in code of your own, please report it with what it shows"
 )
@@ -65,9 +71,8 @@ def _general(
         os.environ[SWITCH] = "off"
 
 
-@functools.cache
-def application() -> Any:
-    """Return the commands as one program: called with its arguments, it ends in SystemExit."""
+def program_of(groups: dict[str, Commands]) -> Any:
+    """Return commands as one program, whose help shows them in groups; called with arguments, it ends in SystemExit."""
     app = typer.Typer(
         callback=_general,
         no_args_is_help=True,
@@ -75,13 +80,20 @@ def application() -> Any:
         rich_markup_mode=None,  # the extra in filtergym[fast] would be taken for a style
         result_callback=close_output,
     )
-    for name, command in COMMANDS.items():
-        app.command(name)(command)
+    for group, commands in groups.items():
+        for name, command in commands.items():
+            app.command(name, rich_help_panel=group)(command)
     return typer.main.get_command(app)
 
 
-def main() -> None:
-    """Run the command line.
+@functools.cache
+def application() -> Any:
+    """Return the commands of ``filtergym``."""
+    return program_of(GROUPS)
+
+
+def main(program: Callable[[], Any] = application, name: str = "filtergym") -> None:
+    """Run the command line, or another program with its ways of ending.
 
     A user's mistake, or what the operating system refuses, ends in one sentence and exit code 2; what nobody expected
     in one that asks for a report, and exit code 1. With ``--debug`` both end in a traceback.
@@ -92,7 +104,7 @@ def main() -> None:
         with warnings.catch_warnings(), nullcontext() if sys.flags.safe_path else modules_from(os.getcwd()):
             warnings.showwarning = _show_warning
             # Under one name, however it was started: the shell asks for completions of that.
-            application()([word for word in sys.argv[1:] if word != "--debug"], prog_name="filtergym")
+            program()([word for word in sys.argv[1:] if word != "--debug"], prog_name=name)
     except Exception as error:
         if debug:
             raise

@@ -53,7 +53,7 @@ def check_installed() -> None:
 
 
 def check_command_line() -> None:
-    """The installed command lists, evaluates a tuned policy and a shipped agent, and knows its version."""
+    """The installed command lists, evaluates a tuned policy and a shipped agent, knows its version, has no paper."""
     command = Path(sys.executable).parent / "filtergym"
     evaluate = "evaluate filtergym/ManeuveringTarget-v0 --policy imm-tuned --policy ppo --episodes 2"
     for arguments, expected in (
@@ -64,6 +64,11 @@ def check_command_line() -> None:
         ran = subprocess.run([command, *arguments.split()], capture_output=True, text=True, check=False)
         assert ran.returncode == 0, ran.stderr
         assert expected in ran.stdout
+    ran = subprocess.run(
+        [command, "reproduce", "imm-alpha-beta"], capture_output=True, text=True, check=False
+    )
+    assert (ran.returncode, ran.stderr.count("\n")) == (2, 1), ran.stderr
+    assert "part of the repository, not of the package" in ran.stderr
 
 
 if __name__ == "__main__":

@@ -72,13 +72,21 @@ def _one(space, rng):
 def command(monkeypatch, capsys):
     """Run the command line; returns exit code, output and errors."""
 
-    def run(*words):
+    def run(*words, program=main):
         monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
         with pytest.raises(SystemExit) as ended:
-            main()
+            program()
         return ended.value.code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def make_page(command):
+    """Run ``python docs/make``; returns exit code, output and errors."""
+    import commands
+
+    return functools.partial(command, program=commands.main)
 
 
 @pytest.fixture

@@ -215,7 +215,6 @@ def test_a_table_says_what_its_references_know(run):
         (("tune", ENV, "--policy", "random"), "unknown tunable policy"),
         (("reproduce", "imm"), "unknown paper"),
         (("benchmark", "--environment", "Nothing"), "unknown environment"),
-        (("comparison", "missing.json"), "cannot read the results"),
         (("report", "missing.json"), "cannot read the results"),
     ],
 )
@@ -305,8 +304,9 @@ def mean_cost(records, name):
     return next(r.value for r in records if (r.policy, r.metric, r.window) == (name, "cost", "all"))
 
 
-def test_comparison_shows_what_the_records_say(tmp_path, run):
-    from filtergym.reports import comparison
+def test_comparison_shows_what_the_records_say(tmp_path, make_page, monkeypatch):
+    import comparison
+
     from filtergym.reports.ranking import who_is_best
 
     names = ["imm", "imm-tuned", "adaptive-rearm", "ppo", "known-turn", "known-input-bound"]
@@ -349,7 +349,8 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
         "<!-- comparison ManeuveringTarget-v0: begin -->\n<!-- comparison ManeuveringTarget-v0: end -->"
         "\n<!-- comparison of all: begin -->\n<!-- comparison of all: end -->"
     )
-    assert run("comparison", "results.json", "--into", "page.md").returncode == 0
+    monkeypatch.chdir(tmp_path)
+    assert make_page("comparison", "results.json", "--into", "page.md")[0] == 0
     assert "`ppo` (learned)" in page.read_text()
     assert "| ManeuveringTarget | `ppo` | `random` |" in page.read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.png").stat().st_size > 10_000
@@ -365,16 +366,17 @@ def test_comparison_shows_what_the_records_say(tmp_path, run):
         "--columns",
         "1",
     )
-    assert run(*again).returncode == 0
+    assert make_page(*again)[0] == 0
     assert "(images/comparison_ManeuveringTarget-v0.svg)" in page.read_text()
     assert 'width="252' in (tmp_path / "images" / "comparison_ManeuveringTarget-v0.svg").read_text()
     assert (tmp_path / "images" / "comparison_ManeuveringTarget-v0.pdf").exists()
 
 
-def test_curves_in_a_format_that_nobody_writes_are_refused_first(run, tmp_path):
-    result = run("seeds", "nowhere", "--curves", "curves.gif")
-    assert result.returncode == 2
-    assert "written as png, svg or pdf, got 'gif'" in result.stderr
+def test_curves_in_a_format_that_nobody_writes_are_refused_first(make_page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, errors = make_page("seeds", "nowhere", "--curves", "curves.gif")
+    assert code == 2
+    assert "written as png, svg or pdf, got 'gif'" in errors
     assert list(tmp_path.iterdir()) == []
 
 

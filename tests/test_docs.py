@@ -7,13 +7,12 @@ import re
 import shlex
 from pathlib import Path
 
+import command_line
 import pytest
+from environment_page import environment_tables, put_tables
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, parameter_names
-
-from filtergym.reports import command_line
-from filtergym.reports.environment_page import environment_tables, put_tables
-from filtergym.reports.pages import insert_between_markers
+from pages import insert_between_markers
 
 DOCS = Path(__file__).parent.parent / "docs"
 AUDIENCES = ("filter_designer.md", "rl_researcher.md", "log_file.md")
@@ -37,7 +36,7 @@ def page(id: str) -> str:
 
 @pytest.mark.parametrize("id", catalogue())
 def test_tables_of_the_page_are_those_of_the_code(id, tmp_path):
-    """If not: ``filtergym page ID --into docs/environments/PAGE.md``."""
+    """If not: ``python docs/make page ID --into docs/environments/PAGE.md``."""
     copy = tmp_path / "page.md"
     copy.write_text(page(id), encoding="utf-8")
     assert put_tables(id, copy) == list(environment_tables(id))
@@ -49,7 +48,7 @@ def test_page_has_the_usual_headings_and_a_room_table(id):
     text = page(id)
     assert [h for h in HEADINGS if f"\n## {h}\n" not in text] == []
     table = text.partition("<!-- room table: begin -->")[2].partition("<!-- room table: end -->")[0]
-    assert "filtergym room" in table
+    assert "python docs/make room" in table
 
 
 @pytest.mark.parametrize("id", catalogue())
@@ -101,7 +100,7 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
 
 
 def test_page_of_the_command_line_is_that_of_the_code(tmp_path):
-    """If not: ``python -m filtergym.reports.command_line docs/command_line.md``."""
+    """If not: ``python docs/make command-line docs/command_line.md``."""
     copy = tmp_path / "page.md"
     copy.write_text((DOCS / "command_line.md").read_text(encoding="utf-8"), encoding="utf-8")
     insert_between_markers(copy, {command_line.MARKER: command_line.command_line_markdown()})
@@ -139,7 +138,7 @@ def test_first_page_shows_the_result_and_the_commands_of_the_readme():
 
 def test_every_page_of_results_says_what_makes_it():
     for name, words in (
-        ("comparison.md", "filtergym comparison results/results.json --into docs/comparison.md"),
+        ("comparison.md", "python docs/make comparison results/results.json --into docs/comparison.md"),
         ("training_seeds.md", "--into docs/training_seeds.md"),
         ("speed.md", "python benchmarks/throughput.py"),
         ("plan.md", "python benchmarks/plan.py"),

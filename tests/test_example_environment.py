@@ -8,13 +8,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from environment_page import environment_tables
 from filtergym.baselines import catalogue as baselines
 from filtergym.envs import registration
 from filtergym.envs.catalogue import make_task
 from gymnasium.utils.env_checker import check_env
 
 import filtergym
-from filtergym.reports.environment_page import environment_tables
 
 FOLDER = Path(__file__).parent.parent / "docs" / "examples"
 ID = "mine/InvertedPendulum-v0"

@@ -7,15 +7,15 @@ import subprocess
 
 import pytest
 import xarray
-from filtergym.baselines.reproduction import Grid
 from filtergym.evaluation.metrics import flight_records
+from filtergym.papers.grid import Grid
 from rich.table import Table
 from rich.text import Text
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
 from filtergym.reports.export import latex_table, latex_text, records_as_csv
-from filtergym.reports.tables import flights_table, grid_table, recorded_table, results_tables
+from filtergym.reports.tables import flights_table, recorded_table, results_tables
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NASTY = '50 % of $a_b$ & {c} ~ ^ # \\ < > | " ± 3 m², σ ≤ ∞, λ, 日, Müller'
@@ -40,7 +40,7 @@ def tables(dataset):
         "results": results_tables(records, 150)[0],
         "recorded": recorded_table(tidy_records(flights)),
         "flights": flights_table(flights, flight_records(flights), tidy_records(flights)),
-        "grid": grid_table(Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]])),
+        "grid": Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]]).__rich__(),
         "nasty": nasty,
     }
 

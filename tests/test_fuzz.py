@@ -5,6 +5,7 @@ import random
 import shutil
 import warnings
 
+import commands
 import numpy as np
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
@@ -47,11 +48,11 @@ WORDS = (
 def command(monkeypatch, capsys):
     """Run the command line; what it says is at most one sentence, which asks for no report."""
 
-    def run(*words):
+    def run(*words, program=main):
         monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
         warnings.simplefilter("ignore", RuntimeWarning)  # outside the tests, one of NumPy is no error
         with pytest.raises(SystemExit) as ended:
-            main()
+            program()
         errors = capsys.readouterr().err
         assert ended.value.code in (0, 2), (words, errors)
         assert errors.count("\n") == (0 if ended.value.code == 0 else 1), (words, errors)
@@ -169,7 +170,7 @@ def test_results(tmp_path, command):
     for i in range(30):
         file.write_bytes(whole)
         file.write_bytes(broken_json(file, rng))
-        command("comparison", file)
+        command("comparison", file, program=commands.main)
         if i % 3 == 0:
             command("report", file, "--out", tmp_path / "report.html")
 
@@ -182,7 +183,7 @@ def test_records_of_training(tmp_path, command):
         (folder / "run.json").write_bytes(whole)
         (folder / "run.json").write_bytes(broken_json(folder / "run.json", rng))
         curves = () if i % WHOLE else ("--curves", tmp_path / "curves.png")
-        command("seeds", folder, "--policy", "imm", *episodes(i), *curves)
+        command("seeds", folder, "--policy", "imm", *episodes(i), *curves, program=commands.main)
 
 
 def test_settings(command):

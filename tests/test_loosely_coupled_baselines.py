@@ -6,11 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.loosely_coupled_navigation import reproduction as paper
 from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedEstimator
 from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
-from filtergym.baselines.loosely_coupled_navigation.reproduction import experiment
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.loosely_coupled_navigation.world import within
@@ -19,10 +17,12 @@ from filtergym.evaluation.rollout import run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled
 from filtergym.filters.linear_systems import van_loan
+from filtergym.papers.kalman_bucy_ins_gnss import experiment
 
 import filtergym  # noqa: F401  # registers the environments
 from filtergym import evaluate, tidy_records
 from filtergym.names import competitor
+from filtergym.papers import kalman_bucy_ins_gnss as paper
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
 KNOWN = baselines_of(ID)

@@ -426,8 +426,7 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
 
 def test_training_seeds_are_scored_the_same(two, tmp_path):
     from filtergym.agents.learned_policy import PRETRAINED
-
-    from filtergym.reports.training_seeds import episode_means, load_runs
+    from training_seeds import episode_means, load_runs
 
     folders = []
     for seed, shipped in ((0, "ppo"), (1, "bptt")):
@@ -450,8 +449,8 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
 
 
 def test_units_of_a_reproduction_stand_in_their_places(two):
-    from filtergym.baselines.maneuvering_target.reproduction.experiment import flown, squares_of
-    from filtergym.baselines.reproduction import gathered, later
+    from filtergym.papers.imm_alpha_beta.experiment import flown, squares_of
+    from filtergym.papers.reproduction import gathered, later
 
     asked = {
         ("imm", 1): [later(flown, "imm", 8), 3.0],

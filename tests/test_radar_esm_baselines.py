@@ -7,17 +7,17 @@ import numpy
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
-from filtergym.baselines.radar_esm_tracking import reproduction
 from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
-from filtergym.baselines.radar_esm_tracking.reproduction import claims, experiment
-from filtergym.baselines.reproduction.measured import Measured
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import started_lanes
+from filtergym.papers.measured import Measured
+from filtergym.papers.radar_esm_class_fusion import claims, experiment
 
 import filtergym  # noqa: F401  # registers the environments
 from filtergym import evaluate, tidy_records
+from filtergym.papers import radar_esm_class_fusion as reproduction
 
 ID = "filtergym/RadarEsmTracking-v0"
 WINDOWS = {"early": (1, 20), "middle": (20, 60), "late": (60, 120)}

@@ -133,7 +133,7 @@ def test_evaluation_with_baselines(turns):
     assert ("adaptive", "policy", "score", "", "all") in own
 
 
-def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
+def test_the_command_line_lists_and_evaluates_it(package, command, make_page, monkeypatch):
     monkeypatch.chdir(package)
     code, listed, errors = command("list", ID)
     assert code == 0, errors
@@ -141,7 +141,7 @@ def test_the_command_line_lists_and_evaluates_it(package, command, monkeypatch):
     assert "nobody's" in listed
     code, _, errors = command("benchmark", "--environment", ID, "--out", "results")
     assert code == 0, errors
-    code, _, errors = command("room", ID)
+    code, _, errors = make_page("room", ID)
     assert code == 2
     assert "has no paper's algorithm to compare with" in errors
 

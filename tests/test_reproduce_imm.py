@@ -6,24 +6,24 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.baselines.maneuvering_target import reproduction as paper
-from filtergym.baselines.maneuvering_target.reproduction import claims, experiment, figures
-from filtergym.baselines.maneuvering_target.reproduction.experiment import recorded
-from filtergym.baselines.maneuvering_target.reproduction.gain_schedules import (
+from filtergym.envs.catalogue import make_task
+from filtergym.papers.imm_alpha_beta import claims, experiment, figures
+from filtergym.papers.imm_alpha_beta.experiment import recorded
+from filtergym.papers.imm_alpha_beta.gain_schedules import (
     best_schedule,
     maneuver_flight,
     mean_square_errors,
     ramp_schedule,
 )
-from filtergym.baselines.maneuvering_target.reproduction.imm_readings import (
+from filtergym.papers.imm_alpha_beta.imm_readings import (
     Reading,
     Recording,
     interacting_multiple_model,
 )
-from filtergym.baselines.reproduction.measured import Measured
-from filtergym.envs.catalogue import make_task
+from filtergym.papers.measured import Measured
 
 from filtergym import evaluate
+from filtergym.papers import imm_alpha_beta as paper
 
 ID = "filtergym/ManeuveringTarget-v0"
 

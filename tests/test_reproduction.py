@@ -5,21 +5,19 @@ from pathlib import Path
 
 import numpy
 import pytest
-from filtergym.baselines.reproduction import (
+from filtergym.evaluation.print_layout import save
+from filtergym.papers.grid import Grid
+from filtergym.papers.measured import Measured, mean, means, measured
+from filtergym.papers.reproduction import (
     Claim,
-    Grid,
     Reproduction,
-    as_markdown,
     episode_count,
     its_command,
-    paper_module,
-    papers,
-    save_reproduction,
     verdict_of,
 )
-from filtergym.baselines.reproduction.measured import Measured, mean, means, measured
-from filtergym.evaluation.print_layout import save
 from matplotlib.figure import Figure
+
+from filtergym.papers import paper_module, papers
 
 
 def example() -> Reproduction:
@@ -30,7 +28,7 @@ def example() -> Reproduction:
         [Claim("C1", "It is small.", "|e| = 3.1 ± 0.2 m", "10 runs", "not reproduced")],
         [Grid("Errors", ("run", "m"), [("first", "3.0"), ("second", "3.2")])],
         {"figure_1": (figure, "The error."), "figure_2": (figure, "The same again.")},
-        its_command("a-paper", 3),
+        its_command("filtergym.papers.a_paper", 3),
     )
 
 
@@ -48,6 +46,12 @@ def test_an_unknown_paper_is_named_with_what_was_meant() -> None:
         paper_module("imm-alpha-gamma")
 
 
+def test_a_package_without_the_repository_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("filtergym.papers.__path__", [str(tmp_path)])
+    with pytest.raises(ValueError, match="are part of the repository, not of the package"):
+        paper_module("imm-alpha-beta")
+
+
 def test_every_paper_refuses_episodes_without_an_interval() -> None:
     assert (episode_count(None, 50), episode_count(2, 50)) == (50, 2)
     for name in papers():
@@ -57,7 +61,7 @@ def test_every_paper_refuses_episodes_without_an_interval() -> None:
 
 
 def test_the_page_holds_claims_tables_and_figures() -> None:
-    lines = as_markdown(example()).splitlines()
+    lines = example().markdown().splitlines()
     assert lines[0] == "# A paper"
     assert lines[2] == "Made by `filtergym reproduce a-paper --episodes 3 --out DIR`."
     # A bar inside a cell must not open another cell.
@@ -69,14 +73,14 @@ def test_the_page_holds_claims_tables_and_figures() -> None:
 
 
 def test_saving_writes_the_page_and_every_figure_and_nothing_else(tmp_path: Path) -> None:
-    save_reproduction(example(), tmp_path)
+    example().save(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["figure_1.png", "figure_2.png", "report.md"]
-    assert (tmp_path / "report.md").read_text(encoding="utf-8") == as_markdown(example())
+    assert (tmp_path / "report.md").read_text(encoding="utf-8") == example().markdown()
     assert (tmp_path / "figure_2.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_figures_in_other_formats_and_the_page_that_shows_the_first(tmp_path: Path) -> None:
-    save_reproduction(example(), tmp_path, ("svg", "pdf"))
+    example().save(tmp_path, ("svg", "pdf"))
     figures = [f"figure_{i}.{suffix}" for i in (1, 2) for suffix in ("pdf", "svg")]
     assert sorted(p.name for p in tmp_path.iterdir()) == [*figures, "report.md"]
     assert "![The error.](figure_1.svg)" in (tmp_path / "report.md").read_text(encoding="utf-8")
@@ -91,7 +95,7 @@ def test_a_failure_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
     result = example()
     result = replace(result, figures={**result.figures, "figure_2": (Unpaintable(), "Nothing.")})
     with pytest.raises(RuntimeError, match="no ink"):
-        save_reproduction(result, tmp_path)
+        result.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == "the last one"
 

@@ -5,11 +5,7 @@ import math
 import numpy
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.reproduction import save_reproduction
-from filtergym.baselines.reproduction.measured import Measured
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
-from filtergym.baselines.tightly_coupled_navigation import reproduction as paper
-from filtergym.baselines.tightly_coupled_navigation.reproduction import claims, experiment
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.task import Initial
@@ -19,9 +15,12 @@ from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import run_bound, run_estimator, run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
+from filtergym.papers.measured import Measured
+from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
 from naive import dense
 
 from filtergym import evaluate, tidy_records
+from filtergym.papers import multi_hypothesis_ins_gnss as paper
 
 ID = "filtergym/TightlyCoupledNavigation-v0"
 KNOWN = baselines_of(ID)
@@ -474,7 +473,7 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
     assert verdicts["C5"] == "reproduced"
     for table in result.tables:
         assert {len(row) for row in table.rows} == {len(table.header)}
-    save_reproduction(result, tmp_path)
+    result.save(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"report.md", *(f"{name}.png" for name in result.figures)}
 
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import training_seeds
 from filtergym.agents.learned_policy import PRETRAINED
-
-from filtergym.reports import training_seeds
-from filtergym.reports.training_seeds import compare, episode_means, load_runs, spread
+from training_seeds import compare, episode_means, load_runs, spread
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -144,7 +143,7 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     assert scored[8:] == ["agent", "agent", "imm"]
 
 
-def test_command_fills_the_page(folders, tmp_path, command, monkeypatch):
+def test_command_fills_the_page(folders, tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = tmp_path / "page.md"
     page.write_text(
@@ -163,7 +162,7 @@ def test_command_fills_the_page(folders, tmp_path, command, monkeypatch):
         "--curves",
         "curves.png",
     )
-    code, shown, errors = command("seeds", *arguments)
+    code, shown, errors = make_page("seeds", *arguments)
     assert code == 0, errors
     assert "bptt seed 1" in shown
     text = page.read_text()
@@ -189,17 +188,17 @@ def test_the_page_folds_what_the_command_folds():
     for text in tables:
         shown, *folded = text.split("<details>\n")
         after = folded[-1].partition("</details>")[2]
-        assert "Made by `filtergym seeds RUN" in after
+        assert "Made by `python docs/make seeds RUN" in after
         assert [part.count("</details>") for part in (shown, *folded)] == [0, *(1 for _ in folded)]
         assert shown.count("\n|---") == 1
         assert all(part.count("\n|---") == 1 for part in folded)
 
 
-def test_what_cannot_be_compared(folders, tmp_path, command, monkeypatch):
+def test_what_cannot_be_compared(folders, tmp_path, make_page, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def fails(expected, *arguments):
-        code, _, errors = command("seeds", *arguments)
+        code, _, errors = make_page("seeds", *arguments)
         assert (code, errors.count("\n")) == (2, 1), errors
         assert expected in errors
 

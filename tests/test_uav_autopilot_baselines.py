@@ -10,11 +10,9 @@ import xarray
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
-from filtergym.baselines.uav_autopilot import reproduction as paper
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
 from filtergym.baselines.uav_autopilot.metrics import METRICS
 from filtergym.baselines.uav_autopilot.references import Matched
-from filtergym.baselines.uav_autopilot.reproduction import experiment
 from filtergym.baselines.uav_autopilot.theory import stationary
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.uav_autopilot.banks import MODES
@@ -23,8 +21,10 @@ from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.rollout import run_reference
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import linear_systems, packed_covariance
+from filtergym.papers.uav_autopilot_kalman import experiment
 
 from filtergym import evaluate, tidy_records
+from filtergym.papers import uav_autopilot_kalman as paper
 
 ID = "filtergym/UavAutopilot-v0"
 BOTH = pytest.mark.parametrize("plant", ["P", "U"])

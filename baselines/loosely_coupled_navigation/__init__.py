@@ -1,8 +1,5 @@
-"""What LooselyCoupledNavigation is compared with, and the reproduction of its paper."""
+"""What LooselyCoupledNavigation is compared with."""
 
 from .policies import BASELINES
 
-PAPER = "kalman-bucy-ins-gnss"
-"""Name of the paper on the command line; :mod:`.reproduction` repeats its experiments."""
-
-__all__ = ["BASELINES", "PAPER"]
+__all__ = ["BASELINES"]

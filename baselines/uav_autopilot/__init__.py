@@ -1,8 +1,5 @@
-"""What UavAutopilot is compared with, and the reproduction of its paper."""
+"""What UavAutopilot is compared with."""
 
 from .policies import BASELINES
 
-PAPER = "uav-autopilot-kalman"
-"""Name of the paper on the command line; :mod:`.reproduction` repeats its experiments."""
-
-__all__ = ["BASELINES", "PAPER"]
+__all__ = ["BASELINES"]

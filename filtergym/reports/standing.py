@@ -1,7 +1,7 @@
 """How trained agents stand beside the paper's algorithm, the strongest classical competitor and the reference.
 
-On the validation split, by which agents are chosen; tables of the test split are made by ``filtergym evaluate``,
-``filtergym seeds`` and ``filtergym benchmark``.
+On the validation split, by which agents are chosen; tables of the test split are made by ``filtergym evaluate``
+and ``filtergym benchmark``.
 """
 
 from collections.abc import Mapping

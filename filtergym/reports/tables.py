@@ -12,7 +12,6 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from ..baselines.catalogue import baselines_of
-from ..baselines.reproduction import Grid, Reproduction
 from ..baselines.tuning import Tuned
 from ..evaluation.competitors import RANKED
 from ..offline import Written
@@ -328,14 +327,6 @@ def _flights(
     return table
 
 
-def claims_table(result: Reproduction) -> Table:
-    """Return the claims of a paper with what was measured and the verdicts."""
-    table = Table("claim", "what was measured", "verdict", title=result.title, show_lines=True)
-    for claim in result.claims:
-        table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
-    return table
-
-
 def tuned_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     """Return what a search has found beside the values that it started from."""
     table = Table("value", "untuned", "tuned", title=f"{outcome.policy} on {outcome.scenario}")
@@ -355,19 +346,4 @@ def datasets_table(written: Iterable[Written]) -> Table:
         table.add_row(
             entry.name, made_with, f"{entry.episodes:,}", f"{entry.steps:,}", f"{entry.mean_return:.4g}"
         )
-    return table
-
-
-def grid_table(grid: Grid) -> Table:
-    """Return a table of text for the terminal: numbers to the right, without the marks of Markdown."""
-
-    def plain(cell: str) -> str:
-        return cell.replace("`", "").replace("<br>", "\n")
-
-    table = Table(title=plain(grid.title), title_justify="left")
-    for i, name in enumerate(grid.header):
-        words = any(row[i].startswith("`") for row in grid.rows)
-        table.add_column(plain(name), justify="left" if words else "right")
-    for row in grid.rows:
-        table.add_row(*map(plain, row))
     return table

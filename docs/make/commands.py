@@ -1,0 +1,224 @@
+"""Commands that make this project's own pages: ``python docs/make COMMAND``."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import comparison
+import training_seeds
+import typer
+from command_line import MARKER as COMMANDS_MARKER
+from command_line import command_line_markdown
+from environment_page import environment_tables, put_tables
+from filtergym.envs.catalogue import find_scenario, importable_name, short_name, task_class
+from filtergym.evaluation.files import whole_files, writable_file, writable_folder
+from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.print_layout import check_columns, check_formats, save
+from pages import check_markers, insert_between_markers, markers_of
+from room import MARKER, measure_room, room_markdown
+
+from filtergym.__main__ import main as run
+from filtergym.__main__ import program_of
+from filtergym.commands.shown import print_results
+from filtergym.commands.terminal import (
+    Cluster,
+    Columns,
+    Environment,
+    Episodes,
+    Experiment,
+    Formats,
+    Jobs,
+    Split,
+    Trust,
+    complete_policy,
+    complete_scenario,
+    console,
+    progress_bar,
+)
+from filtergym.reports.records import write_records
+
+PROGRAM = "python docs/make"
+
+
+def comparison_page(
+    records: Annotated[list[Path], typer.Argument(help="results.json of full benchmarks.")],
+    into: Annotated[
+        Path | None,
+        typer.Option(help="Page that takes the tables; pictures go to the folder images/ beside it."),
+    ] = None,
+    format: Formats = None,
+    columns: Columns = 2,
+) -> None:
+    """Compare papers, tuned policies, learned agents and references, from the records of a benchmark.
+
+    Example: python docs/make comparison results/results.json --into docs/comparison.md
+    """
+    formats = check_formats(format or ["png"])
+    check_columns(columns)
+    found = comparison.read_benchmark(records)
+    markers = {id: f"comparison {short_name(id)}" for id in found}
+    overview = "comparison of all"
+    if into is not None:
+        check_markers(into, markers.values())
+    compared = {id: comparison.compare_environment(own, columns) for id, own in found.items()}
+    if into is not None:
+        texts = {}
+        with whole_files(into.parent / "images") as images:
+            for id, own in found.items():
+                for suffix in formats:
+                    save(compared[id].figure, images / f"comparison_{short_name(id)}.{suffix}")
+                picture = f"comparison_{short_name(id)}.{formats[0]}"
+                command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
+                texts[markers[id]] = comparison.comparison_markdown(
+                    compared[id], own, f"images/{picture}", command
+                )
+        on_page = set(markers_of(into))
+        # Tables over all environments only from records of all that the page shows.
+        if overview in on_page and on_page <= {overview, *texts}:
+            texts[overview] = comparison.overview_markdown(found)
+        insert_between_markers(into, texts)
+    for each in compared.values():
+        for grid in each.grids:
+            console.print(grid)
+    for grid in (comparison.summary(found), comparison.harm(found)):
+        console.print(grid)
+
+
+def room(
+    environment: Environment,
+    episodes: Episodes = 5000,
+    seed: Experiment = 0,
+    into: Annotated[Path | None, typer.Option(help="Page whose room table is replaced.")] = None,
+) -> None:
+    """Show how much is left to win: best constant action, paper, tuned policies, references, bounds.
+
+    Example: python docs/make room filtergym/ManeuveringTarget-v0
+    """
+    cls = task_class(environment)
+    if into is not None:
+        check_markers(into, [MARKER])  # a page that cannot take the table is refused before the work
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
+    if into is not None:
+        command = f"{PROGRAM} room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
+        insert_between_markers(into, {MARKER: room_markdown(records, command)})
+    print_results(records)
+
+
+def page(
+    environment: Environment,
+    into: Annotated[Path | None, typer.Option(help="Page whose tables are replaced.")] = None,
+) -> None:
+    """Make the tables of an environment's page from its code: actions, fields, parameters, scenarios, policies.
+
+    A field is named for its block, and where that has several rows for each of its parts.
+
+    Example: python docs/make page filtergym/ManeuveringTarget-v0
+    """
+    if into is not None:
+        console.print(f"{into}: {', '.join(put_tables(environment, into))}")
+        return
+    for name, table in environment_tables(environment).items():
+        console.print(f"{name}\n\n{table}\n", soft_wrap=True)
+
+
+def seeds(
+    runs: Annotated[list[Path], typer.Argument(help="Folders of training runs, of one environment.")],
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Scenario; repeatable. Default: the training distribution.", autocompletion=complete_scenario
+        ),
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Opponent; repeatable. Default: tunable policies, tuned ones and references.",
+            autocompletion=complete_policy,
+        ),
+    ] = None,
+    episodes: Episodes = 2000,
+    seed: Experiment = 0,
+    split: Split = "test",
+    out: Annotated[Path | None, typer.Option(help="File for tidy records.")] = None,
+    into: Annotated[Path | None, typer.Option(help="Page whose seeds table is replaced.")] = None,
+    curves: Annotated[Path | None, typer.Option(help="PNG, SVG or PDF file for the learning curves.")] = None,
+    columns: Columns = 2,
+    trust: Trust = False,
+    jobs: Jobs = 1,
+    cluster: Cluster = None,
+) -> None:
+    """Score training seeds: every run's best agent, the spread between seeds, the median against opponents.
+
+    A run's best agent is plain arrays; where it is a model only, loading can execute code and needs --trust. With --out
+    what is scored is kept beside it until all is done: after an interruption the same command goes on.
+
+    Example: python docs/make seeds runs/ppo-0 runs/ppo-1 runs/ppo-2 --split validation
+    """
+    check_columns(columns)
+    if curves is not None:
+        check_formats([curves.suffix.removeprefix(".").lower()])
+    found = training_seeds.load_runs(runs, trust)
+    cls = task_class(found[0].run.environment)
+    scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
+    opponents = policy or training_seeds.default_opponents(cls.id)
+    marker = f"seeds {short_name(cls.id)}"
+    for file in (out, curves):
+        if file is not None:
+            writable_file(file)
+    waiting = None if out is None else writable_folder(out.with_name(f"{out.name}.unfinished"))
+    if into is not None:
+        check_markers(into, [marker])
+    if curves is not None:
+        save(training_seeds.learning_curves(found, columns), curves)
+    with Workers(jobs, cluster) as workers, progress_bar() as bar:
+        line = bar.add_task("evaluating", total=None)
+        records, grids = training_seeds.compare_scenarios(
+            found,
+            opponents,
+            scenarios,
+            episodes,
+            seed,
+            split,
+            lambda done: bar.update(line, advance=done),
+            trust,
+            waiting,
+            workers,
+        )
+    if out is not None:
+        write_records(out, records)
+    if into is not None:
+        command = f"{PROGRAM} seeds RUN ... {' '.join(f'--scenario {name}' for name in scenarios)} "
+        command += "".join(f"--policy {name} " for name in policy or ())
+        command += f"--episodes {episodes} --split {split} --seed {seed}"
+        insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
+    if waiting is not None and waiting.exists():
+        shutil.rmtree(waiting)  # measured by this code: another time it is measured anew
+    for grid in grids:
+        console.print(grid)
+
+
+def command_line(
+    into: Annotated[Path, typer.Argument(help="Page whose sections are replaced.")],
+) -> None:
+    """Make the sections of the page of the command line from the commands themselves.
+
+    Example: python docs/make command-line docs/command_line.md
+    """
+    insert_between_markers(into, {COMMANDS_MARKER: command_line_markdown()})
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "page": page,
+    "room": room,
+    "comparison": comparison_page,
+    "seeds": seeds,
+    "command-line": command_line,
+}
+
+
+def main() -> None:
+    """Run one of them; mistakes end as those of ``filtergym`` do."""
+    run(lambda: program_of({"Commands": COMMANDS}), PROGRAM)

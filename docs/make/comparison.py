@@ -1,0 +1,287 @@
+"""The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.catalogue import baselines_of, paper_of
+from filtergym.envs.catalogue import catalogue, nearest, short_name, task_class
+from filtergym.evaluation.competitors import RANKED
+from filtergym.evaluation.figures import draw_differences
+from filtergym.evaluation.metrics import Record
+from filtergym.papers.grid import Grid, markdown_table
+
+from filtergym.reports.ranking import HARM, ranking, ranking_sentence, who_is_best
+from filtergym.reports.results import read_all_results
+from filtergym.reports.tables import INCONSISTENT, against_paper, consistency, score_text, with_interval
+
+STRONGEST = 4
+"""Classical competitors that the page shows."""
+DIFFERENCE = "relative_cost_difference"
+
+
+class Comparison(NamedTuple):
+    """What the page shows of one environment."""
+
+    environment: str
+    grids: list[Grid]
+    figure: Any
+
+
+def read_benchmark(paths: Sequence[Path]) -> dict[str, list[Record]]:
+    """Read the records of benchmarks, by environment.
+
+    Raises:
+        ValueError: if a file is none, is of something else, or they hold nothing.
+    """
+    found: dict[str, list[Record]] = {}
+    for result in read_all_results(paths)[0]:
+        for record in result.records:
+            check_known(record)
+        found.setdefault(result.environment, []).extend(result.records)
+    if not found:
+        raise ValueError(f"{paths[0]} holds no records: make them by filtergym benchmark --full")
+    return found
+
+
+def check_known(record: Record) -> None:
+    """Raise ValueError if a record is of an environment or a scenario that is not here."""
+    cls = catalogue().get(record.environment)
+    if cls is None:
+        raise nearest("environment", record.environment, catalogue())
+    if record.scenario not in cls.scenarios:
+        raise nearest("scenario", record.scenario, cls.scenarios)
+
+
+def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
+    """Names that the page shows, of those in the records, in the order of its columns.
+
+    Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
+    algorithm; it and the best constant action, tuned; the reference whose score is 1. The others stand in the records.
+    On a narrow screen only the first columns are seen without scrolling.
+    """
+    known, cls = baselines_of(id), task_class(id)
+    of_default = [record for record in records if record.scenario == cls.default_scenario]
+    classical = [
+        place.name
+        for place in ranking(of_default or records)
+        if place.role != "learned" and place.name != known.score_paper
+    ]
+    tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
+    present = {record.policy for record in records}
+    strongest, paper = classical[:STRONGEST], known.score_paper
+    wanted = dict.fromkeys((*shipped_agents(id), *strongest, paper, *tuned, known.score_reference))
+    return [name for name in wanted if name in present]
+
+
+def _by_name(records: Sequence[Record]) -> dict[tuple[str, ...], Record]:
+    """Records of one scenario over all times, as the tables look for them."""
+    return {(r.policy, r.metric, r.component, r.window): r for r in records if r.window == "all"}
+
+
+def _cells(name: str, records: Sequence[Record]) -> list[str]:
+    """Cost against the paper's algorithm, median, wins, and ANEES of a competitor in one scenario."""
+    values = _by_name(records)
+    return [
+        with_interval(values.get((name, DIFFERENCE, "", "all")), 100.0, negligible=0.005),
+        *against_paper(values, name),
+        consistency(values.get((name, "anees", "state", "all"))),
+    ]
+
+
+def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
+    """Best of every origin on the training distribution of each environment, and the reference.
+
+    Args:
+        found: records by environment.
+    """
+    rows = []
+    for id, every in found.items():
+        known, learned = baselines_of(id), shipped_agents(id)
+        records = [record for record in every if record.scenario == task_class(id).default_scenario]
+        values, kinds = _by_name(records), {record.policy: record.kind for record in records}
+        places = [place.name for place in ranking(records)] if records else []
+        best: dict[str, str] = {}
+        for name in places:
+            origin = f"learned {kinds[name]}" if name in learned else "classical"
+            best.setdefault(origin, name)
+        if known.score_reference in kinds:
+            best["reference"] = known.score_reference
+        for origin, name in best.items():
+            rows.append(
+                [
+                    short_name(id).removesuffix("-v0"),
+                    f"`{name}`",
+                    origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
+                    *_cells(name, records),
+                    score_text(values.get((name, "score", "", "all"))),
+                ]
+            )
+    header = ["environment", "name", "origin", "cost against the paper's, %", "median, %", "wins, %", "ANEES"]
+    return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
+
+
+def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
+    """The scenario in which each learned agent stands worst against the paper's algorithm.
+
+    Args:
+        found: records by environment.
+    """
+    rows = []
+    for id, records in found.items():
+        for name in shipped_agents(id):
+            own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
+            if not own:
+                continue
+            worst = max(own, key=lambda record: record.value or 0.0)
+            beside = [record for record in records if record.scenario == worst.scenario]
+            rows.append(
+                [
+                    short_name(id).removesuffix("-v0"),
+                    f"`{name}`",
+                    f"`{worst.scenario}`",
+                    *_cells(name, beside),
+                    f"{sum((record.low or 0.0) > HARM for record in own)} of {len(own)}",
+                ]
+            )
+    header = ["environment", "agent", "worst scenario", "cost against the paper's there, %", "median, %"]
+    last = f"scenarios more than {100.0 * HARM:g} % above the paper"
+    return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
+
+
+def compare_environment(records: Sequence[Record], width: int = 2) -> Comparison:
+    """Tables of one environment: cost against the paper's algorithm, and the physical error.
+
+    Args:
+        records: of the environment.
+        width: of the figure, 1 or 2 columns of a paper.
+
+    Raises:
+        ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
+    """
+    cls = task_class(records[0].environment)
+    known = baselines_of(cls.id)
+    paper, columns = paper_of(cls.id), compared_policies(cls.id, records)
+    if paper not in columns:
+        raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
+    others = [name for name in columns if name != paper]
+    found = {(r.scenario, r.policy, r.metric, r.component): r for r in records if r.window == "all"}
+    sizes = {record.scenario: record.episodes for record in records}
+    metric, component = known.physical
+    units = [r.unit for r in records if (r.metric, r.component) == known.physical]
+    if not others or not units:
+        raise ValueError(
+            f"the records of {cls.id} hold nothing to compare with {paper!r}, or no {metric} {component}: make them by "
+            "filtergym benchmark --full"
+        )
+    by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
+    bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
+    kinds, learned = {r.policy: r.kind for r in records}, shipped_agents(cls.id)
+    verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
+
+    def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:
+        """Table of a text for each scenario and name; where it is ``judged``, the verdict comes first."""
+        heads = [f"`{name}`{_role(name, kinds[name], paper, learned)}" for name in names]
+        return Grid(
+            title,
+            ["scenario", *(["verdict"] if judged else []), *heads],
+            [
+                [
+                    f"`{scenario}`" + ("" if cls.scenarios[scenario].training else "<br>held out"),
+                    *([verdicts[scenario]] if judged else []),
+                    *(text(scenario, name) for name in names),
+                ]
+                for scenario in sizes
+            ],
+        )
+
+    def typical(scenario: str, name: str) -> str:
+        median, wins = against_paper(by_window, name, (scenario,))
+        return "-" if median == "-" else f"{median}<br>{wins}"
+
+    quantity = f"{metric} {component}".replace("_", " ").replace("rmse", "RMSE").strip()
+    grids = [
+        grid(
+            f"Cost against `{paper}`, %",
+            others,
+            lambda scenario, name: _two_lines(found.get((scenario, name, DIFFERENCE, "")), 100.0),
+            judged=True,
+        ),
+        grid(
+            f"{quantity}, {units[0]}",
+            [*columns, *bounds],
+            lambda scenario, name: _two_lines(found.get((scenario, name, metric, component)), 1.0),
+        ),
+        grid(
+            f"Episode by episode: median difference of the cost to `{paper}`, %, and share of episodes with a lower "
+            "cost, %",
+            columns,
+            typical,
+        ),
+        grid(
+            "Consistency: mean NEES over the dimension; 1 is consistent, "
+            f"{INCONSISTENT} off by more than a factor of two",
+            columns,
+            lambda scenario, name: consistency(found.get((scenario, name, "anees", "state"))),
+        ),
+    ]
+    differences: dict[str, dict[str, tuple[float, ...]]] = {}
+    for scenario in sizes:
+        row = differences.setdefault(
+            scenario + ("\n(training)" if cls.scenarios[scenario].training else ""), {}
+        )
+        for name in others:
+            record = found.get((scenario, name, DIFFERENCE, ""))
+            interval = () if record is None else (record.value, record.low, record.high)
+            percent = tuple(100.0 * x for x in interval if x is not None)
+            if len(percent) == 3:
+                row[name] = percent
+    unranked = [name for name in others if kinds[name] not in RANKED]
+    figure = draw_differences(differences, others, learned, unranked, cls.id, paper, columns=width)
+    return Comparison(cls.id, grids, figure)
+
+
+def _role(name: str, kind: str, paper: str, learned: Sequence[str]) -> str:
+    if name == paper:
+        return " (paper)"
+    if name in learned:
+        return " (learned estimator)" if kind == "estimator" else " (learned)"
+    return "" if kind == "policy" else f" ({kind})"
+
+
+def _two_lines(record: Record | None, scale: float) -> str:
+    """Value above interval, so that columns stay narrow."""
+    # Percentages to a hundredth: what is smaller is rounding.
+    negligible = 0.005 if scale == 100.0 else 0.0
+    shown = with_interval(record, scale, negligible=negligible)
+    return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
+
+
+def overview_markdown(found: Mapping[str, Sequence[Record]]) -> str:
+    """Both tables over all environments."""
+    lines: list[str] = []
+    for grid in (summary(found), harm(found)):
+        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
+    return "\n".join(lines[:-1])
+
+
+def comparison_markdown(comparison: Comparison, records: Sequence[Record], picture: str, command: str) -> str:
+    """Tables and picture of one environment, with the command that made the records."""
+    first = records[0]
+    episodes = sorted({record.episodes for record in records})
+    count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
+    scenarios = dict.fromkeys(record.scenario for record in records)
+    lines: list[str] = [
+        f"* {ranking_sentence([r for r in records if r.scenario == scenario])}" for scenario in scenarios
+    ]
+    lines.append("")
+    for grid in comparison.grids:
+        lines += [f"**{grid.title}**", "", *markdown_table(grid.header, grid.rows), ""]
+    lines += [
+        f"![Cost against the paper's algorithm in every scenario, {comparison.environment}]({picture})",
+        "",
+        f"{first.split.capitalize()} split, {count} episodes a scenario, 95 % intervals over episodes. "
+        f"Made by `{command}`.",
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,194 @@
+"""The tables of an environment's page, made from its code: what stands in the code stands on the page.
+
+Texts are those of the code: the meaning of controls (``Task.actions``), the observation blocks, the docstrings under
+the fields of parameters and measurement, the scenarios' descriptions, the first lines of policies' docstrings
+and what references know.
+"""
+
+import ast
+import inspect
+import textwrap
+import typing
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.catalogue import make_task, task_class
+from filtergym.envs.observation import Block
+from filtergym.envs.parameters import Limits, declared
+from filtergym.envs.task import Task
+from filtergym.papers.grid import markdown_table
+from pages import insert_between_markers, markers_of
+
+PARTS_SHOWN = 4
+"""Fields of one block that are named one by one; more are told by their endings."""
+
+
+def field_documentation(cls: type) -> dict[str, str]:
+    """Docstrings under the fields of a NamedTuple or dataclass, in one line each, inherited ones first."""
+    found: dict[str, str] = {}
+    for base in reversed(cls.__mro__):
+        if not inspect.get_annotations(base) or base.__module__ in ("builtins", "typing"):
+            continue
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(definition, ast.ClassDef)
+        for statement, after in zip(definition.body, [*definition.body[1:], None], strict=True):
+            if not isinstance(statement, ast.AnnAssign) or not isinstance(statement.target, ast.Name):
+                continue
+            text = ""
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                text = " ".join(str(after.value.value).split())
+            found[statement.target.id] = text.replace("``", "`")
+    return found
+
+
+def measurement_class(cls: type[Task]) -> Any:
+    """NamedTuple of what the sensors of a task say: the second part of what its world returns."""
+    return typing.get_args(typing.get_type_hints(cls.World.advance)["return"])[1]
+
+
+def _space(task: Task) -> str:
+    space: Any = task.action_space
+    if hasattr(space, "n"):
+        return f"`Discrete({space.n})`"
+    return f"`Box({space.low.min():g}, {space.high.max():g}, {space.shape})`"
+
+
+def _actions(cls: type[Task]) -> list[str]:
+    rows = []
+    for control in cls.controls:
+        role = " (default)" if control == cls.controls[0] else ""
+        rows.append((f"`{control}`{role}", _space(make_task(cls.id, control)), cls.actions.get(control, "")))
+    return markdown_table(("control", "space", "meaning"), rows)
+
+
+def _names(block: Block) -> str:
+    if not block.parts:
+        return f"`{block.name}`"
+    if len(block.parts) <= PARTS_SHOWN:
+        return ", ".join(f"`{block.name}_{part}`" for part in block.parts)
+    return f"`{block.name}` ending in " + ", ".join(f"`_{part}`" for part in block.parts)
+
+
+def _fields(cls: type[Task]) -> list[str]:
+    lines: list[str] = []
+    tables: dict[tuple[Any, ...], list[str]] = {}
+    tasks = {control: make_task(cls.id, control) for control in cls.controls}
+    for control, task in tasks.items():
+        tables.setdefault(task.fields, []).append(control)
+    for fields, controls in tables.items():
+        named = ", ".join(f"`{control}`" for control in controls)
+        rows = [
+            (
+                _names(block),
+                block.unit,
+                block.shown.text
+                + block.text
+                + (" (mean over the interval)" if block.over_interval == "mean" else ""),
+            )
+            for block in tasks[controls[0]].bank.blocks
+        ]
+        lines += [
+            "",
+            f"{named} ({len(fields)} fields):",
+            "",
+            *markdown_table(("field", "unit", "what it is"), rows),
+        ]
+        quantities = tasks[controls[0]].bank.quantities
+        if quantities:
+            readable = "; ".join(f"`{q.name}`, {q.unit}: {q.text}" for q in quantities)
+            lines += ["", f"Read from them by `task.reader(NAME)`: {readable}."]
+    return lines[1:]
+
+
+def _measurement(cls: type[Task]) -> list[str]:
+    rows = [(f"`{name}`", text) for name, text in field_documentation(measurement_class(cls)).items()]
+    return markdown_table(("field", "what it is"), rows)
+
+
+def _limits(limits: Limits) -> str:
+    if limits.choices:
+        return ", ".join(f'`"{choice}"`' for choice in limits.choices)
+    signs = {"above": ">", "at_least": "≥", "below": "<", "at_most": "≤"}
+    parts = [
+        f"{sign} {getattr(limits, name):g}"
+        for name, sign in signs.items()
+        if getattr(limits, name) is not None
+    ]
+    parts += ["ascending"] if limits.ascending else []
+    parts += ["sums to 1"] if limits.stochastic else []
+    return ", ".join(parts)
+
+
+def _parameters(cls: type[Task]) -> list[str]:
+    texts, defaults = field_documentation(cls.Parameters), cls.Parameters()
+    rows = [
+        (f"`{name}`", f"`{getattr(defaults, name)!r}`", _limits(limits), texts[name])
+        for name, (_, limits) in declared(cls.Parameters).items()
+    ]
+    return markdown_table(("keyword", "default", "limits", "meaning"), rows)
+
+
+def _scenarios(cls: type[Task]) -> list[str]:
+    rows = [
+        (f"`{s.name}`", "training" if s.training else "held out", s.description)
+        for s in cls.scenarios.values()
+    ]
+    return markdown_table(("scenario", "role", "what happens"), rows)
+
+
+def _first_sentence(maker: Any) -> str:
+    paragraph = (inspect.getdoc(maker) or "").partition("\n\n")[0]
+    return " ".join(paragraph.split()).replace("``", "`")
+
+
+def _policies(cls: type[Task]) -> list[str]:
+    known = baselines_of(cls.id)
+    roles = {known.score_paper: " (score 0)", known.score_reference: " (score 1)"}
+    rows = []
+    for name, maker in known.policies.items():
+        rows.append(
+            (f"`{name}`{roles.get(name, '')}", getattr(maker, "control", "any"), _first_sentence(maker))
+        )
+    for name, maker in known.estimators.items():
+        rows.append((f"`{name}`", "(estimator)", _first_sentence(maker)))
+    for kind, table in (("reference", known.references), ("bound", known.bounds)):
+        for name, maker in table.items():
+            text = f"{_first_sentence(maker)} Knows {maker.knows}."
+            rows.append((f"`{name}`{roles.get(name, '')}", f"({kind})", text))
+    return markdown_table(("name", "control", "what it does"), rows)
+
+
+TABLES = {
+    "actions": _actions,
+    "fields": _fields,
+    "measurement": _measurement,
+    "parameters": _parameters,
+    "scenarios": _scenarios,
+    "policies": _policies,
+}
+
+
+def environment_tables(id: str) -> dict[str, str]:
+    """Make the tables of an environment, by the names of their markers, in Markdown."""
+    cls = task_class(id)
+    return {name: "\n".join(make(cls)) for name, make in TABLES.items()}
+
+
+def put_tables(id: str, page: Path) -> Sequence[str]:
+    """Put those tables into a page that it has markers for, and return their names.
+
+    Raises:
+        ValueError: if the page does not exist or has none of the markers.
+    """
+    tables = environment_tables(id)
+    wanted: Iterable[str] = [name for name in tables if name in markers_of(page)]
+    if not wanted:
+        first = next(iter(tables))
+        raise ValueError(
+            f"{page} has none of the markers {', '.join(tables)}: write <!-- {first}: begin --> and "
+            f"<!-- {first}: end --> where that table should stand"
+        )
+    insert_between_markers(page, {name: tables[name] for name in wanted})
+    return list(wanted)

@@ -1,0 +1,82 @@
+"""The room table: who is best on an environment's training distribution, and how much there is to win."""
+
+from collections.abc import Callable
+
+from filtergym.agents.named_policies import shipped_agents
+from filtergym.baselines.catalogue import baselines_of, paper_of
+from filtergym.baselines.tuning import tuned_names
+from filtergym.envs.catalogue import task_class
+from filtergym.evaluation.metrics import Record
+from filtergym.papers.grid import markdown_table
+
+from filtergym.names import evaluate, tidy_records
+from filtergym.reports.ranking import ranking_sentence
+from filtergym.reports.tables import (
+    INCONSISTENT,
+    against_paper,
+    consistency,
+    main_components,
+    ranked,
+    score_text,
+    with_interval,
+)
+
+MARKER = "room table"
+"""What the markers of a page are called, between which the table stands."""
+
+
+def room_policies(id: str) -> list[str]:
+    """Names in the room table: everything that has a name, but random actions."""
+    paper_of(id)  # there is no room without it
+    known = baselines_of(id)
+    names = [*known.names, *tuned_names(id), *shipped_agents(id)]
+    return [name for name in names if name != "random"]
+
+
+def measure_room(id: str, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
+    """Evaluate everything that the room table shows, on the test split of the default scenario."""
+    return tidy_records(
+        evaluate(task_class(id).id, room_policies(id), None, episodes, seed, progress=progress)
+    )
+
+
+def room_markdown(records: list[Record], command: str) -> str:
+    """Return the room table as Markdown, with the command that makes it."""
+    first = records[0]
+    found = {(r.policy, r.metric, r.component, r.window): r for r in records}
+    shown = main_components(records)
+    units = {r.component: r.unit for r in records if r.metric == "rmse"}
+    header = [
+        "policy",
+        f"cost against `{paper_of(first.environment)}`, %",  # what a narrow screen shows without scrolling
+        "median, %",
+        "wins, %",
+        "control",
+        "mean cost",
+        *(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown),
+        "ANEES",
+        "score",
+    ]
+    rows = []
+    for name, kind, control in ranked(records):
+        rows.append(
+            [
+                f"`{name}`",
+                with_interval(
+                    found.get((name, "relative_cost_difference", "", "all")), 100.0, negligible=0.005
+                ),
+                *against_paper(found, name),
+                control if kind == "policy" else f"({kind})",
+                with_interval(found.get((name, "cost", "", "all"))),
+                *(with_interval(found.get((name, "rmse", c, "all"))) for c in shown),
+                consistency(found.get((name, "anees", "state", "all"))),
+                score_text(found.get((name, "score", "", "all"))),
+            ]
+        )
+    note = (
+        f"{ranking_sentence(records)} Lowest cost first; median and wins are of the cost of each episode. ANEES is the "
+        f"mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
+        f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
+        f"95 % bootstrap intervals. Made by `{command}`."
+    )
+    return "\n".join([*markdown_table(header, rows), "", note])

@@ -1,0 +1,131 @@
+"""Exact errors of one alpha-beta filter whose gains follow a schedule fixed beforehand.
+
+With gains that do not depend on the data the error is linear in the noise, so its mean square follows
+without Monte Carlo from :func:`~filtergym.filters.alpha_beta.propagate_error`: for constant gains, for the
+ramp of the paper's adaptive filter when the scan of the detection is given, and for the best schedule.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy
+
+from ...envs.maneuvering_target.parameters import ManeuveringTargetParameters
+from ...filters import alpha_beta, polar
+
+
+class Flight(NamedTuple):
+    """The x coordinate of one flight: what the filter must follow, and through which noise."""
+
+    displacement: numpy.ndarray
+    """What the manoeuvre adds to the position in each scan, m, ``(K,)``."""
+    increment: numpy.ndarray
+    """What it adds to the velocity, m/s, ``(K,)``."""
+    variance: numpy.ndarray
+    """Variance of the measurement at the true position, from the start on, m^2, ``(K + 1,)``."""
+    interval: float
+    """T, s."""
+
+
+def maneuver_flight(parameters: ManeuveringTargetParameters) -> Flight:
+    """X coordinate of a flight with one manoeuvre at stated scans (the paper's), K scans long."""
+    p, T = parameters, parameters.sampling_interval
+    first, last = p.maneuver_steps
+    scans = numpy.arange(1, p.horizon + 1)
+    accelerating = (scans >= first) & (scans <= last)
+    position = numpy.empty((2, p.horizon + 1))
+    for axis in range(2):
+        increments = p.acceleration[axis] * T * accelerating
+        velocity = p.initial_velocity[axis] + numpy.concatenate([[0.0], numpy.cumsum(increments)])
+        steps = T * velocity[:-1] + 0.5 * T * increments
+        position[axis] = p.initial_position[axis] + numpy.concatenate([[0.0], numpy.cumsum(steps)])
+    variance = polar.cartesian_variances(position, p.range_sigma, math.radians(p.bearing_sigma))[0]
+    increment = p.acceleration[0] * T * accelerating
+    return Flight(0.5 * T * increment, increment, variance, T)
+
+
+class MeanSquares(NamedTuple):
+    """Mean square of the error in each scan."""
+
+    position: numpy.ndarray
+    """m^2, ``(K, ...)``."""
+    velocity: numpy.ndarray
+    """(m/s)^2, ``(K, ...)``."""
+
+
+def mean_square_errors(flight: Flight, alpha: numpy.ndarray) -> MeanSquares:
+    """Exact mean square of the error under a schedule of gains, beta by equation (21).
+
+    Args:
+        flight: what is followed; the track starts with the errors of (24).
+        alpha: position gain of each scan, ``(K, ...)``; trailing axes are schedules side by side.
+    """
+    T, nothing = flight.interval, 0.0 * alpha[0]
+    start = flight.variance[0]
+    moments = alpha_beta.ErrorMoments(
+        nothing,
+        nothing,
+        alpha_beta.Covariance(start + nothing, nothing, 2.0 * start / T**2 + nothing),
+    )
+    beta = alpha_beta.benedict_bordner_beta(alpha)
+    position, velocity = [], []
+    for k in range(len(alpha)):
+        moments = alpha_beta.propagate_error(
+            moments,
+            flight.displacement[k],
+            flight.increment[k],
+            flight.variance[k + 1],
+            alpha[k],
+            beta[k],
+            T,
+        )
+        position.append(moments.position**2 + moments.covariance.position)
+        velocity.append(moments.velocity**2 + moments.covariance.velocity)
+    return MeanSquares(numpy.stack(position), numpy.stack(velocity))
+
+
+def ramp_schedule(
+    low: float, high: float, horizon: int, detection: int | None = None, ramp_scans: int = 7
+) -> numpy.ndarray:
+    """Position gains of the paper's adaptive filter when a manoeuvre is detected at a given scan, ``(K,)``.
+
+    The gain falls linearly from ``high`` at scan 1 to ``low`` at scan 1 + ``ramp_scans``; at the detection it
+    jumps to ``high`` and falls again.
+    """
+    scan = numpy.arange(1, horizon + 1)
+    step = scan - 1
+    if detection is not None:
+        step = numpy.where(scan >= detection, scan - detection, step)
+    return high - (high - low) * numpy.minimum(step, ramp_scans) / ramp_scans
+
+
+def best_schedule(flight: Flight) -> numpy.ndarray:
+    """Position gains of least summed mean-square position error: a floor for schedules, ``(K,)``.
+
+    It is told the whole flight, so no causal policy should be expected to reach it; one that reacts to the
+    data may do better all the same.
+    """
+    from scipy.optimize import minimize
+
+    scans = len(flight.increment)
+    nominal = float(flight.variance.mean()) * scans
+    step = 1e-6
+    shifts = step * numpy.eye(scans)
+
+    def objective(alpha: numpy.ndarray) -> tuple[float, numpy.ndarray]:
+        # All central differences side by side cost as much as a few schedules one by one.
+        schedules = numpy.concatenate(
+            [alpha[:, None], alpha[:, None] + shifts, alpha[:, None] - shifts], axis=1
+        )
+        total = mean_square_errors(flight, schedules).position.sum(axis=0) / nominal
+        return float(total[0]), (total[1 : scans + 1] - total[scans + 1 :]) / (2.0 * step)
+
+    result = minimize(
+        objective,
+        ramp_schedule(0.3, 0.7, scans, int(numpy.argmax(flight.increment != 0.0)) + 2),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(1e-3, 0.999)] * scans,
+        options={"maxiter": 1000, "ftol": 1e-10},
+    )
+    return result.x

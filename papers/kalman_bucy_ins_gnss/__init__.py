@@ -1,0 +1,25 @@
+"""Kalman-Bucy filters in orientation and navigation (Benkafo, Lobaty): figures 2, 4 and 5, and the claims.
+
+The paper prints no numbers ("hypothetical conditions") and curves without ordinates. The examples below are
+ours, chosen so that its figures look as described: (a) a first-order process, which the filter follows
+although the reference goes elsewhere; (b) fusion of INS and GNSS, scenario ``paper`` of the environment.
+
+Reading: "the systematic errors are compensated" is tested twice, as attenuation (smaller than in the INS) and
+as removal (no mean error left).
+"""
+
+from ...evaluation.parallel import Workers
+from ..reproduction import Progress, Reproduction, episode_count, its_command
+from . import claims, experiment, figures
+
+TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they follow, and INS/GNSS fusion"
+STEPS = experiment.STEPS
+
+
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
+    """Run the examples and judge the claims."""
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
+    shown = claims.claims(r), claims.tables(r), figures.figures(r)
+    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -1,0 +1,110 @@
+"""Numbers measured over Monte Carlo runs, with one kind of uncertainty: a bootstrap over the runs.
+
+While it is computed, a quantity is an array with its value first and then its value in every bootstrap sample
+of the runs. Whatever is computed from such arrays (ratios, roots, largest values) keeps its uncertainty, and
+is paired where the runs face the same noise. An array of length one is exact.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy
+import xarray
+
+from ..baselines.names import evaluate
+from ..evaluation.bootstrap import Bootstrap
+from ..evaluation.rollout import run_policy, run_reference
+
+RESAMPLES = 500
+
+
+@lru_cache(maxsize=4)
+def _resampling(runs: int) -> Bootstrap:
+    return Bootstrap(runs, RESAMPLES)
+
+
+class Measured(NamedTuple):
+    """A value and its uncertainty; "certainly" in a verdict means by the whole interval.
+
+    As text it is ``value ± standard error``, both in the digits asked for (``f"{m:.3f}"``, ``f"{m:+.1%}"``),
+    or in two digits of the error (``f"{m}"``); the value alone where it is exact.
+    """
+
+    value: float
+    low: float
+    """2.5 % quantile of the bootstrap samples."""
+    high: float
+    error: float = math.nan
+    """Their standard deviation, NaN where the value is exact."""
+
+    def __format__(self, spec: str) -> str:
+        if not spec:
+            digits = 1 - math.floor(math.log10(self.error)) if self.error > 0.0 else 4
+            spec = f".{max(digits, 0)}f"
+        error = "" if math.isnan(self.error) else f" ± {self.error:{spec.lstrip('+')}}"
+        text = f"{self.value:{spec}}{error}"
+        return text.replace("%", "") + " %" if "%" in spec else text
+
+
+def means(values: numpy.ndarray) -> numpy.ndarray:
+    """Mean over the runs ``(runs, ...)``, and over every bootstrap sample of them, ``(1 + resamples, ...)``."""
+    return _resampling(len(values)).means(values)
+
+
+def measured(samples: numpy.ndarray) -> Measured:
+    """Value and uncertainty of a quantity, ``(1 + resamples,)``."""
+    if len(samples) == 1:
+        return Measured(*[float(samples[0])] * 3)
+    low, high = band(samples)
+    return Measured(float(samples[0]), float(low), float(high), float(samples[1:].std()))
+
+
+def mean(values: numpy.ndarray) -> Measured:
+    """Mean over the runs ``(runs,)``."""
+    return measured(means(values))
+
+
+def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Bounds of the 95 % interval of curves, ``(1 + resamples, ...)``."""
+    low, high = numpy.percentile(samples[1:], [2.5, 97.5], axis=0)
+    return low, high
+
+
+def evaluated(environment: str, name: str, scenario: str, episodes: int, **keywords: Any) -> xarray.Dataset:
+    """Evaluate a policy, reference or bound on test episodes; one unit of work.
+
+    Args:
+        environment: id.
+        name: of the policy.
+        scenario: name of the scenario.
+        episodes: Monte Carlo runs.
+        **keywords: of :func:`~filtergym.baselines.names.evaluate`; parameters of the task.
+    """
+    return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
+
+
+def recorded(
+    task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any], Mapping[str, numpy.ndarray]]
+) -> dict[str, numpy.ndarray]:
+    """Run a policy or a reference estimator and keep what an evaluation does not record.
+
+    Args:
+        task: under the actor's control.
+        actor: policy or reference.
+        seeds: one for each episode.
+        fields: values ``(..., N)`` to keep of the state after every action.
+
+    Returns:
+        The same, ``(episodes, K, ...)`` with the other axes in reversed order.
+    """
+    kept: list[dict[str, numpy.ndarray]] = []
+
+    def record(state: Any) -> None:
+        # Lanes beyond the seeds are padding.
+        kept.append({name: values[..., : len(seeds)].T for name, values in fields(state).items()})
+
+    run = run_policy if hasattr(actor, "predict") else run_reference
+    run(task, actor, seeds, record, lambda _: None)
+    return {name: numpy.stack([values[name] for values in kept], axis=1) for name in kept[0]}

@@ -1,0 +1,28 @@
+"""Radar and ESM with class recognition (Ivanov, Seliverstov): figures 1 to 4 and the claims.
+
+The paper shows curves without legible numbers. Its experiment leaves open the duration, the manoeuvre noise,
+the composition of the classes and the rest that :class:`.RadarEsmTrackingParameters` marks "ours", so claims
+are tested on sizes that those choices give, and a list of variants says what depends on them.
+
+Errors of a filter of one fixed class are exact (covariance recursion of truth and error together); those of
+the adaptive filter are root-mean-squares over episodes.
+
+Reading: the "posterior" deviations of figures 2 to 4 belong to one run "corresponding to figure 1", so they
+are most likely the filters' own; both those and the errors really made are drawn and told apart.
+"""
+
+from ...evaluation.parallel import Workers
+from ..reproduction import Progress, Reproduction, episode_count, its_command
+from . import claims, experiment, figures
+
+TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
+STEPS = experiment.STEPS
+
+
+def reproduce(
+    progress: Progress, episodes: int | None = None, workers: Workers | None = None
+) -> Reproduction:
+    """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
+    r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100), workers)
+    shown = claims.claims(r), claims.tables(r), figures.figures(r)
+    return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

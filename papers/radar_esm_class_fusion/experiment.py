@@ -1,0 +1,207 @@
+"""The paper's filter and its rivals on targets of every class, and variants of what the paper leaves open."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...baselines.radar_esm_tracking.metrics import SURE
+from ...envs.catalogue import make_task
+from ...envs.radar_esm_tracking.parameters import RadarEsmTrackingParameters
+from ...envs.radar_esm_tracking.task import RadarEsmTracking
+from ...evaluation.parallel import Workers
+from ...filters import class_fusion
+from ..measured import Measured, evaluated, mean, means, measured
+from ..reproduction import Progress, gathered, later
+
+EPISODES = 20000
+SEED = 2008
+WINDOWS = {"0.5-10 s": (1, 20), "10-30 s": (20, 60), "30-60 s": (60, 120)}
+"""First and last scan, both included."""
+LATE = WINDOWS["30-60 s"]
+COMPONENTS = (("range", "m"), ("range rate", "m/s"), ("acceleration", "m/s²"))
+CLASSES = ("S0", "S1", "S2")
+INTERVAL = RadarEsmTrackingParameters.sampling_interval
+WORTHLESS_RATE = 1e4
+"""m/s: a radial velocity measured with this error says no more than two ranges half a second apart."""
+
+
+def leaking(probability: float) -> tuple[tuple[float, ...], ...]:
+    """Class transition matrix that leaves each class with a probability, equally for the others."""
+    return tuple(
+        tuple(1.0 - probability if i == j else probability / 2.0 for j in range(3)) for i in range(3)
+    )
+
+
+_SIGMA = RadarEsmTrackingParameters.acceleration_sigma
+VARIANTS: dict[str, dict[str, Any]] = {
+    "as in the main experiment": {},
+    "sigma_a halved": {"acceleration_sigma": tuple(0.5 * s for s in _SIGMA)},
+    "sigma_a doubled": {"acceleration_sigma": tuple(2.0 * s for s in _SIGMA)},
+    "sigma_a of S1 for all classes": {"acceleration_sigma": (_SIGMA[1],) * 3},
+    "alpha in reverse order": {"manoeuvrability": (0.1, 0.033, 0.025)},
+    "noise on the acceleration only": {"process_noise": "acceleration"},
+    "sigma_D = 300 m": {"range_sigma": 300.0},
+    "range without Doppler": {"range_rate_sigma": WORTHLESS_RATE},
+    "1 % class leakage, filters mixed": {"class_transition": leaking(0.01)},
+    "5 % class leakage, filters mixed": {"class_transition": leaking(0.05)},
+}
+STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
+
+
+def parameters(variant: str = "as in the main experiment") -> RadarEsmTrackingParameters:
+    """Parameters of scenario ``paper`` in a variant."""
+    return make_task(RadarEsmTracking.id, scenario="paper", **VARIANTS[variant]).parameters
+
+
+def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int) -> numpy.ndarray:
+    """Exact mean square error of one class's filter on a target of another, scans 1 to K, ``(3, K)``."""
+    models, start = RadarEsmTracking.design_models(p)
+    channels = class_fusion.design_channels(models, start, p.horizon)
+    joint = numpy.zeros((6, 6))
+    # The first estimate is the measurement with no acceleration: its error there is minus the acceleration.
+    joint[2, 2] = joint[5, 5] = p.acceleration_sigma[target] ** 2
+    joint[2, 5] = joint[5, 2] = -joint[2, 2]
+    joint[3, 3], joint[4, 4] = p.range_sigma**2, p.range_rate_sigma**2
+    covariance = class_fusion.channel_error_covariance(models, channels, target, channel, joint)
+    return numpy.stack([covariance[i, i, 1:] for i in range(3)])
+
+
+def rms(mean_square: numpy.ndarray, window: tuple[int, int]) -> float:
+    """Root of the mean over a window of scans, of a mean square ``(K,)``."""
+    return math.sqrt(mean_square[window[0] - 1 : window[1]].mean())
+
+
+class Run(NamedTuple):
+    """What is kept of a policy over some episodes; ``of`` chooses some of them."""
+
+    error: numpy.ndarray
+    """Estimate minus truth, ``(episodes, K, 3)``."""
+    variance: numpy.ndarray
+    """Reported, mean over episodes, ``(K, 3)``."""
+    first_variance: numpy.ndarray
+    """Reported in the first episode, ``(K, 3)``."""
+    probability: numpy.ndarray
+    """Of the classes, ``(episodes, K, 3)``."""
+    true_probability: numpy.ndarray
+    """``(episodes, K)``."""
+    true_class: numpy.ndarray
+    """``(episodes,)``."""
+    true_type: numpy.ndarray
+    """``(episodes,)``."""
+    cost: numpy.ndarray
+    """Mean over the scans, ``(episodes,)``."""
+
+    def mean_square(self, component: int, window: tuple[int, int], of: Any = ...) -> numpy.ndarray:
+        """Mean square error over a window, ``(1 + resamples,)``."""
+        return means((self.error[of][:, window[0] - 1 : window[1], component] ** 2).mean(axis=1))
+
+    def true_at(self, second: float, of: Any = ...) -> Measured:
+        """Mean probability of the true class at a time."""
+        return mean(self.true_probability[of][:, round(second / INTERVAL) - 1])
+
+    def recognition(self, share: float, of: Any = ...) -> float:
+        """Time by which a share of the runs has had P(true class) >= 0.9 once, s; infinite if fewer have."""
+        sure = self.true_probability[of] >= SURE
+        return _quantile(numpy.where(sure.any(axis=1), sure.argmax(axis=1), math.inf), share)
+
+    def settling(self, share: float) -> float:
+        """Time after which a share of the runs keeps P(true class) >= 0.9 to the end, s."""
+        unsure = self.true_probability < SURE
+        last = numpy.where(unsure.any(axis=1), unsure.shape[1] - unsure[:, ::-1].argmax(axis=1), 0)
+        return _quantile(numpy.where(last < unsure.shape[1], last, math.inf), share)
+
+    def wrong(self) -> numpy.ndarray:
+        """Whether a wrong class has P >= 0.9, ``(episodes, K)``."""
+        other = numpy.arange(len(CLASSES)) != self.true_class[:, None, None]
+        return ((self.probability >= SURE) & other).any(axis=2)
+
+    def sure_and_wrong(self, of: Any = ...) -> Measured:
+        """Share of runs that end with P >= 0.9 for a wrong class."""
+        return mean(self.wrong()[of][:, -1].astype(float))
+
+    def calibration(self, window: tuple[int, int]) -> list[Measured]:
+        """Mean square error over mean reported variance of each component."""
+        reported = self.variance[window[0] - 1 : window[1]].mean(axis=0)
+        return [measured(self.mean_square(c, window) / reported[c]) for c in range(len(COMPONENTS))]
+
+
+def _quantile(scan: numpy.ndarray, share: float) -> float:
+    return INTERVAL * (float(numpy.sort(scan)[math.ceil(share * len(scan)) - 1]) + 1.0)
+
+
+def tracked(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
+    """Run a policy; one unit of work."""
+    one = evaluated(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
+    variance = [one[f"variance_{c.name}"].values for c in RadarEsmTracking.components]
+    return Run(
+        one["error"].values,
+        numpy.stack([v.mean(axis=0) for v in variance], axis=-1),
+        numpy.stack([v[0] for v in variance], axis=-1),
+        one["mode_probability"].values,
+        one["true_class_probability"].values,
+        one["true_class"].values[:, 0].astype(int),
+        one["true_type"].values[:, 0].astype(int),
+        one["cost"].values.mean(axis=1),
+    )
+
+
+class Results(NamedTuple):
+    """Everything that claims, tables and figures are made of."""
+
+    episodes: int
+    small: int
+    """Episodes of every run beside the main one."""
+    exact: dict[tuple[int, int], numpy.ndarray]
+    """Mean squares by (target, filter), ``(3, K)``."""
+    own: numpy.ndarray
+    """Variances that the filters of the classes report, ``(3, classes, K)``."""
+    fused: list[Run]
+    """The paper's algorithm on each class."""
+    radar: list[Run]
+    esm: list[Run]
+    every_decision: list[Run]
+    """The paper's algorithm, and with refused decisions too, on the same episodes."""
+    fixed_type: dict[str, Run]
+    """The printed rule and the joint posterior on targets of one type."""
+    variants: dict[str, list[Run]]
+    """Adaptive filter and radar alone, by name of the variant."""
+
+    def excess(self, s: int, component: int, window: tuple[int, int]) -> Measured:
+        """RMSE of the adaptive filter over the ideal one's on targets of class s, minus one."""
+        ideal = rms(self.exact[s, s][component], window)
+        return measured(numpy.sqrt(self.fused[s].mean_square(component, window)) / ideal - 1.0)
+
+    def gain(self, s: int, component: int, window: tuple[int, int]) -> Measured:
+        """RMSE of the non-adaptive filter over the adaptive one's."""
+        fixed = rms(self.exact[s, 2][component], window)
+        return measured(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
+
+
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
+    """Run all experiments; ``STEPS`` units of work. Side experiments have a quarter of the episodes."""
+    small = max(episodes // 4, 2)
+    p = parameters()
+    models, start = RadarEsmTracking.design_models(p)
+    channels = class_fusion.design_channels(models, start, p.horizon)
+
+    def by_class(name: str, count: int) -> list[Any]:
+        return [later(tracked, name, "paper", count, true_class=s) for s in CLASSES]
+
+    def both(one: str, other: str, count: int, **keywords: Any) -> list[Any]:
+        return [later(tracked, name, "paper", count, **keywords) for name in (one, other)]
+
+    results = Results(
+        episodes,
+        small,
+        {(t, c): exact_mean_squares(p, t, c) for t in range(3) for c in range(3)},
+        numpy.stack([channels.covariance[i, i, :, 1:] for i in range(3)]),
+        by_class("quasi-optimal", episodes),
+        by_class("radar-only", small),
+        by_class("esm-only", small),
+        both("quasi-optimal", "ungated", episodes),
+        {name: later(tracked, name, "fixed-type", episodes) for name in ("quasi-optimal", "joint-type")},
+        {name: both("quasi-optimal", "radar-only", small, **keywords) for name, keywords in VARIANTS.items()},
+    )
+    done: Results = gathered(results, progress, workers)
+    return done

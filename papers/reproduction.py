@@ -1,0 +1,162 @@
+"""What a reproduction of a paper consists of.
+
+A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (statements, verdicts,
+tables), ``figures``. Its ``__init__.py`` defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress
+callback) and ``reproduce(progress, episodes=None, workers=None) -> Reproduction``, which runs the experiment
+(``episodes`` Monte Carlo runs instead of its own number; units of work :func:`gathered` from workers) and judges the
+claims.
+
+There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. Pictures: :mod:`.panels`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from rich.table import Table
+
+from ..evaluation.files import whole_files, write_text
+from ..evaluation.parallel import Workers
+from ..evaluation.print_layout import save
+from .grid import Grid, markdown_table
+
+Verdict = Literal["reproduced", "reproduced in part", "not reproduced", "paper is silent"]
+Progress = Callable[[int], None]
+"""Told of units of work done."""
+UNCERTAINTY = (
+    '± is one standard error, by bootstrap over the runs; "certainly" means by a 95 % bootstrap interval.'
+)
+
+
+class Later(NamedTuple):
+    """A unit of work that somebody will do: a function of a module and its arguments."""
+
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    keywords: dict[str, Any]
+
+
+def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+    """Leave a unit of work to :func:`gathered`, which puts its result in this place."""
+    return Later(function, arguments, keywords)
+
+
+def gathered(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
+    """Do what was left for later, and return the same structure with what came out of it.
+
+    Args:
+        results: tuples, named ones too, lists and dictionaries, in which :func:`later` left units of work.
+        progress: told of units done.
+        workers: who does them; default: this process, one after the other.
+    """
+    units: list[Later] = []
+    _places(results, units.append)
+    done = (workers or Workers()).results(_unit, units, [1] * len(units), progress)
+    found = iter(done)
+    return _places(results, lambda unit: next(found))
+
+
+def _unit(unit: Later, tick: Progress) -> Any:
+    found = unit.function(*unit.arguments, **unit.keywords)
+    tick(1)
+    return found
+
+
+def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
+    """Return a structure with something else where units of work stand, in their order."""
+    if isinstance(part, Later):
+        return instead(part)
+    if isinstance(part, dict):
+        return {key: _places(value, instead) for key, value in part.items()}
+    if isinstance(part, list):
+        return [_places(value, instead) for value in part]
+    if isinstance(part, tuple):
+        values = [_places(value, instead) for value in part]
+        return type(part)(*values) if hasattr(part, "_fields") else tuple(values)
+    return part
+
+
+def verdict_of(holds: Iterable[bool]) -> Verdict:
+    """Verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
+    parts = list(holds)
+    return "reproduced" if all(parts) else "reproduced in part" if any(parts) else "not reproduced"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One claim of the paper, or one thing it does not mention."""
+
+    key: str
+    statement: str
+    """What the paper says, in our words; or the question, where it is silent."""
+    measured: str
+    """The figures, with their uncertainty."""
+    method: str
+    """Runs, windows, statistic."""
+    verdict: Verdict = "paper is silent"
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """Claims with verdicts, tables and figures of one paper."""
+
+    title: str
+    claims: Sequence[Claim]
+    tables: Sequence[Grid] = ()
+    figures: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
+    """File name without suffix -> Matplotlib figure and its caption, one sentence."""
+    command: str = ""
+    """What made it."""
+
+    def markdown(self, suffix: str = "png") -> str:
+        """Claims, tables and figures as one page, which shows files of figures that end in a suffix."""
+        lines = [f"# {self.title}", ""]
+        if self.command:
+            lines += [f"Made by `{self.command}`.", ""]
+        lines += [UNCERTAINTY, "", "## Claims", ""]
+        lines += markdown_table(
+            ("claim", "what was measured", "how", "verdict"),
+            [(f"**{c.key}.** {c.statement}", c.measured, c.method, f"**{c.verdict}**") for c in self.claims],
+        )
+        for table in self.tables:
+            lines += ["", f"## {table.title}", "", *markdown_table(table.header, table.rows)]
+        for name, (_, caption) in self.figures.items():
+            lines += ["", f"![{caption}]({name}.{suffix})", "", caption]
+        return "\n".join(lines) + "\n"
+
+    def save(self, folder: Path, formats: Sequence[str] = ("png",)) -> None:
+        """Write ``report.md`` and the figures into an existing folder, all of them or none; the report shows those of
+        the first format.
+        """
+        with whole_files(folder) as waiting:
+            for name, (figure, _) in self.figures.items():
+                for suffix in formats:
+                    save(figure, waiting / f"{name}.{suffix}")
+            write_text(waiting / "report.md", self.markdown(formats[0]))
+
+    def __rich__(self) -> Table:
+        """Return the claims with what was measured and the verdicts, for the terminal."""
+        table = Table("claim", "what was measured", "verdict", title=self.title, show_lines=True)
+        for claim in self.claims:
+            table.add_row(f"{claim.key}. {claim.statement}", claim.measured, claim.verdict)
+        return table
+
+
+def episode_count(episodes: int | None, default: int, least: int = 2) -> int:
+    """Return the number of Monte Carlo runs of a reproduction.
+
+    Raises:
+        ValueError: for fewer than ``least``; a single run has no interval.
+    """
+    count = default if episodes is None else episodes
+    if count < least:
+        raise ValueError(f"episodes must be at least {least} for intervals over them, got {count}")
+    return count
+
+
+def its_command(module: str, episodes: int | None) -> str:
+    """Command that reproduces the paper of a module with this number of runs; None: its own."""
+    paper = module.rpartition(".")[2].replace("_", "-")
+    runs = "" if episodes is None else f" --episodes {episodes}"
+    return f"filtergym reproduce {paper}{runs} --out DIR"

@@ -1,0 +1,300 @@
+"""The loop of aircraft, filter and controller: its runs, and what linear theory says about it."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy
+
+from ...baselines.uav_autopilot.policies import Kalman, RawSensors
+from ...baselines.uav_autopilot.references import TrueState
+from ...envs.catalogue import make_task
+from ...envs.task import Episode
+from ...envs.uav_autopilot.task import UavAutopilot
+from ...evaluation.parallel import Workers
+from ...evaluation.seeds import episode_seeds
+from ...filters import linear_systems
+from ..measured import evaluated, mean, recorded
+from ..reproduction import Progress, gathered, later
+
+EPISODES = 600
+HORIZON = 600
+SETTLED = slice(200, HORIZON)
+"""Measurements after the burn-in."""
+AFTER_STEP = slice(300, HORIZON)
+STEP_TIME = 200
+TWO_MINUTES = 6000
+"""Measurements of plant U."""
+CASES: dict[str, dict[str, Any]] = {
+    "P, H = I": {"plant": "P"},
+    "P, H = [1 0]": {"plant": "P", "sensors": ("position",)},
+    "U": {"plant": "U"},
+}
+LOOPS = ("true-state", "kalman", "raw-sensors")
+RANDOM = ("kalman", "matched")
+STEPS = (len(LOOPS) + 1) * len(CASES) - 1 + 2 * len(RANDOM)
+
+
+# --- runs
+
+
+@dataclass
+class Signals:
+    """One loop over all runs, ``(runs, time)`` each."""
+
+    task: UavAutopilot
+    output: numpy.ndarray
+    control: numpy.ndarray
+    cost: numpy.ndarray
+    """In the units of the weights."""
+    observation: numpy.ndarray
+    estimate: numpy.ndarray
+    innovation: numpy.ndarray
+    """In units of the output; exact once the filter's covariance has settled."""
+    nees: numpy.ndarray
+    """Normalised estimation error squared per coordinate."""
+    nis: numpy.ndarray
+    plant_input: numpy.ndarray
+    """Control plus white noise, plant P; control, plant U."""
+
+    def text(self, name: str, digits: int = 4, times: slice = SETTLED) -> str:
+        """Mean of a signal over runs and time."""
+        return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
+
+    def variance(self, name: str) -> float:
+        """Mean square of a node about the output, settled."""
+        return float(numpy.mean((getattr(self, name) - self.output)[:, SETTLED] ** 2))
+
+    @property
+    def decibel(self) -> float:
+        """Noise of node 2 over noise of node 3."""
+        return 10.0 * math.log10(self.variance("observation") / self.variance("estimate"))
+
+
+def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) -> Signals:
+    """Run one loop of ``LOOPS`` on test episodes."""
+    control = "mode" if loop == "raw-sensors" else "gain"
+    task: Any = make_task("UavAutopilot", control, scenario, horizon=HORIZON, **keywords)
+    shown = task.measured.index(task.output)
+
+    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+        error, said = task.error(episode), task.records(episode)
+        covariance = numpy.moveaxis(task.covariance(episode), -1, 0)
+        whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
+        without_filter = numpy.full_like(said["output"], numpy.nan)
+        innovation = said.get("innovation", without_filter)
+        return {
+            "output": said["output"],
+            "control": said["control_signal"],
+            "cost": task.cost(episode) * task.cost_unit,
+            "observation": episode.measurement.reading[shown],
+            "estimate": task.mean(episode)[task.output],
+            "innovation": innovation * math.sqrt(innovation_variance(task)),
+            "nees": (whitened * error.T).sum(axis=1) / len(error),
+            "nis": said["nis"] / said["nis_degrees"] if "nis" in said else without_filter,
+            "truth": episode.truth.state,
+        }
+
+    actor = {"true-state": TrueState, "kalman": Kalman, "raw-sensors": RawSensors}[loop](task)
+    series = recorded(task, actor, episode_seeds("test", 0, episodes), fields)
+    truth, plant_input = series.pop("truth"), series["control"].copy()
+    if task.parameters.plant == "P":
+        # What drives the plant to the next measurement; the last one has no next.
+        driven = truth[:, 1:] - truth[:, :-1] @ task.design.model.F.T
+        plant_input[:, :-1] = (driven @ numpy.linalg.pinv(task.design.model.B).T)[:, :, 0]
+    return Signals(task=task, plant_input=plant_input, **series)
+
+
+class Results(NamedTuple):
+    """Everything that claims, tables and figures are made of."""
+
+    episodes: int
+    noise: dict[str, dict[str, Signals]]
+    """White-noise input, by case and loop."""
+    step: dict[str, Signals]
+    """Unit step and the same noise, the loop with the filter."""
+    random: dict[str, dict[str, Any]]
+    """Datasets of the policies of ``RANDOM`` on scenario ``random``, by plant."""
+
+    def response(self, case: str) -> numpy.ndarray:
+        """Output after a unit step, ``(K - STEP_TIME + 1,)``."""
+        # Linear loop, same noise: the difference of the runs is the response without noise, exactly.
+        return (self.step[case].output - self.noise[case]["kalman"].output).mean(axis=0)[STEP_TIME - 1 :]
+
+    def transient(self, case: str) -> tuple[float, float, float]:
+        """Overshoot, time to 90 % and time to stay within 5 %, s."""
+        y, T = self.response(case), interval(self.step[case].task)
+        outside = numpy.flatnonzero(numpy.abs(y - 1.0) > 0.05)
+        return max(float(y.max()) - 1.0, 0.0), float(numpy.argmax(y >= 0.9)) * T, float(outside[-1] + 1) * T
+
+
+def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
+    """Run all experiments; ``STEPS`` units of work."""
+
+    def signals(keywords: dict[str, Any], scenario: str, loop: str) -> Any:
+        return later(simulate, keywords, scenario, loop, episodes)
+
+    results = Results(
+        episodes,
+        {
+            # One sensor cannot be fed back alone: the loop is unstable.
+            case: {
+                loop: signals(keywords, "paper-noise", loop)
+                for loop in LOOPS
+                if loop != "raw-sensors" or "sensors" not in keywords
+            }
+            for case, keywords in CASES.items()
+        },
+        {
+            case: signals(keywords | {"step_time": STEP_TIME}, "paper-step", "kalman")
+            for case, keywords in CASES.items()
+        },
+        {
+            plant: {
+                name: later(evaluated, "UavAutopilot", name, "random", episodes, plant=plant)
+                for name in RANDOM
+            }
+            for plant in "PU"
+        },
+    )
+    done: Results = gathered(results, progress, workers)
+    return done
+
+
+# --- theory
+
+
+class Loop(NamedTuple):
+    """Matrices of the loop: plant, sensors, feedback, settled filter gain, covariances of the noise."""
+
+    F: numpy.ndarray
+    B: numpy.ndarray
+    H: numpy.ndarray
+    L: numpy.ndarray
+    K: numpy.ndarray
+    Q: numpy.ndarray
+    R: numpy.ndarray
+
+
+def matrices(task: UavAutopilot) -> Loop:
+    """Return the matrices of a task's loop."""
+    d = task.design
+    Q = d.model.scaled_noise + d.model.other_noise
+    return Loop(d.model.F, d.model.B, d.H, d.feedback, d.steady.gain, Q, d.R)
+
+
+def interval(task: UavAutopilot) -> float:
+    """T, s."""
+    return float(task.parameters.value("sampling_interval"))
+
+
+def innovation_variance(task: UavAutopilot) -> float:
+    """Settled variance of the output's innovation."""
+    d, shown = task.design, task.measured.index(task.output)
+    return float((d.H @ d.steady.predicted @ d.H.T + d.R)[shown, shown])
+
+
+def spectrum(values: numpy.ndarray, T: float) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Frequencies, Hz, and averaged periodogram, unit squared per Hz."""
+    n = values.shape[1]
+    power = (numpy.abs(numpy.fft.rfft(values, axis=1)) ** 2).mean(axis=0) * T / n
+    return numpy.fft.rfftfreq(n, T), power
+
+
+def flatness(values: numpy.ndarray) -> float:
+    """Geometric over arithmetic mean of the averaged periodogram: one for white noise."""
+    power = spectrum(values, 1.0)[1]
+    return float(numpy.exp(numpy.log(power).mean()) / power.mean())
+
+
+def theory_spectra(task: UavAutopilot, frequency: numpy.ndarray) -> dict[str, numpy.ndarray]:
+    """Spectra of the nodes of the settled loop, white-noise input, from its transfer functions."""
+    (F, B, H, L, K, Q, R), T = matrices(task), interval(task)
+    n, m = len(F), len(R)
+    loop = linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R)
+    entry = numpy.block([[numpy.eye(n), numpy.zeros_like(K)], [numpy.eye(n) - K @ H, -K]])
+    noise = numpy.block(
+        [
+            [linear_systems.noise_factor(Q), numpy.zeros((n, m))],
+            [numpy.zeros((m, n)), numpy.linalg.cholesky(R)],
+        ]
+    )
+    sensor = numpy.eye(m)[[task.measured.index(task.output)]]
+    coordinate = numpy.eye(n)[[task.output]]
+    z = numpy.exp(2j * numpy.pi * frequency * T)[:, None, None]
+    # The noise of a measurement acts on the state of that measurement: s(k) = A s(k-1) + entry n(k).
+    response = numpy.linalg.solve(numpy.eye(2 * n) - loop.transition / z, entry @ noise + 0.0 * z)
+
+    def power(row: numpy.ndarray, feed: Any = 0.0) -> numpy.ndarray:
+        return T * (numpy.abs(row @ response + feed) ** 2).sum(axis=(1, 2))
+
+    # The noise on the control between two measurements belongs to the second one, hence the z.
+    driven = numpy.zeros((1, noise.shape[1]))
+    if task.parameters.plant == "P":
+        driven[0, 0] = task.parameters.acceleration_sigma
+    return {
+        "plant_input": power(-L @ numpy.hstack([numpy.eye(n), -numpy.eye(n)]), z * driven),
+        "observation": power(
+            numpy.hstack([coordinate, 0.0 * coordinate]), numpy.hstack([numpy.zeros((1, n)), sensor]) @ noise
+        ),
+        "estimate": power(numpy.hstack([coordinate, -coordinate])),
+        "innovation": T * innovation_variance(task) + 0.0 * frequency,
+    }
+
+
+def settles_without_command(task: UavAutopilot) -> float:
+    """Output at which a unit command settles if (6) and (10) are taken as printed."""
+    F, B, H, L, K, _, _ = matrices(task)
+    one = numpy.eye(len(F))
+    # x = F x + B (N - L y);  y = (1 - K H) (F - B L) y + K H x
+    system = numpy.block([[one - F, B @ L], [-K @ H, one - (one - K @ H) @ (F - B @ L)]])
+    command = numpy.concatenate([B[:, 0] * task.design.feedforward, numpy.zeros(len(F))])
+    return float(numpy.linalg.solve(system, command)[task.output])
+
+
+def loop_theory(task: UavAutopilot, scale: float) -> tuple[float, float, float]:
+    """Cost (in the units of the weights), output and control variance with process noise times ``scale``."""
+    F, B, H, L, _, Q, R = matrices(task)
+    n, d = len(F), task.design
+    K = linear_systems.steady_kalman(F, H, scale * Q, R).gain
+    X = linear_systems.stationary_covariance(*linear_systems.estimate_feedback_loop(F, B, H, L, K, Q, R))
+    row = numpy.hstack([L, -L])
+    control = float((row @ X @ row.T)[0, 0])
+    cost = float(numpy.trace(d.weight @ X[:n, :n])) + d.control_weight * control
+    return cost, float(X[task.output, task.output]), control
+
+
+def covariances(task: UavAutopilot, **changes: Any) -> numpy.ndarray:
+    """Recursion (12): sigma of the output's estimate, gain on the integrating mode, ``(2, TWO_MINUTES)``.
+
+    The mode's coordinate is ``w^T x`` with ``w^T F = w^T``, scaled to contain the output once.
+    """
+    F, _, H, _, _, Q, R = matrices(task)._replace(**changes)
+    values, vectors = numpy.linalg.eig(F.T)
+    w = numpy.real(vectors[:, numpy.argmin(numpy.abs(values - 1.0))])
+    w = w / w[task.output]
+    P = numpy.diag(numpy.square(task.parameters.value("initial_sigmas"))).astype(float)
+    found = numpy.empty((2, TWO_MINUTES))
+    for k in range(TWO_MINUTES):
+        P = F @ P @ F.T + Q
+        K = numpy.zeros((len(F), 1))
+        if len(H):
+            K = P @ H.T @ numpy.linalg.inv(H @ P @ H.T + R)
+            rest = numpy.eye(len(F)) - K @ H
+            P = rest @ P @ rest.T + K @ R @ K.T
+        found[:, k] = math.sqrt(P[task.output, task.output]), float(numpy.linalg.norm(w @ K))
+    return found
+
+
+def covariance_curves(task: UavAutopilot) -> dict[str, numpy.ndarray]:
+    """Recursion (12) of plant U where its correcting term bounds the covariance and where it does not."""
+    names = [c.name for c in task.components]
+    H = numpy.eye(len(names))
+    rate, elevator = names.index("rate"), names.index("elevator")
+    R = numpy.diag(numpy.square(task.parameters.value("sensor_sigmas")[1:]))
+    return {
+        "with the correcting term": covariances(task),
+        "without it (no measurement)": covariances(task, H=H[:0]),
+        "no sensor of pitch: not detectable": covariances(task, H=H[[rate, elevator]], R=R),
+        "gusts the only noise": covariances(task, Q=task.design.model.scaled_noise),
+    }
