@@ -134,7 +134,9 @@ def curve_statistics(
         values, degrees = run[metric].values, consistency_degrees(run, metric)
         present = ~numpy.isnan(values)
         sums = numpy.stack([numpy.where(present, values, 0.0), degrees * present], axis=1)
-        yield Statistic(("curve", f"a{metric}"), sums, functools.partial(_over_dimension, episodes), 0)
+        yield Statistic(
+            ("curve", f"a{metric}"), sums, functools.partial(_over_dimension, episodes), 0, optional=True
+        )
     if "action" in run:
         values = run["action"].transpose("episode", "action_name", "time").values
         there = ~numpy.isnan(values).all(axis=(0, 2))

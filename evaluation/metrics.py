@@ -172,6 +172,7 @@ def record_statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]
                 ("record", "log_likelihood", "measurement", window, "nat"),
                 _sums_of_present(said[:, times]),
                 _ratio,
+                optional=True,
             )
     if not is_bound and judged:
         cost = run["cost"].values
@@ -193,16 +194,26 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -
     component = "state" if metric == "nees" else "measurement"
     values, degrees = run[metric].values, consistency_degrees(run, metric)
     normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
-    yield Statistic(("record", f"a{metric}", component, window, "1"), _sums_of_present(normalised), _ratio)
+    yield Statistic(
+        ("record", f"a{metric}", component, window, "1"), _sums_of_present(normalised), _ratio, optional=True
+    )
     low, high = chi_square_band(degrees)
     inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
-    yield Statistic(("record", f"{metric}_inside", component, window, "1"), _sums_of_present(inside), _ratio)
+    yield Statistic(
+        ("record", f"{metric}_inside", component, window, "1"),
+        _sums_of_present(inside),
+        _ratio,
+        optional=True,
+    )
     if metric == "nis":
         there = ~numpy.isnan(normalised)
         inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
         sums = numpy.stack([there.sum(axis=1), inverse.sum(axis=1)], axis=1)
         yield Statistic(
-            ("record", "anis_band", component, window, "1"), sums, functools.partial(_band, episodes=episodes)
+            ("record", "anis_band", component, window, "1"),
+            sums,
+            functools.partial(_band, episodes=episodes),
+            optional=True,
         )
 
 

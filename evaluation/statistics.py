@@ -43,6 +43,8 @@ class Statistic(NamedTuple):
     """Resamples that have a mean of their own; None: those of the bootstrap."""
     sample: int = 0
     """Number of the first episodes whose values are kept, in place of means of all; zero: means."""
+    optional: bool = False
+    """A block that lacks it adds nothing to its means; otherwise it is then known of no episode."""
 
 
 class Reduction(NamedTuple):
@@ -53,12 +55,15 @@ class Reduction(NamedTuple):
     """As of :meth:`.bootstrap.Bootstrap.sums`."""
     samples: dict[Key, list[numpy.ndarray]]
     """``(episodes, ...)``, piece by piece."""
+    optional: set[Key]
 
     def merge(self, later: "Reduction") -> "Reduction":
-        """Add the episodes that come next: sums that one side lacks are zero there, a sample needs both."""
-        both = {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
+        """Add the episodes that come next."""
+        optional = self.optional | later.optional
+        sums = {key: own for key, own in (self.sums | later.sums).items() if key in optional}
+        sums |= {key: own + later.sums[key] for key, own in self.sums.items() if key in later.sums}
         samples = {k: own + later.samples[k] for k, own in self.samples.items() if k in later.samples}
-        return Reduction(self.functions | later.functions, self.sums | later.sums | both, samples)
+        return Reduction(self.functions | later.functions, sums, samples, optional)
 
     def results(self) -> dict[Key, Any]:
         """Return every statistic of all episodes; once, since samples are given away."""
@@ -99,12 +104,13 @@ def reduce_run(
 
 
 def _reduce_block(statistics: Iterable[Statistic], bootstrap: Bootstrap, first: int) -> Reduction:
-    found = Reduction({}, {}, {})
+    found = Reduction({}, {}, {}, set())
     columns = 0
 
     def means() -> Iterator[Statistic]:
         for s in statistics:
             found.functions[s.key] = s.function
+            found.optional.update([s.key] * s.optional)
             if s.sample:
                 found.samples[s.key] = [s.values[: max(0, s.sample - first)].copy()]
             else:
