@@ -589,7 +589,7 @@ class Validation:
             **entry,
             "paper": self.paper,
             "paper_cost": float(self.paper_cost[0]),
-            "relative_cost_difference": list(self.bootstrap.interval(cost / self.paper_cost - 1.0)),
+            "relative_cost_difference": list(self.bootstrap.relative_difference(cost, self.paper_cost)),
         }
 
 

@@ -33,7 +33,9 @@ def row(id: str, agent: str, scenario: str, episodes: int) -> str:
     bootstrap = Bootstrap(episodes)
     fallback, *others = (bootstrap.means(cost) for cost in data["cost"].mean("time").values)
     cells = [
-        "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in bootstrap.interval(cost / fallback - 1.0)))
+        "{:+.1f} [{:+.1f}, {:+.1f}]".format(
+            *(100.0 * x for x in bootstrap.relative_difference(cost, fallback))
+        )
         for cost in others
     ]
     anees = data["nees"].mean(["episode", "time"]).values / data.sizes["component"]

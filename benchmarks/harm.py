@@ -37,7 +37,7 @@ def rows(id: str, agents: list[str], episodes: int, split: str) -> list[str]:
         beyond = numpy.quantile(paper, 0.99)
         for name, cost in zip(agents, others, strict=True):
             ratio = [
-                float(x) for x in bootstrap.interval(bootstrap.means(cost) / bootstrap.means(paper) - 1.0)
+                float(x) for x in bootstrap.relative_difference(bootstrap.means(cost), bootstrap.means(paper))
             ]
             if name not in worst or ratio[0] > worst[name][0][0]:
                 worst[name] = ratio, scenario

@@ -51,7 +51,7 @@ from filtergym.evaluation.curves import DISTRIBUTED
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
-from filtergym.evaluation.summary import Asked, Part, _resampling, summarise, told_together, write_summary
+from filtergym.evaluation.summary import Asked, Part, _resampling, combine_summaries, summarise, write_summary
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.progress import track
@@ -142,12 +142,17 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
     packed = pickle.dumps(part)
     # Each with arrays of its own, as they come from other processes: shared ones would be packed once.
     copies, read = spent(lambda: [pickle.loads(packed) for _ in range(4)])
-    four, adding = spent(lambda: functools.reduce(Part.and_of, copies))
+    four, adding = spent(lambda: functools.reduce(Part.merge, copies))
     further = (len(pickle.dumps(four)) - len(packed)) / 3
     # Distributions are told of so many measurements and no more; costs and the like are kept of all episodes.
-    distributed = sum(len(pickle.dumps(v)) for key, v in part.drawn.kept.items() if key != "mean_cost")
+    samples = part.reduction.samples
+    distributed = sum(
+        len(pickle.dumps(v))
+        for (_, *name), v in samples.items()
+        if {*name} & {"error_exceeded", "action", "gain"}
+    )
     resampling = _resampling(EPISODES)
-    one, all_four = (spent(lambda whole=whole: whole.finished(resampling, None))[1] for whole in (part, four))
+    one, all_four = (spent(lambda whole=whole: whole.summary(resampling, None))[1] for whole in (part, four))
     slope = max(0.0, (all_four - one) / (3 * scale))
     found |= {
         "distributed": distributed / scale,
@@ -169,7 +174,7 @@ def told_seconds(id: str, episodes: int) -> float:
     other = one._replace(contender=one.contender._replace(name="other"))
     other = other._replace(head=other.head.assign_coords(policy="other"))
     _resampling(episodes)  # once for all cells
-    seconds = spent(lambda: told_together([one, other]))[1] / 2
+    seconds = spent(lambda: combine_summaries([one, other]))[1] / 2
     with tempfile.TemporaryDirectory() as folder:
         return seconds + spent(lambda: write_summary(Path(folder) / "one.npz", one, ""))[1]
 

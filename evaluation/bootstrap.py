@@ -14,8 +14,8 @@ whole flights are resampled (cluster bootstrap; Davison and Hinkley, Bootstrap M
 too narrow.
 """
 
-import copy
 import functools
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -39,22 +39,28 @@ class Estimate(NamedTuple):
     high: float
 
 
-Sums = tuple[numpy.ndarray, numpy.ndarray | None]
-"""Weighted sums over episodes, and of whether there is a number at all; None: there always is."""
+def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
+    """Means from what all episodes contribute to :meth:`Bootstrap.sums`; NaN where nobody has a number."""
+    if sums.shape[1] == 1:
+        return sums[:, 0]
+    values, present = sums[:, 0], sums[:, 1]
+    return numpy.divide(values, present, out=numpy.full(values.shape, numpy.nan), where=present > 0.0)
 
 
-def added(one: Sums, other: Sums) -> Sums:
-    """Add what two sets of episodes contribute to a mean."""
-    there = None if one[1] is None or other[1] is None else one[1] + other[1]
-    return one[0] + other[0], there
+def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
+    """Values and their 95 % percentile intervals; an interval is NaN where a resample is not finite.
 
+    Args:
+        samples: of the data and of every resample, ``(1 + resamples, ...)``.
 
-def mean_of_sums(sums: Sums) -> numpy.ndarray:
-    """Means from what all episodes contribute; NaN where nobody has a number."""
-    values, there = sums
-    if there is None:
-        return values
-    return numpy.divide(values, there, out=numpy.full(values.shape, numpy.nan), where=there > 0.0)
+    Returns:
+        ``(3, ...)``: value, lower and upper end.
+    """
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    with numpy.errstate(invalid="ignore"):
+        ends = numpy.percentile(samples[1:], [tail, 100.0 - tail], axis=0)
+    ends = numpy.where(numpy.isfinite(samples[1:]).all(axis=0), ends, numpy.nan)
+    return numpy.concatenate([samples[:1], ends])
 
 
 def block_of(times: int) -> int:
@@ -102,45 +108,53 @@ class Bootstrap:
         self.counts = counts
         # Clusters may differ in size: the mean is over the episodes of those that were drawn.
         self.totals = counts.sum(axis=1, dtype=numpy.int64)
-
-    def fewer(self, resamples: int) -> "Bootstrap":
-        """Return the first of the resamples: what a bootstrap of no more would have drawn."""
-        found = copy.copy(self)
-        found.counts, found.totals = self.counts[: 1 + resamples], self.totals[: 1 + resamples]
-        return found
+        self._last: tuple[slice, numpy.ndarray] | None = None
 
     @property
     def weights(self) -> numpy.ndarray:
         """Share of every episode in the data and in every resample, ``(1 + resamples, episodes)``."""
-        return self.weights_of(slice(None))
+        return self.counts / self.totals[:, None]
 
     def weights_of(self, episodes: slice) -> numpy.ndarray:
-        """Share of some episodes, ``(1 + resamples, some)``."""
-        return self.counts[:, episodes] / self.totals[:, None]
+        """Share of some episodes, ``(1 + resamples, some)``; those asked for last are kept."""
+        if self._last is None or self._last[0] != episodes:
+            self._last = None  # two blocks of weights are never held
+            self._last = episodes, self.counts[:, episodes] / self.totals[:, None]
+        return self._last[1]
 
     def by_resamples(self, order: numpy.ndarray) -> Iterator[numpy.ndarray]:
         """Share of the episodes in an order, ``(some, episodes)``, of the data and some resamples after the other."""
         for i in range(0, len(self.counts), AT_ONCE):
             yield self.counts[i : i + AT_ONCE, order] / self.totals[i : i + AT_ONCE, None]
 
-    def sums(self, values: numpy.ndarray, first: int = 0) -> Sums:
-        """Add up what some episodes contribute to :meth:`means`.
+    def sums(
+        self, values: Sequence[numpy.ndarray], first: int = 0, resamples: int | None = None
+    ) -> list[numpy.ndarray]:
+        """Add up what some episodes contribute to means, with one matrix product for all arrays.
 
         Args:
-            values: ``(some, ...)``, of at most ``BLOCK`` episodes.
+            values: arrays ``(some, ...)`` of the same episodes, at most ``BLOCK``.
             first: number of the first of them.
+            resamples: only the first ones, which are those of a bootstrap of no more; None: all.
 
         Returns:
-            Weighted sums of the values, and of whether they are there where any is missing, ``(1 + resamples, ...)``.
+            Of each array the weighted sums, ``(1 + resamples, 1, ...)``; of ragged episodes of the values that are
+            there and of their weights, ``(1 + resamples, 2, ...)``.
         """
-        flat = values.reshape(len(values), -1)
-        weights = self.weights_of(slice(first, first + len(values)))
-        shape = (len(weights), *values.shape[1:])
+        some = len(values[0])
+        flat = numpy.concatenate([each.reshape(some, -1) for each in values], axis=1, dtype=float)
+        weights = self.weights_of(slice(first, first + some))
+        weights = weights if resamples is None else weights[: 1 + resamples]
         if self.ragged:
             present = ~numpy.isnan(flat)
-            there = (weights @ present).reshape(shape)
-            return (weights @ numpy.where(present, flat, 0.0)).reshape(shape), there
-        return (weights @ flat).reshape(shape), None
+            total = numpy.stack([weights @ numpy.where(present, flat, 0.0), weights @ present], axis=1)
+        else:
+            total = (weights @ flat)[:, None]
+        ends = numpy.cumsum([each[0].size for each in values])
+        return [
+            total[..., end - each[0].size : end].reshape(*total.shape[:2], *each.shape[1:])
+            for each, end in zip(values, ends, strict=True)
+        ]
 
     def means(self, values: numpy.ndarray) -> numpy.ndarray:
         """Means over the episodes and over every resample of them.
@@ -151,8 +165,8 @@ class Bootstrap:
         Returns:
             ``(1 + resamples, ...)``; the first row is the data's own.
         """
-        parts = (self.sums(values[i : i + BLOCK], i) for i in range(0, len(values), BLOCK))
-        return mean_of_sums(functools.reduce(added, parts))
+        parts = (self.sums([values[i : i + BLOCK]], i)[0] for i in range(0, len(values), BLOCK))
+        return mean_of_sums(functools.reduce(operator.add, parts))
 
     def medians(self, values: numpy.ndarray) -> numpy.ndarray:
         """Medians over the episodes and over every resample of them, ``(1 + resamples,)``.
@@ -170,12 +184,11 @@ class Bootstrap:
 
     def interval(self, statistics: numpy.ndarray) -> Estimate:
         """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""
-        tail = 50.0 * (1.0 - CONFIDENCE)
-        value, resampled = statistics[0], statistics[1:]
-        if not numpy.isfinite(resampled).all():
-            return Estimate(float(value), float("nan"), float("nan"))
-        low, high = numpy.percentile(resampled, [tail, 100.0 - tail])
-        return Estimate(float(value), float(low), float(high))
+        return Estimate(*percentile_interval(statistics).tolist())
+
+    def relative_difference(self, means: numpy.ndarray, others: numpy.ndarray) -> Estimate:
+        """Paired relative difference of means to those of another competitor, both from :meth:`means`."""
+        return self.interval(means / others - 1.0)
 
     def estimate(
         self, values: numpy.ndarray, of_means: Callable[[numpy.ndarray], numpy.ndarray] = lambda m: m

@@ -6,24 +6,24 @@ flights what is missing is left out.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
-from .bootstrap import Bootstrap, Sums, added, block_of, mean_of_sums
+from .bootstrap import block_of, percentile_interval
 from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
     chi_square_band,
     consistency_degrees,
     consistency_metrics,
-    in_blocks,
     mean_over_time,
     reported_components,
     squared_errors,
 )
+from .statistics import ALL, Key, Statistic, reduce_run
 from .threads import one_thread
 
 SHARES = numpy.geomspace(1e-4, 1.0, 121)
@@ -35,6 +35,11 @@ DISTRIBUTED = 2**21
 PERCENTILES = (10.0, 90.0)
 """Of actions and gains over episodes."""
 
+ENDINGS = ("", "_low", "_high")
+"""Of the names of a curve and of the ends of its band."""
+
+Curve = dict[str, numpy.ndarray]
+"""What belongs to a curve, by the ending of its name."""
 Series = tuple[tuple[str, ...], numpy.ndarray]
 """Dimensions and values of a variable."""
 
@@ -70,61 +75,13 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         split, seed, episodes, paper, reference, cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
-    names = dataset["policy"].values.tolist()
-    return joined(
-        [drawn_from(dataset.sel(policy=name), bootstrap).finished() for name in names],
-        dataset,
-        bootstrap.episodes,
-    )
+    declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)
+    runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
+    found = [competitor_curves(reduce_run(run, declare, bootstrap).results()) for run in runs]
+    return stack_curves(found, dataset, bootstrap.episodes)
 
 
-class Drawn(NamedTuple):
-    """What curves are made of: of one competitor over some episodes, or over all of them; finished once."""
-
-    sums: dict[str, Sums]
-    """Of squared errors, ``(1 + resamples, time, quantity)``, and of probabilities, ``(1 + resamples, ..., time)``."""
-    totals: dict[str, numpy.ndarray]
-    """Of NEES and NIS and their dimension, over the episodes, ``(2, time)``."""
-    kept: dict[str, list[numpy.ndarray]]
-    """Whose distribution is drawn, ``(episodes, ...)``, piece by piece: errors, actions, gains, costs."""
-    actions: list[str]
-    """Names of the actions."""
-    gains: list[str]
-
-    def and_of(self, later: "Drawn") -> "Drawn":
-        """Add the episodes that come next."""
-        sums = {key: added(own, later.sums[key]) for key, own in self.sums.items()}
-        totals = dict(self.totals)
-        for key, total in later.totals.items():
-            totals[key] = totals[key] + total if key in totals else total
-        kept = {key: own + later.kept[key] for key, own in self.kept.items()}
-        return self._replace(sums=sums, totals=totals, kept=kept)
-
-    def finished(self) -> "Finished":
-        """Turn what all episodes come to into curves."""
-        found: dict[str, numpy.ndarray] = {}
-        for key, sums in self.sums.items():
-            means = mean_of_sums(sums)
-            if key == "rmse":
-                means = numpy.moveaxis(numpy.sqrt(means), -1, 1)
-            found |= dict(zip((key, f"{key}_low", f"{key}_high"), _band(means), strict=True))
-        for key, (total, dimension) in self.totals.items():
-            found[f"{key}_dimension"] = dimension
-            nothing = numpy.full(len(total), numpy.nan)
-            found[key] = numpy.divide(total, dimension, out=nothing, where=dimension > 0.0)
-        for key, pieces in self.kept.items():
-            values = numpy.concatenate(pieces)
-            pieces.clear()  # so that little is held twice
-            if key == "error_exceeded":
-                found[key] = numpy.stack([exceeded_errors(each) for each in numpy.moveaxis(values, -1, 0)])
-            elif key == "mean_cost":
-                found[key] = numpy.array(values.mean())
-            else:
-                found |= dict(zip((key, f"{key}_low", f"{key}_high"), _spread(values), strict=True))
-        return Finished(found, self.actions, self.gains)
-
-
-class Finished(NamedTuple):
+class CompetitorCurves(NamedTuple):
     """The curves of one competitor, and the names of its actions and gains."""
 
     curves: dict[str, numpy.ndarray]
@@ -132,53 +89,64 @@ class Finished(NamedTuple):
     gains: list[str]
 
 
+def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
+    """Take the curves out of the results of :func:`curve_statistics` over all episodes of a competitor."""
+    curves: dict[str, numpy.ndarray] = {}
+    labels: dict[str, list[str]] = {}
+    for (kind, *words), endings in results.items():
+        if kind == "curve":
+            name, *labels[name] = words
+            curves |= {name + ending: values for ending, values in endings.items()}
+    return CompetitorCurves(curves, labels.get("action", []), labels.get("gain", []))
+
+
 def shown_quantities(dataset: xarray.Dataset) -> list[str]:
     """Return the groups of components, where there are any, else the first three components."""
     return list(groups_of(dataset)) or list(reported_components(dataset))[:3]
 
 
-def drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Drawn:
-    """Return what some episodes of one competitor contribute to its curves.
+def curve_statistics(
+    run: xarray.Dataset, episodes: int, resamples: int = BAND_RESAMPLES
+) -> Iterator[Statistic]:
+    """Declare what curves are made of: by variable, and the names of actions and gains.
 
     Args:
-        run: one policy's part of an evaluation.
-        bootstrap: over the episodes of the whole evaluation.
-        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
+        run: some episodes of one competitor.
+        episodes: of the whole evaluation.
+        resamples: of the bands.
     """
-    parts = (_drawn_from(part, bootstrap, first + i) for i, part in in_blocks(run))
-    return functools.reduce(Drawn.and_of, parts)
-
-
-def _drawn_from(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Drawn:
-    sums: dict[str, Sums] = {}
-    totals: dict[str, numpy.ndarray] = {}
-    kept: dict[str, list[numpy.ndarray]] = {}
-    distributed = slice(max(0, max(block_of(run.sizes["time"]), DISTRIBUTED // run.sizes["time"]) - first))
+    times = run.sizes["time"]
+    distributed = max(block_of(times), DISTRIBUTED // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)
-        sums["rmse"] = bootstrap.sums(squares, first)
+        yield Statistic(("curve", "rmse"), squares, _rmse, resamples)
         if str(run["kind"].values) != "bound":
-            kept["error_exceeded"] = [numpy.sqrt(squares[distributed])]
-            kept["mean_cost"] = [mean_over_time(run, run["cost"].values)]
+            yield Statistic(("curve", "error_exceeded"), squares, _exceeded, sample=distributed)
+            yield Statistic(
+                ("curve", "mean_cost"), mean_over_time(run, run["cost"].values), _mean, sample=ALL
+            )
+    for name in ("mode_probability", "true_class_probability"):
+        if name in run:
+            values = run[name].transpose("episode", ..., "time").values
+            yield Statistic(("curve", name), values, _band, resamples)
     for metric in consistency_metrics(run):
         values, degrees = run[metric].values, consistency_degrees(run, metric)
         present = ~numpy.isnan(values)
-        total = numpy.where(present, values, 0.0).sum(axis=0)
-        totals[f"a{metric}"] = numpy.stack([total, (degrees * present).sum(axis=0)])
-    for name in ("mode_probability", "true_class_probability"):
-        if name in run:
-            sums[name] = bootstrap.sums(run[name].transpose("episode", ..., "time").values, first)
-    actions: list[str] = []
+        sums = numpy.stack([numpy.where(present, values, 0.0), degrees * present], axis=1)
+        yield Statistic(
+            ("curve", f"a{metric}"), sums, functools.partial(_over_dimension, episodes), 0, optional=True
+        )
     if "action" in run:
         values = run["action"].transpose("episode", "action_name", "time").values
         there = ~numpy.isnan(values).all(axis=(0, 2))
         if there.any():
-            kept["action"], actions = [values[distributed, there]], run["action_name"].values[there].tolist()
+            names = run["action_name"].values[there].tolist()
+            yield Statistic(("curve", "action", *names), values[:, there], _spread, sample=distributed)
     gains = [name for name in gains_of(run) if not numpy.isnan(run[name].values).all()]
     if gains:
-        kept["gain"] = [numpy.stack([run[name].values[distributed] for name in gains], axis=1)]
-    return Drawn(sums, totals, kept, actions, gains)
+        values = numpy.stack([run[name].values for name in gains], axis=1)
+        yield Statistic(("curve", "gain", *gains), values, _spread, sample=distributed)
 
 
 DIMENSIONS = {
@@ -195,7 +163,7 @@ DIMENSIONS = {
 """Of a curve, after the competitor."""
 
 
-def joined(found: Sequence[Finished], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
+def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, episodes: int) -> xarray.Dataset:
     """Put the curves of several competitors together.
 
     Args:
@@ -210,7 +178,7 @@ def joined(found: Sequence[Finished], dataset: xarray.Dataset, episodes: int) ->
     }
     variables: dict[str, Series] = {}
     for key, dims in DIMENSIONS.items():
-        for ending in ("", "_low", "_high"):
+        for ending in ENDINGS:
             own = [each.curves.get(key + ending) for each in found]
             shapes = [values.shape for values in own if values is not None]
             if not shapes:
@@ -287,7 +255,7 @@ def exceeded_errors(errors: numpy.ndarray) -> numpy.ndarray:
     return found
 
 
-def _consistency_bands(found: Sequence[Finished]) -> dict[str, Series]:
+def _consistency_bands(found: Sequence[CompetitorCurves]) -> dict[str, Series]:
     """Where mean NEES and NIS over their dimension lie with 95 % if the filter is consistent.
 
     A sum of independent chi-square numbers is one, of the sum of their degrees (Bar-Shalom, Li, Kirubarajan: Estimation
@@ -308,8 +276,8 @@ def _consistency_bands(found: Sequence[Finished]) -> dict[str, Series]:
     return variables
 
 
-def _spread(values: numpy.ndarray) -> numpy.ndarray:
-    """Mean and percentiles over the episodes of ``(episodes, name, time)``: ``(3, name, time)``."""
+def _spread(values: numpy.ndarray) -> Curve:
+    """Mean and percentiles over the episodes of ``(episodes, name, time)``."""
     flat = values.reshape(len(values), -1)
     found = numpy.full((3, flat.shape[1]), numpy.nan)
     absent = numpy.isnan(flat)
@@ -319,12 +287,32 @@ def _spread(values: numpy.ndarray) -> numpy.ndarray:
     found[1:, whole] = numpy.percentile(flat[:, whole], PERCENTILES, axis=0)
     found[0, some] = numpy.nanmean(flat[:, some], axis=0)
     found[1:, some] = numpy.nanpercentile(flat[:, some], PERCENTILES, axis=0)
-    return found.reshape(3, *values.shape[1:])
+    return dict(zip(ENDINGS, found.reshape(3, *values.shape[1:]), strict=True))
 
 
-def _band(series: numpy.ndarray) -> numpy.ndarray:
-    """Return the first of some series, and the 95 % interval of the others, its resamples: ``(3, ...)``."""
-    return numpy.stack([series[0], *numpy.percentile(series[1:], [2.5, 97.5], axis=0)])
+def _band(means: numpy.ndarray) -> Curve:
+    return dict(zip(ENDINGS, percentile_interval(means), strict=True))
+
+
+def _rmse(means: numpy.ndarray) -> Curve:
+    return _band(numpy.moveaxis(numpy.sqrt(means), -1, 1))
+
+
+def _exceeded(squares: numpy.ndarray) -> Curve:
+    errors = numpy.moveaxis(numpy.sqrt(squares), -1, 0)
+    return {"": numpy.stack([exceeded_errors(each) for each in errors])}
+
+
+def _mean(values: numpy.ndarray) -> Curve:
+    return {"": numpy.array(values.mean())}
+
+
+def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
+    """Mean NEES or NIS over its dimension, and the sum of the dimensions, from the means of both, ``(1, 2, time)``."""
+    total, dimension = means[0]
+    nothing = numpy.full(len(total), numpy.nan)
+    mean = numpy.divide(total, dimension, out=nothing, where=dimension > 0.0)
+    return {"": mean, "_dimension": episodes * dimension}
 
 
 def _present(name: str, dims: tuple[str, ...], values: numpy.ndarray) -> dict[str, Series]:

@@ -6,17 +6,21 @@ Differences and ratios are paired: numerator and denominator are resampled toget
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
-from .bootstrap import RESAMPLES, Bootstrap, Estimate, Sums, added, block_of, mean_of_sums
+from .bootstrap import RESAMPLES, Bootstrap, Estimate
 from .competitors import RANKED
 from .dataset import groups_of, seed_of, slices_of, windows_of, with_windows
+from .statistics import ALL, Key, Statistic, reduce_run
 from .threads import one_thread
+
+if TYPE_CHECKING:
+    from .own_metrics import OwnMetrics
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
 
@@ -116,83 +120,6 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
     )
 
 
-def in_blocks(run: xarray.Dataset) -> Iterator[tuple[int, xarray.Dataset]]:
-    """Cut a run into blocks of episodes; yields the number of each one's first episode in the run, and the block."""
-    block = block_of(run.sizes["time"])
-    for first in range(0, run.sizes["episode"], block):
-        yield first, run.isel(episode=slice(first, first + block))
-
-
-class Statistic(NamedTuple):
-    """A measure before it is averaged over episodes: what each of them contributes."""
-
-    metric: str
-    component: str
-    window: str
-    unit: str
-    values: numpy.ndarray
-    """``(episodes, ...)``; the means over episodes and over their resamples are what the measure is made of."""
-    of: Callable[[numpy.ndarray], numpy.ndarray | Estimate]
-    """From these means, ``(1 + resamples, ...)``, to the measure, ``(1 + resamples,)``."""
-
-
-Key = tuple[str, str, str, str]
-"""Metric, component, window and unit."""
-Averaged = tuple[Callable[[numpy.ndarray], numpy.ndarray | Estimate], Sums]
-
-
-class Judged(NamedTuple):
-    """What records are made of: of one competitor over some episodes, the fewer the less memory it takes."""
-
-    averaged: dict[Key, Averaged]
-    costs: list[numpy.ndarray]
-    """Mean cost of every episode, piece by piece; nothing of bounds, and without truth."""
-
-    def and_of(self, later: "Judged") -> "Judged":
-        """Add the episodes that come next."""
-        averaged = dict(self.averaged)
-        for key, (of, sums) in later.averaged.items():
-            averaged[key] = of, added(averaged[key][1], sums) if key in averaged else sums
-        return Judged(averaged, self.costs + later.costs)
-
-    def cost(self) -> numpy.ndarray | None:
-        """Mean cost of every episode, ``(episodes,)``; None of bounds, and without truth."""
-        return numpy.concatenate(self.costs) if self.costs else None
-
-    def measures(self, bootstrap: Bootstrap) -> list[Measure]:
-        """Turn sums over all episodes into measures."""
-        found = []
-        for (metric, component, window, unit), (of, sums) in self.averaged.items():
-            value = of(mean_of_sums(sums))
-            estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
-            found.append(Measure(metric, component, window, estimate, unit))
-        return found
-
-
-def judge(run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Judged:
-    """Return what some episodes of one competitor contribute to its records.
-
-    Args:
-        run: one policy's part of an evaluation.
-        bootstrap: over the episodes of the whole evaluation.
-        first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
-    """
-    parts = (_judged(part, bootstrap, first + i) for i, part in in_blocks(run))
-    return functools.reduce(Judged.and_of, parts)
-
-
-def _judged(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Judged:
-    averaged: dict[Key, Averaged] = {}
-    for s in _statistics(run, bootstrap.episodes):
-        averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first)
-    told = "cost" in run and str(run["kind"].values) != "bound"
-    return Judged(averaged, [mean_over_time(run, run["cost"].values)] if told else [])
-
-
-def _itself(means: numpy.ndarray) -> numpy.ndarray:
-    return means
-
-
 def _minus(means: numpy.ndarray) -> numpy.ndarray:
     return -means
 
@@ -203,7 +130,13 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
     return found
 
 
-def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
+def record_statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
+    """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
+
+    Args:
+        run: some episodes of one competitor.
+        episodes: of the whole evaluation.
+    """
     groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
     judged = run.attrs.get("truth", True)
@@ -211,14 +144,16 @@ def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
         squares = squared_errors(run, component, groups)
         for window, times in slices.items():
             yield Statistic(
-                "rmse", component, window, unit, mean_over_time(run, squares[:, times]), numpy.sqrt
+                ("record", "rmse", component, window, unit),
+                mean_over_time(run, squares[:, times]),
+                numpy.sqrt,
             )
-        yield Statistic("peak_rmse", component, "all", unit, squares, _peak)
+        yield Statistic(("record", "peak_rmse", component, "all", unit), squares, _peak)
         if not is_bound and component not in groups:
             signed = run["error"].sel(component=component).values
             for window, times in slices.items():
                 values = mean_over_time(run, signed[:, times])
-                yield Statistic("mean_error", component, window, unit, values, _itself)
+                yield Statistic(("record", "mean_error", component, window, unit), values)
     for metric in consistency_metrics(run):
         for window, times in slices.items():
             yield from _consistency(run.isel(time=times), metric, window, episodes)
@@ -227,22 +162,27 @@ def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
             probability = run["mode_probability"].sel(mode=mode).values
             for window, times in slices.items():
                 values = mean_over_time(run, probability[:, times])
-                yield Statistic("mean_mode_probability", mode, window, "1", values, _itself)
+                yield Statistic(("record", "mean_mode_probability", mode, window, "1"), values)
     says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
     if says or not judged:  # there is nothing else of an estimator of one's own then
         for window, times in slices.items():
             shape = (run.sizes["episode"], run.sizes["time"])
             said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
             yield Statistic(
-                "log_likelihood", "measurement", window, "nat", _sums_of_present(said[:, times]), _ratio
+                ("record", "log_likelihood", "measurement", window, "nat"),
+                _sums_of_present(said[:, times]),
+                _ratio,
+                optional=True,
             )
     if not is_bound and judged:
         cost = run["cost"].values
         for window, times in slices.items():
-            yield Statistic("cost", "", window, "1", mean_over_time(run, cost[:, times]), _itself)
+            yield Statistic(("record", "cost", "", window, "1"), mean_over_time(run, cost[:, times]))
         charge = run["charge"].values
         total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
-        yield Statistic("return", "", "all", "1", total, _minus)
+        yield Statistic(("record", "return", "", "all", "1"), total, _minus)
+    if "cost" in run and not is_bound:
+        yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
 
 
 def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -> Iterator[Statistic]:
@@ -254,16 +194,26 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -
     component = "state" if metric == "nees" else "measurement"
     values, degrees = run[metric].values, consistency_degrees(run, metric)
     normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
-    yield Statistic(f"a{metric}", component, window, "1", _sums_of_present(normalised), _ratio)
+    yield Statistic(
+        ("record", f"a{metric}", component, window, "1"), _sums_of_present(normalised), _ratio, optional=True
+    )
     low, high = chi_square_band(degrees)
     inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
-    yield Statistic(f"{metric}_inside", component, window, "1", _sums_of_present(inside), _ratio)
+    yield Statistic(
+        ("record", f"{metric}_inside", component, window, "1"),
+        _sums_of_present(inside),
+        _ratio,
+        optional=True,
+    )
     if metric == "nis":
         there = ~numpy.isnan(normalised)
         inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
         sums = numpy.stack([there.sum(axis=1), inverse.sum(axis=1)], axis=1)
         yield Statistic(
-            "anis_band", component, window, "1", sums, functools.partial(_band, episodes=episodes)
+            ("record", "anis_band", component, window, "1"),
+            sums,
+            functools.partial(_band, episodes=episodes),
+            optional=True,
         )
 
 
@@ -341,8 +291,13 @@ class _Against:
         self, contenders: Sequence[Contender], paper: str, reference: str, bootstrap: Bootstrap
     ) -> None:
         self.costs = {c.name: c.costs for c in contenders if c.costs is not None}
-        self.means = {name: bootstrap.means(costs) for name, costs in self.costs.items()}
         self.paper, self.reference, self.bootstrap = paper, reference, bootstrap
+        against = self.costs.get(paper)
+        self.ratios = {} if against is None else {name: own / against for name, own in self.costs.items()}
+        columns = [*self.costs.values(), *map(_wins, self.ratios.values())]
+        means = bootstrap.means(numpy.stack(columns, axis=1)).T if columns else ()
+        self.means = dict(zip(self.costs, means, strict=False))
+        self.wins = dict(zip(self.ratios, means[len(self.costs) :], strict=True))
         ranked = {c.name: c.costs.mean() for c in contenders if c.kind in RANKED and c.costs is not None}
         self.ranked = list(ranked)
         # The first where none is a number, as of flights in which nobody was measured.
@@ -351,25 +306,31 @@ class _Against:
     def behind_best(self, name: str) -> Iterator[Measure]:
         """Paired relative difference of the cost to the best one's."""
         if name in self.ranked:
-            difference = self.means[name] / self.means[self.best] - 1.0
-            yield Measure("behind_best", self.best, "all", self.bootstrap.interval(difference), "1")
+            difference = self.bootstrap.relative_difference(self.means[name], self.means[self.best])
+            yield Measure("behind_best", self.best, "all", difference, "1")
 
     def others(self, name: str) -> Iterator[Measure]:
         """Score and paired difference to the paper's algorithm, where there is what they need."""
-        if self.paper not in self.costs or name not in self.costs:
+        if name not in self.ratios:
             return
-        interval, cost, paper = self.bootstrap.interval, self.means[name], self.means[self.paper]
-        yield Measure("cost_difference", "", "all", interval(cost - paper), "1")
-        yield Measure("relative_cost_difference", "", "all", interval(cost / paper - 1.0), "1")
-        ratio = self.costs[name] / self.costs[self.paper]
-        yield Measure("median_cost_ratio", "", "all", interval(self.bootstrap.medians(ratio)), "1")
-        # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
-        draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
-        wins = numpy.where(draw, 0.5, ratio < 1.0)
-        yield Measure("win_rate", "", "all", self.bootstrap.estimate(wins), "1")
+        bootstrap, cost, paper = self.bootstrap, self.means[name], self.means[self.paper]
+        found = {
+            "cost_difference": bootstrap.interval(cost - paper),
+            "relative_cost_difference": bootstrap.relative_difference(cost, paper),
+            "median_cost_ratio": bootstrap.interval(bootstrap.medians(self.ratios[name])),
+            "win_rate": bootstrap.interval(self.wins[name]),
+        }
         if self.reference in self.costs:
-            value = score(cost, paper, self.means[self.reference], self.bootstrap)
-            yield Measure("score", "", "all", value, "1")
+            found["score"] = score(cost, paper, self.means[self.reference], bootstrap)
+        for metric, estimate in found.items():
+            yield Measure(metric, "", "all", estimate, "1")
+
+
+def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
+    """One where an episode costs less than by the paper's algorithm, ``(episodes,)``."""
+    # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
+    draw = numpy.isclose(ratio, 1.0, rtol=0.0, atol=1e-9)
+    return numpy.where(draw, 0.5, ratio < 1.0)
 
 
 @one_thread()
@@ -396,9 +357,7 @@ PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
 
 
 @one_thread()
-def tidy_records(
-    dataset: xarray.Dataset, metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None = None
-) -> list[Record]:
+def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -> list[Record]:
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
@@ -417,30 +376,41 @@ def tidy_records(
         metrics: the environment's own, from one policy's part of the dataset; left out for recordings.
     """
     bootstrap = bootstrap_of(dataset)
+    # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
+    own = None if dataset.attrs.get("recorded") else metrics
+
+    def declare(run: xarray.Dataset) -> Iterator[Statistic]:
+        yield from record_statistics(run, bootstrap.episodes)
+        if own is not None:
+            yield from own.statistics(run)
+
+    runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     contenders = [
-        contender(dataset.sel(policy=name), bootstrap, metrics) for name in dataset["policy"].values.tolist()
+        contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own) for run in runs
     ]
     return records_of(contenders, dataset, bootstrap)
 
 
-def contender(
-    run: xarray.Dataset,
-    bootstrap: Bootstrap,
-    metrics: Callable[[xarray.Dataset, Bootstrap], list[Measure]] | None,
+def contender_of(
+    results: Mapping[Key, Any], run: xarray.Dataset, bootstrap: Bootstrap, metrics: "OwnMetrics | None"
 ) -> Contender:
     """Return what the records of a competitor are made of.
 
     Args:
-        run: its part of an evaluation.
+        results: of :func:`record_statistics`, and of the environment's own metrics.
+        run: its part of an evaluation, of whose variables none is needed.
         bootstrap: over the episodes.
         metrics: the environment's own.
     """
-    judged = judge(run, bootstrap)
-    # Of a recording, they would ask for more of the truth than it holds.
-    own = metrics is not None and not run.attrs.get("recorded")
-    further = metrics(run, bootstrap) if metrics is not None and own else []
+    measures = []
+    for (kind, *words), value in results.items():
+        if kind == "record":
+            metric, component, window, unit = words
+            estimate = value if isinstance(value, Estimate) else bootstrap.interval(value)
+            measures.append(Measure(metric, component, window, estimate, unit))
+    further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.cost())
+    return Contender(name, kind, control, measures, further, results.get(("cost",)))
 
 
 def records_of(

@@ -4,16 +4,17 @@ They come in two steps, so that no more than a block of episodes need be in memo
 few numbers of it or what is only averaged over the episodes; and what follows from that of all of them.
 """
 
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from operator import itemgetter
+from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
-from .bootstrap import Bootstrap, Sums, added, mean_of_sums
-from .metrics import Measure, in_blocks
+from .bootstrap import Bootstrap
+from .metrics import Measure
+from .statistics import ALL, Key, Statistic, reduce_run
 
 Arrays = Mapping[str, numpy.ndarray]
 
@@ -29,30 +30,6 @@ class Gathered(NamedTuple):
     """The same in every episode."""
 
 
-class Taken(NamedTuple):
-    """What was gathered of some episodes, to be added to."""
-
-    each: dict[str, list[numpy.ndarray]]
-    sums: dict[str, Sums]
-    common: dict[str, numpy.ndarray]
-
-    def and_of(self, later: "Taken") -> "Taken":
-        """Add the episodes that come next; what these have not is known of none."""
-        return Taken(
-            {key: own + later.each[key] for key, own in self.each.items() if key in later.each},
-            {key: added(own, later.sums[key]) for key, own in self.sums.items() if key in later.sums},
-            {key: own for key, own in self.common.items() if key in later.common},
-        )
-
-    def gathered(self) -> Gathered:
-        """Return what all episodes come to."""
-        return Gathered(
-            {key: numpy.concatenate(parts) for key, parts in self.each.items()},
-            {key: mean_of_sums(sums) for key, sums in self.sums.items()},
-            self.common,
-        )
-
-
 @dataclass(frozen=True)
 class OwnMetrics:
     """The metrics of an environment."""
@@ -62,21 +39,34 @@ class OwnMetrics:
     measures: Callable[[Gathered, Bootstrap, xarray.Dataset], list[Measure]]
     """From what was gathered of all episodes, and the evaluation, of whose variables none is needed."""
 
-    def take(self, run: xarray.Dataset, bootstrap: Bootstrap, first: int = 0) -> Taken:
-        """Gather from some episodes of one competitor.
+    def statistics(self, run: xarray.Dataset) -> Iterator[Statistic]:
+        """Declare what was gathered.
 
         Args:
-            run: one policy's part of an evaluation.
-            bootstrap: over the episodes of the whole evaluation.
-            first: number of the run's first episode among them; a multiple of :func:`.bootstrap.block_of`.
+            run: some episodes of one competitor.
         """
-        parts = (self._taken(part, bootstrap, first + i) for i, part in in_blocks(run))
-        return functools.reduce(Taken.and_of, parts)
-
-    def _taken(self, run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Taken:
         each, averaged, common = self.gather(run)
-        sums = {key: bootstrap.sums(values, first) for key, values in averaged.items()}
-        return Taken({key: [values] for key, values in each.items()}, sums, dict(common))
+        for key, values in averaged.items():
+            yield Statistic(("averaged", key), values)
+        for key, values in each.items():
+            yield Statistic(("each", key), values, sample=ALL)
+        for key, values in common.items():
+            yield Statistic(("common", key), values[None], itemgetter(0), sample=1)
+
+    def measures_of(
+        self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: xarray.Dataset
+    ) -> list[Measure]:
+        """Return the measures of one competitor.
+
+        Args:
+            results: of :meth:`statistics` of all episodes.
+            bootstrap: over them.
+            evaluation: its part of the evaluation, of whose variables none is needed.
+        """
+        gathered = Gathered(
+            *({key[1]: results[key] for key in results if key[0] == f} for f in Gathered._fields)
+        )
+        return self.measures(gathered, bootstrap, evaluation)
 
     def __call__(self, run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
         """Return the measures of one competitor.
@@ -85,4 +75,4 @@ class OwnMetrics:
             run: one policy's part of an evaluation, all of its episodes.
             bootstrap: over them.
         """
-        return self.measures(self.take(run, bootstrap).gathered(), bootstrap, run)
+        return self.measures_of(reduce_run(run, self.statistics, bootstrap).results(), bootstrap, run)

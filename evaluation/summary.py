@@ -8,7 +8,7 @@ import functools
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,13 +16,14 @@ import numpy
 import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
-from .curves import BAND_RESAMPLES, Drawn, Finished, drawn_from, joined
+from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
 from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
-from .metrics import Contender, Judged, Measure, Record, judge, records_of
-from .own_metrics import OwnMetrics, Taken
+from .metrics import Contender, Measure, Record, contender_of, record_statistics, records_of
+from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
+from .statistics import Reduction, Statistic, reduce_run
 from .threads import one_thread
 
 TOGETHER = 4 * BLOCK
@@ -73,7 +74,7 @@ class Summary(NamedTuple):
     """One competitor of an evaluation."""
 
     contender: Contender
-    finished: Finished
+    curves: CompetitorCurves
     head: xarray.Dataset
     """Its part of the evaluation, without what was kept of every episode."""
     episodes: int
@@ -90,26 +91,18 @@ class Kept(NamedTuple):
 class Part(NamedTuple):
     """Some episodes of one competitor."""
 
-    judged: Judged
-    drawn: Drawn
-    own: Taken | None
-    """For the environment's own metrics."""
+    reduction: Reduction
     head: xarray.Dataset
 
-    def and_of(self, later: "Part") -> "Part":
+    def merge(self, later: "Part") -> "Part":
         """Add the episodes that come next."""
-        own = None if self.own is None or later.own is None else self.own.and_of(later.own)
-        return Part(self.judged.and_of(later.judged), self.drawn.and_of(later.drawn), own, self.head)
+        return self._replace(reduction=self.reduction.merge(later.reduction))
 
-    def finished(self, bootstrap: Bootstrap, metrics: OwnMetrics | None) -> Summary:
+    def summary(self, bootstrap: Bootstrap, metrics: OwnMetrics | None) -> Summary:
         """Return the summary of all episodes."""
-        name, kind, control = (str(self.head[word].values) for word in ("policy", "kind", "control"))
-        measures = self.judged.measures(bootstrap)
-        further = []
-        if metrics is not None and self.own is not None:
-            further = metrics.measures(self.own.gathered(), bootstrap, self.head)
-        found = Contender(name, kind, control, measures, further, self.judged.cost())
-        return Summary(found, self.drawn.finished(), self.head, bootstrap.episodes)
+        results = self.reduction.results()
+        contender = contender_of(results, self.head, bootstrap, metrics)
+        return Summary(contender, competitor_curves(results), self.head, bootstrap.episodes)
 
 
 @functools.lru_cache(maxsize=1)
@@ -120,6 +113,33 @@ def _resampling(episodes: int) -> Bootstrap:
 
 def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
+
+    Raises:
+        ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
+    """
+
+    def declare(run: xarray.Dataset) -> Iterator[Statistic]:
+        yield from record_statistics(run, asked.episodes)
+        if asked.metrics is not None:
+            yield from asked.metrics.statistics(run)
+        yield from curve_statistics(run, asked.episodes)
+
+    part = reduce_episodes(asked, declare, tick)
+    last = asked.episodes if asked.last is None else asked.last
+    if last - asked.first < asked.episodes:
+        return part
+    return part.summary(_resampling(asked.episodes), asked.metrics)
+
+
+def reduce_episodes(
+    asked: Asked, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
+) -> Part:
+    """Run what is asked for and reduce it to statistics, a block of episodes at a time.
+
+    Args:
+        asked: one competitor over episodes.
+        declare: from some of its episodes to their statistics.
+        tick: told of measurements done.
 
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
@@ -141,19 +161,17 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)
-    of_curves = bootstrap.fewer(BAND_RESAMPLES)
     last = asked.episodes if asked.last is None else asked.last
-    found: Part | None = None
     block = block_of(plan.tasks[asked.name].horizon)
-    for i in range(asked.first, last, block):
-        piece = plan.piece(asked.name, i, min(block, last - i), False, asked.drawn_episodes, True)
-        run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
-        run = run.isel(policy=0)
-        own = None if asked.metrics is None else asked.metrics.take(run, bootstrap, i)
-        part = Part(judge(run, bootstrap, i), drawn_from(run, of_curves, i), own, _head(run))
-        found = part if found is None else found.and_of(part)
-    assert found is not None
-    return found.finished(bootstrap, asked.metrics) if last - asked.first == asked.episodes else found
+
+    def parts() -> Iterator[Part]:
+        for i in range(asked.first, last, block):
+            piece = plan.piece(asked.name, i, min(block, last - i), False, asked.drawn_episodes, True)
+            run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
+            run = run.isel(policy=0)
+            yield Part(reduce_run(run, declare, bootstrap, i), _head(run))
+
+    return functools.reduce(Part.merge, parts())
 
 
 def _head(run: xarray.Dataset) -> xarray.Dataset:
@@ -219,15 +237,15 @@ def _summarised(
         waiting.setdefault(i, {})[piece.first] = found, piece.last or 0
         while done[i] in waiting[i]:
             later, done[i] = waiting[i].pop(done[i])
-            added[i] = added[i].and_of(later) if i in added else later
+            added[i] = added[i].merge(later) if i in added else later
         if done[i] == asked[i].episodes:
             with one_thread():
-                whole = added.pop(i).finished(_resampling(asked[i].episodes), asked[i].metrics)
+                whole = added.pop(i).summary(_resampling(asked[i].episodes), asked[i].metrics)
             yield i, whole
 
 
 @one_thread()
-def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:
+def combine_summaries(found: Sequence[Summary]) -> tuple[list[Record], xarray.Dataset, xarray.Dataset]:
     """Return what the summaries of all competitors of an evaluation come to.
 
     Returns:
@@ -236,15 +254,13 @@ def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Datase
     """
     evaluation = _heads_together(found)
     records = records_of([one.contender for one in found], evaluation, _resampling(found[0].episodes))
-    finished = [one.finished for one in found]
-    if len({one.contender.control for one in found if one.finished.actions}) > 1:
-        finished = [
-            one.finished._replace(
-                actions=[f"{one.contender.control}: {part}" for part in one.finished.actions]
-            )
+    each = [one.curves for one in found]
+    if len({one.contender.control for one in found if one.curves.actions}) > 1:
+        each = [
+            one.curves._replace(actions=[f"{one.contender.control}: {part}" for part in one.curves.actions])
             for one in found
         ]
-    curves = joined(finished, evaluation, found[0].episodes)
+    curves = stack_curves(each, evaluation, found[0].episodes)
     return records, curves, evaluation
 
 
@@ -286,11 +302,11 @@ def write_summary(path: Path, summary: Summary, made_by: str) -> None:
         "control": own.control,
         "measures": own.measures,
         "further": own.further,
-        "actions": summary.finished.actions,
-        "gains": summary.finished.gains,
+        "actions": summary.curves.actions,
+        "gains": summary.curves.gains,
         "episodes": summary.episodes,
     }
-    arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.finished.curves.items()}
+    arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.curves.curves.items()}
     if own.costs is not None:
         arrays["costs"] = own.costs
     head = numpy.frombuffer(
@@ -318,11 +334,11 @@ def read_summary(path: Path, made_by: str) -> Summary | None:
                 for name in ("measures", "further")
             )
             contender = Contender(words["name"], words["kind"], words["control"], measures, further, costs)
-            finished = Finished(curves, words["actions"], words["gains"])
+            own = CompetitorCurves(curves, words["actions"], words["gains"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None  # what a crash has left half: it is made again
     head.attrs = {name: _plain(value) for name, value in head.attrs.items()}
-    return Summary(contender, finished, head, words["episodes"])
+    return Summary(contender, own, head, words["episodes"])
 
 
 def _plain(value: Any) -> Any:

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import xarray
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import mean_of_present
+from filtergym.evaluation.statistics import ALL, Statistic, reduce_run
 from scipy import stats
 
 
@@ -66,3 +68,56 @@ def test_the_mean_of_what_is_present_pools_over_episodes():
         mean_of_present(full, bootstrap), bootstrap.estimate(full.mean(axis=1)), rtol=1e-10
     )
     assert np.isnan(mean_of_present(np.full((30, 5), np.nan), bootstrap)).all()
+
+
+@pytest.mark.parametrize("clusters", [None, list("aabbbcddd")])
+def test_statistics_of_an_episode_are_reduced_together_block_by_block(monkeypatch, clusters):
+    """Against loops over the resamples; one product a block serves all means, and its weights are made once."""
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 4)  # episodes
+    rng = np.random.default_rng(0)
+    bootstrap = Bootstrap(9, 20, clusters=clusters)
+    values = {"number": rng.normal(size=9), "curve": rng.normal(size=(9, 3, 2)), "late": rng.normal(size=9)}
+    if clusters is not None:
+        values["curve"][2:5, 1] = np.nan
+    run = xarray.Dataset(
+        {name: (("episode", "time", "axis")[: array.ndim], array) for name, array in values.items()},
+        coords={"time": range(3)},
+    )
+    products = []
+    monkeypatch.setattr(
+        Bootstrap, "sums", lambda self, *args, own=Bootstrap.sums: products.append(args) or own(self, *args)
+    )
+
+    def declare(block):
+        yield Statistic(("root",), block["curve"].values, np.abs)
+        yield Statistic(("number",), block["number"].values)
+        if block["late"].values[0] != values["late"][0]:  # the first block has none
+            yield Statistic(("late",), block["late"].values, optional=True)
+            yield Statistic(("unknown",), block["late"].values)
+            yield Statistic(("unknown sample",), block["late"].values, sample=ALL)
+        yield Statistic(("sample",), block["number"].values, sample=6)
+        yield Statistic(("few",), block["curve"].values, resamples=5)
+
+    found = reduce_run(run, declare, bootstrap).results()
+    assert [(len(args[0]), args[1]) for args in products] == [(2, 0), (1, 0), (4, 4), (1, 4), (4, 8), (1, 8)]
+    assert set(found) == {("root",), ("number",), ("late",), ("sample",), ("few",)}
+    np.testing.assert_array_equal(found["sample",], values["number"][:6])
+    np.testing.assert_array_equal(found["few",], bootstrap.means(values["curve"])[:6])
+    weights = bootstrap.weights
+    means = [np.nanmean(values["curve"], axis=0)]
+    for row in weights[1:]:
+        there = ~np.isnan(values["curve"]) * row[:, None, None]
+        with np.errstate(invalid="ignore"):
+            means.append(np.nansum(values["curve"] * row[:, None, None], axis=0) / there.sum(axis=0))
+    np.testing.assert_allclose(found["root",], np.abs(means), rtol=1e-12)
+    np.testing.assert_allclose(found["number",], weights @ values["number"], rtol=1e-12)
+    present = weights[:, 4:].sum(axis=1) if clusters is not None else 1.0
+    np.testing.assert_allclose(found["late",], weights[:, 4:] @ values["late"][4:] / present, rtol=1e-12)
+
+
+def test_weights_of_a_block_are_made_once():
+    bootstrap = Bootstrap(9, 20)
+    some = slice(2, 6)
+    assert bootstrap.weights_of(some) is bootstrap.weights_of(slice(2, 6))
+    np.testing.assert_array_equal(bootstrap.weights_of(some), bootstrap.weights[:, some])
+    np.testing.assert_array_equal(bootstrap.weights_of(slice(0, 2)), bootstrap.weights[:, :2])

@@ -20,7 +20,7 @@ from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
 from filtergym.evaluation.parallel import Workers
-from filtergym.evaluation.summary import summaries, told_together
+from filtergym.evaluation.summary import combine_summaries, summaries
 
 import filtergym
 from filtergym import evaluate, tidy_records
@@ -79,7 +79,7 @@ def test_summaries_tell_what_the_evaluation_does(env):
     asked = asked_of(env, names, episodes=6, drawn_episodes=1, **shorter)
     assert [one.episodes for one in asked] == [6] * len(names)
     found = dict(summaries(asked, Workers()))
-    records, curves, evaluation = told_together([found[i] for i in range(len(names))])
+    records, curves, evaluation = combine_summaries([found[i] for i in range(len(names))])
     assert records == tidy_records(dataset)
     expected = filtergym.evaluation.curves.curves_of(dataset)
     assert set(curves.variables) == set(expected.variables)
@@ -117,8 +117,8 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
     in_any = dict(summaries(asked, Workers()))
     first, other = ([found[i] for i in range(3)] for found in (in_turn, in_any))
-    records, curves, _ = told_together(first)
-    again, curves_again, _ = told_together(other)
+    records, curves, _ = combine_summaries(first)
+    again, curves_again, _ = combine_summaries(other)
     assert records == again
     assert curves.identical(curves_again)
     # Sums of blocks are rounded otherwise than those of all episodes at once.

@@ -9,7 +9,7 @@ import xarray
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import slices_of, windows_of
 from ...evaluation.metrics import Measure, squared_errors
-from ...evaluation.own_metrics import Gathered, OwnMetrics
+from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
 
 CLASSES = 3
 SURE = 0.9
@@ -18,10 +18,10 @@ TIMES = (2.0, 5.0, 10.0, 20.0, 30.0, 60.0)
 """Seconds at which the probability of the true class is reported."""
 
 
-def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
-    """Ratio of means over episodes, ``(1 + resamples,)``."""
+def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
+    """Ratio of means over episodes, ``(1 + resamples,)``; without numbers where there is no share."""
     with numpy.errstate(divide="ignore", invalid="ignore"):
-        return bootstrap.means(values) / bootstrap.means(shares)
+        return means / shares
 
 
 def time_quantile(
@@ -58,7 +58,8 @@ def _recognition(
         value = time_quantile(bootstrap, first, chosen, seconds, share)
         yield Measure(f"{name}_{suffix}", component, "all", value, "s")
     never = ((first == len(seconds)) & chosen).astype(float)
-    censored = bootstrap.interval(_ratio(bootstrap, never, chosen.astype(float)))
+    means = bootstrap.means(numpy.stack([never, chosen], axis=1))
+    censored = bootstrap.interval(_ratio(means[:, 0], means[:, 1]))
     yield Measure(f"{name}_censored", component, "all", censored, "1")
 
 
@@ -69,6 +70,11 @@ def _missing(run: xarray.Dataset, name: str) -> bool:
 def _of_class(true_class: numpy.ndarray) -> numpy.ndarray:
     """Whether a target is of a class, ``(..., classes)``."""
     return numpy.asarray(true_class[..., None] == numpy.arange(CLASSES))
+
+
+def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
+    """Whether a target is of a group, ``(..., 1 + classes)``: everybody, and each class."""
+    return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
 def gather(run: xarray.Dataset) -> Gathered:
@@ -86,8 +92,8 @@ def gather(run: xarray.Dataset) -> Gathered:
         )
         variance.append([run[f"variance_{component}"].values[:, times].mean(axis=1) for times in slices])
     share = [[of_class[:, times, s].mean(axis=1) for s in range(CLASSES)] for times in slices]
-    each = {"squares": squares, "squares_by_class": by_class, "variance": variance, "share": share}
-    found = Gathered({key: numpy.moveaxis(numpy.array(values), -1, 0) for key, values in each.items()})
+    means = {"squares": squares, "squares_by_class": by_class, "variance": variance, "share": share}
+    found = Gathered({}, {key: numpy.moveaxis(numpy.array(values), -1, 0) for key, values in means.items()})
     return found if _missing(run, "mode_probability") else _with_beliefs(run, found)
 
 
@@ -101,18 +107,21 @@ def _with_beliefs(run: xarray.Dataset, errors: Gathered) -> Gathered:
     last = _last(seconds)
     wrong = (probability[:, last] >= SURE) & (numpy.arange(probability.shape[2]) != true_class[:, last, None])
     excess = probability.max(axis=2) - (probability.argmax(axis=2) == true_class)
+    at_moments, at_last = _of_group(true_class[:, list(moments.values())]), _of_group(true_class[:, last])
+    averaged = {
+        "probability": true_probability[:, list(moments.values()), None] * at_moments,
+        "share_at_moments": at_moments,
+        "wrong": wrong.any(axis=1)[:, None] & at_last,
+        "share_at_last": at_last,
+        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in slices_of(run).values()], axis=1),
+    }
     each = {
-        "probability": true_probability[:, list(moments.values())],
-        "class": true_class[:, list(moments.values())],
         "first_class": true_class[:, 0],
         "recognised": _first(sure & same),
         "change": change,
         "recognised_again": numpy.where(waited < len(seconds), waited - change, len(seconds)),
-        "last_class": true_class[:, last],
-        "wrong": wrong.any(axis=1),
-        "excess": numpy.stack([excess[:, times].mean(axis=1) for times in slices_of(run).values()], axis=1),
     }
-    return Gathered({**errors.each, **each}, {}, {"seconds": seconds})
+    return Gathered(each, {**errors.averaged, **averaged}, {"seconds": seconds})
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
@@ -136,52 +145,50 @@ def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Datase
     ``confidence_excess``, mean probability of the most probable class minus how often it is the true one.
     A reference has no class probabilities: of it only errors and calibration.
     """
-    if not gathered.each:
+    if not gathered.averaged:
         return []
-    errors = list(_errors(gathered, bootstrap, evaluation))
-    return [*errors, *_beliefs(gathered, bootstrap, evaluation)] if "excess" in gathered.each else errors
+    errors = list(_errors(gathered.averaged, bootstrap, evaluation))
+    return [*errors, *_beliefs(gathered, bootstrap, evaluation)] if gathered.each else errors
 
 
-def _groups(true_class: numpy.ndarray) -> dict[str, numpy.ndarray]:
-    """Everybody, and the targets of each class that there is, ``(episodes,)`` booleans."""
-    by_class = {f"S{s}": true_class == s for s in numpy.unique(true_class)}
-    return {"": numpy.ones(true_class.shape, dtype=bool)} | by_class
+GROUPS = ("", *(f"S{s}" for s in range(CLASSES)))
+"""Names of everybody, and of the targets of each class."""
 
 
-def _errors(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
-    each = gathered.each
+def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
     names, units = evaluation["component"].values.tolist(), evaluation["unit"].values.tolist()
     for i, (component, unit) in enumerate(zip(names, units, strict=True)):
         for j, window in enumerate(windows_of(evaluation)):
             for s in range(CLASSES):
-                share = each["share"][:, j, s]
-                if share.any():
-                    ratio = _ratio(bootstrap, each["squares_by_class"][:, i, j, s], share)
+                share = means["share"][:, j, s]
+                if share[0] > 0.0:
+                    ratio = _ratio(means["squares_by_class"][:, i, j, s], share)
                     value = bootstrap.interval(numpy.sqrt(ratio))
                     yield Measure("rmse_by_class", f"{component} S{s}", window, value, unit)
-            ratio = _ratio(bootstrap, each["squares"][:, i, j], each["variance"][:, i, j])
+            ratio = _ratio(means["squares"][:, i, j], means["variance"][:, i, j])
             yield Measure("calibration_ratio", component, window, bootstrap.interval(ratio), "1")
 
 
 def _beliefs(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
-    each, seconds = gathered.each, gathered.common["seconds"]
+    each, means, seconds = gathered.each, gathered.averaged, gathered.common["seconds"]
     for k, moment in enumerate(_moments(seconds)):
-        for mode, chosen in _groups(each["class"][:, k]).items():
-            ratio = _ratio(bootstrap, each["probability"][:, k] * chosen, chosen.astype(float))
-            value = bootstrap.interval(ratio)
-            yield Measure("mean_true_class_probability", mode, f"{moment:g} s", value, "1")
-    for mode, chosen in _groups(each["first_class"]).items():
-        yield from _recognition("time_to_recognise", bootstrap, each["recognised"], chosen, seconds, mode)
+        shares, probability = means["share_at_moments"][:, k], means["probability"][:, k]
+        for i in numpy.flatnonzero(shares[0]):
+            value = bootstrap.interval(_ratio(probability[:, i], shares[:, i]))
+            yield Measure("mean_true_class_probability", GROUPS[i], f"{moment:g} s", value, "1")
+    for mode, chosen in zip(GROUPS, _of_group(each["first_class"]).T, strict=True):
+        if chosen.any():
+            yield from _recognition("time_to_recognise", bootstrap, each["recognised"], chosen, seconds, mode)
     changed = each["change"] < len(seconds)
     if changed.any():
         name, again = "time_to_recognise_change", each["recognised_again"]
         yield from _recognition(name, bootstrap, again, changed, seconds - seconds[0], "")
-    for mode, chosen in _groups(each["last_class"]).items():
-        ratio = _ratio(bootstrap, each["wrong"] * chosen.astype(float), chosen.astype(float))
+    for i in numpy.flatnonzero(means["share_at_last"][0]):
+        ratio = _ratio(means["wrong"][:, i], means["share_at_last"][:, i])
         window = f"{seconds[_last(seconds)]:g} s"
-        yield Measure("sure_and_wrong", mode, window, bootstrap.interval(ratio), "1")
+        yield Measure("sure_and_wrong", GROUPS[i], window, bootstrap.interval(ratio), "1")
     for j, window in enumerate(windows_of(evaluation)):
-        yield Measure("confidence_excess", "", window, bootstrap.estimate(each["excess"][:, j]), "1")
+        yield Measure("confidence_excess", "", window, bootstrap.interval(means["excess"][:, j]), "1")
 
 
 METRICS = OwnMetrics(gather, measures)

@@ -29,7 +29,7 @@ from ..evaluation.metrics import flight_records
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
-from ..evaluation.summary import summaries, told_together
+from ..evaluation.summary import combine_summaries, summaries
 from ..names import asked_of, competitor, evaluate, is_learned, tidy_records
 from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
@@ -251,7 +251,7 @@ def evaluate_policies(
         records = tidy_records(dataset)
         curves = None if out is None else curves_of(dataset)
     else:
-        records, curves, dataset = told_together([found[i] for i in range(len(found))])
+        records, curves, dataset = combine_summaries([found[i] for i in range(len(found))])
     if estimates is not None:
         write_estimates(estimates, dataset)
     judged = dataset.attrs["truth"]

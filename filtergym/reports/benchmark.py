@@ -18,7 +18,7 @@ from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers
-from ..evaluation.summary import Asked, Summary, summaries, told_together
+from ..evaluation.summary import Asked, Summary, combine_summaries, summaries
 from ..names import asked_of
 from .results import (
     RESULTS,
@@ -211,7 +211,7 @@ def run_benchmark(
         cell = wanted[i]
         if len(found[i]) == len(cell.policies):
             everyone = [found[i].pop(name) for name in cell.policies]
-            records, curves, head = told_together(everyone)
+            records, curves, head = combine_summaries(everyone)
             drawn(cell, curves)
             results[i] = result_of(head, records, curves, shipped_agents(cell.environment))
         while told < len(results) and (due := results[told]) is not None:

@@ -134,7 +134,7 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
         if paper is None or line.role == "paper":
             row += ["-", "-"]
         else:
-            difference = bootstrap.interval(bootstrap.means(own) / bootstrap.means(paper) - 1.0)
+            difference = bootstrap.relative_difference(bootstrap.means(own), bootstrap.means(paper))
             row += [
                 with_interval(difference, 100.0, negligible=0.005),
                 f"{100.0 * (bootstrap.medians(own / paper)[0] - 1.0):+.1f}",
