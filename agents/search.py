@@ -28,8 +28,8 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from ..envs.catalogue import task_class
-from ..evaluation.code import code_digest
 from ..envs.parameters import check_integer
+from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merged, read_section
 from .training_run import FILES, TrainingRun, Validated, load_run, new_run, opened_run
