@@ -234,7 +234,8 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
     Raises:
         ValueError: for the first episode that cannot be true.
     """
-    seen, sigma = task.world.all_seen()
+    world: Any = task.world  # a RecordedWorld
+    seen, sigma = world.all_seen()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
     usual = getattr(task.parameters, "sampling_interval", None)
