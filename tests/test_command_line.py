@@ -7,10 +7,11 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import commands
 import pytest
 from made_results import results_of
 
-from filtergym.__main__ import COMMANDS, main
+from filtergym.__main__ import COMMANDS, GROUPS, main
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
 from filtergym.reports.results import read_results, settings_of, write_results
@@ -51,6 +52,25 @@ def test_help_of_every_command_ends_with_an_example(command, monkeypatch, capsys
         main()
     assert end.value.code == 0
     assert f"Example: filtergym {command}" in capsys.readouterr().out
+
+
+def test_help_shows_the_commands_in_groups(run):
+    shown = run("--help").stdout
+    words = [
+        word
+        for group, commands in GROUPS.items()
+        for word in (f"─ {group} ─", *(f"│ {c} " for c in commands))
+    ]
+    places = [shown.find(word) for word in words]
+    assert -1 not in places
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_help_of_what_makes_the_pages_ends_with_an_example(name, make_page):
+    code, shown, _ = make_page(name, "--help")
+    assert code == 0
+    assert f"Example: python docs/make {name}" in shown
 
 
 def test_progress_bar_says_nothing_where_nobody_looks(capsys):
