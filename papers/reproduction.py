@@ -1,10 +1,10 @@
 """What a reproduction of a paper consists of.
 
-A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (statements, verdicts,
-tables), ``figures``. Its ``__init__.py`` defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress
-callback) and ``reproduce(progress, episodes=None, workers=None) -> Reproduction``, which runs the experiment
-(``episodes`` Monte Carlo runs instead of its own number; units of work :func:`gathered` from workers) and judges the
-claims.
+A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (a table of statements,
+which :func:`judged` reads, and the quantities that they rest on; tables of results), ``figures``. Its ``__init__.py``
+defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and ``reproduce(progress,
+episodes=None, workers=None) -> Reproduction``, which runs the experiment (``episodes`` Monte Carlo runs instead of its
+own number; units of work :func:`gathered` from workers) and judges the claims.
 
 There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. Pictures: :mod:`.panels`.
 """
@@ -12,6 +12,7 @@ There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. P
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
 from rich.table import Table
@@ -77,6 +78,11 @@ def _places(part: Any, instead: Callable[[Later], Any]) -> Any:
     return part
 
 
+def verdict_if(holds: bool) -> Verdict:
+    """Verdict on a claim that holds or does not."""
+    return "reproduced" if holds else "not reproduced"
+
+
 def verdict_of(holds: Iterable[bool]) -> Verdict:
     """Verdict on a claim with several parts: reproduced if all of them hold, in part if some do."""
     parts = list(holds)
@@ -95,6 +101,33 @@ class Claim:
     method: str
     """Runs, windows, statistic."""
     verdict: Verdict = "paper is silent"
+
+
+class Statement(NamedTuple):
+    """A row of a paper's table of claims; in its texts ``{name:.2f}`` stands for a measured quantity."""
+
+    key: str
+    statement: str
+    """What the paper says, in our words; or the question, where it is silent."""
+    measured: str
+    method: str
+    verdict: Callable[[Any], Verdict] | Verdict = "paper is silent"
+    """How the measured quantities, attributes of the argument, judge it."""
+
+
+def judged(table: Iterable[Statement], quantities: Mapping[str, Any]) -> list[Claim]:
+    """Return the claims of a table with the quantities that were measured, by their names in the table."""
+    found = SimpleNamespace(**quantities)
+    return [
+        Claim(
+            row.key,
+            row.statement,
+            row.measured.format_map(quantities),
+            row.method.format_map(quantities),
+            row.verdict(found) if callable(row.verdict) else row.verdict,
+        )
+        for row in table
+    ]
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,12 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import commands
 import pytest
 from made_results import results_of
 
-from filtergym.__main__ import COMMANDS, main
 from filtergym.commands import terminal
+from filtergym.__main__ import COMMANDS, GROUPS, main
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
 from filtergym.reports.results import read_results, settings_of, write_results
@@ -77,7 +78,6 @@ REFUSED = {
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
     "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
-    "seeds": ("missing", "--out", "new/records.json"),
 }
 
 
@@ -121,6 +121,25 @@ def test_a_number_of_training_that_is_zero_is_no_default(words, run):
     result = run("train", ENV, "--out", "run", *words)
     assert result.returncode == 2
     assert "must be an integer of at least 1" in result.stderr
+
+
+def test_help_shows_the_commands_in_groups(run):
+    shown = run("--help").stdout
+    words = [
+        word
+        for group, commands in GROUPS.items()
+        for word in (f"─ {group} ─", *(f"│ {c} " for c in commands))
+    ]
+    places = [shown.find(word) for word in words]
+    assert -1 not in places
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_help_of_what_makes_the_pages_ends_with_an_example(name, make_page):
+    code, shown, _ = make_page(name, "--help")
+    assert code == 0
+    assert f"Example: python docs/make {name}" in shown
 
 
 def test_progress_bar_says_nothing_where_nobody_looks(capsys):

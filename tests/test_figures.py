@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.evaluation.curves import curves_of
-from filtergym.evaluation.figures import (
-    draw_differences,
-    draw_error_over_time,
-    draw_learning_curves,
-    evaluation_figures,
-)
+from filtergym.evaluation.figures import draw_error_over_time, evaluation_figures
 from filtergym.evaluation.looks import COLOURS, MOST_HIGHLIGHTED, by_cost, highlighted, joined, looks, merged
 from filtergym.evaluation.print_layout import WIDTHS, save, sensible_limits
 from matplotlib.colors import to_hex
+from pictures import draw_differences, draw_learning_curves
 
 from filtergym import evaluate, record
 

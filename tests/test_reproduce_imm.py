@@ -21,6 +21,7 @@ from filtergym.papers.imm_alpha_beta.imm_readings import (
     interacting_multiple_model,
 )
 from filtergym.papers.measured import Measured
+from filtergym.papers.reproduction import judged
 
 from filtergym import evaluate
 from filtergym.papers import imm_alpha_beta as paper
@@ -254,7 +255,7 @@ def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
 
 
 def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
-    stated = claims.claims(results.of)
+    stated = judged(claims.CLAIMS, claims.quantities(results.of))
     keys = [claim.key for claim in stated]
     assert keys[:2] == ["C1", "C1 re-arming"]
     assert {"C2", "C3", "Straight legs", "Detection"} <= set(keys)
@@ -266,7 +267,7 @@ def test_claims_and_tables_are_complete(results: SimpleNamespace) -> None:
 
 
 def test_verdicts_of_forty_episodes(results: SimpleNamespace) -> None:
-    verdicts = {claim.key: claim.verdict for claim in claims.claims(results.of)}
+    verdicts = {claim.key: claim.verdict for claim in judged(claims.CLAIMS, claims.quantities(results.of))}
     # With 40 episodes the size of the improvement is not certain, its direction and C3 are.
     assert verdicts["C1"] != "not reproduced"
     assert verdicts["C1 re-arming"] == "not reproduced"
@@ -283,7 +284,9 @@ def test_verdicts_follow_the_data(results: SimpleNamespace) -> None:
     # Two rows down, the smallest errors leave the box.
     grids = {kind: numpy.roll(grid, -2, axis=0) for kind, grid in results.of.grids.items()}
     exchanged_results = results.of._replace(main=exchanged, grids=grids)
-    verdicts = {claim.key: claim.verdict for claim in claims.claims(exchanged_results)}
+    verdicts = {
+        claim.key: claim.verdict for claim in judged(claims.CLAIMS, claims.quantities(exchanged_results))
+    }
     assert verdicts["C1"] == "not reproduced"
     assert verdicts["C2"] == "not reproduced"
     assert verdicts["C3"] == "not reproduced"

@@ -8,9 +8,9 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.baselines.catalogue import baselines_of, paper_of
 from filtergym.envs.catalogue import catalogue, nearest, short_name, task_class
 from filtergym.evaluation.competitors import RANKED
-from filtergym.evaluation.figures import draw_differences
 from filtergym.evaluation.metrics import Record
 from filtergym.papers.grid import Grid, markdown_table
+from pictures import draw_differences
 
 from filtergym.reports.ranking import HARM, ranking, ranking_sentence, who_is_best
 from filtergym.reports.results import read_all_results

@@ -22,12 +22,12 @@ from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
 from filtergym.evaluation.evaluate import check_sendable
-from filtergym.evaluation.figures import draw_learning_curves
 from filtergym.evaluation.files import whole_file
 from filtergym.evaluation.metrics import reported_components, score, squared_errors
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.summary import Asked
 from filtergym.papers.grid import Grid, markdown_table
+from pictures import draw_learning_curves
 from scipy.special import stdtrit
 
 from filtergym.names import competitor

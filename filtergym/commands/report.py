@@ -38,7 +38,8 @@ def reproduce(
     paper: Annotated[
         str,
         typer.Argument(
-            help=f"One of: {', '.join(papers()) or 'none here'}.", autocompletion=one_of(*papers())
+            help=f"One of: {', '.join(papers()) or 'none, outside a clone'}.",
+            autocompletion=one_of(*papers()),
         ),
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for report and figures.")] = None,

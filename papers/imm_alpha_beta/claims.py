@@ -1,13 +1,14 @@
 """The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
 
+import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
 from ..grid import Grid
 from ..measured import Measured, mean, means, measured
-from ..reproduction import Claim, Verdict, verdict_of
+from ..reproduction import Statement, Verdict, verdict_of
 from .experiment import (
     BOX_PAIRS,
     COMPARED,
@@ -63,6 +64,13 @@ class Comparison(NamedTuple):
     def verdict(self) -> Verdict:
         """Verdict on C1 against this comparator."""
         return improvement_verdict(self.section, [*self.turn, *self.recovery])
+
+    def __str__(self) -> str:
+        names = (f"scans {SPAN}", "turn", "recovery", "peak")
+        return "; ".join(
+            f"{name}: position {position:+.1%}, velocity {velocity:+.1%}"
+            for name, (position, velocity) in zip(names, self, strict=True)
+        )
 
 
 def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Measured]:
@@ -181,72 +189,149 @@ def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
 # --- claims
 
 
-def claims(r: Results) -> list[Claim]:
-    """The paper's claims, and what it does not mention, each with a verdict from the figures."""
-    comparison = comparisons(r)
-    rule = (
-        f"{r.episodes} episodes on common noise; change of the RMS along x, paired; reproduced if position and "
-        f"velocity RMS over scans {SPAN} are certainly at least "
-        f"{100 * SUBSTANTIAL:.0f} % smaller and neither turn nor recovery is certainly worse"
-    )
-    statement = "On the manoeuvre section the IMM has substantially smaller RMSE than the adaptive filter"
-    rearm = NAMES["adaptive-rearm"]
-    rows = [
-        ("", "", f"canonical, 0.3 / 0.7; against {NAMES['adaptive']}"),
-        (
-            " re-arming",
-            ", when an alarm during the ramp starts it again (same gains)",
-            f"canonical, 0.3 / 0.7; against {rearm}",
-        ),
-    ] + [
+AGAINST = (
+    ("", "", f"canonical, 0.3 / 0.7; against {NAMES['adaptive']}"),
+    (
+        " re-arming",
+        ", when an alarm during the ramp starts it again (same gains)",
+        f"canonical, 0.3 / 0.7; against {NAMES['adaptive-rearm']}",
+    ),
+    *(
         (
             f" re-arming, {a:g} / {b:g}",
             f", re-arming, both with gains {a:g} / {b:g} of the recommended box",
-            f"gains {a:g} / {b:g}; against {rearm}",
+            f"gains {a:g} / {b:g}; against {NAMES['adaptive-rearm']}",
         )
         for a, b in BOX_PAIRS
-    ]
-    found = findings(r, "gains used", WINDOWS["all"])
+    ),
+)
+"""Opponents of C1: what is added to its name and to the statement, and the name of the comparison."""
+
+
+def _verdict_against(i: int, quantities: Any) -> Verdict:
+    """Verdict on C1 against one of those opponents."""
+    comparison: Comparison = quantities.against[i]
+    return comparison.verdict
+
+
+CLAIMS = (
+    *(
+        Statement(
+            f"C1{suffix}",
+            f"On the manoeuvre section the IMM has substantially smaller RMSE than the adaptive filter{more}.",
+            f"{{against[{i}]}}",
+            "{r.episodes} episodes on common noise; change of the RMS along x, paired; reproduced if position and "
+            f"velocity RMS over scans {SPAN} are certainly at least "
+            f"{100 * SUBSTANTIAL:.0f} % smaller and neither turn nor recovery is certainly worse",
+            functools.partial(_verdict_against, i),
+        )
+        for i, (suffix, more, _) in enumerate(AGAINST)
+    ),
+    Statement(
+        "C2",
+        f"The smallest RMSE is at alpha_1 = {LOW_BOX[0]:g}..{LOW_BOX[1]:g}, "
+        f"alpha_2 = {HIGH_BOX[0]:g}..{HIGH_BOX[1]:g}.",
+        "{best_text}",
+        f"{{r.grid_episodes}} episodes in each of {len(LOW_GAINS)} x {len(HIGH_GAINS)} cells, common noise, RMS "
+        f"along x over all scans; reproduced if the minimum is in the box in {100 * CERTAIN:.0f} % of bootstrap "
+        f"samples and every cell within {100 * NEAR_MINIMUM:.0f} % of it too, for position and velocity. "
+        "The box is half of the grid",
+        lambda q: box_verdict(q.best),
+    ),
+    Statement(
+        "C3",
+        "Mode 1 dominates on the straight legs, mode 2 during the turn.",
+        "mean probability of mode 1: {before:.4f} before the turn, {turn:.4f} in it, {after:.4f} after it; {handover}",
+        "{r.episodes} episodes, mean over the windows; reproduced if certainly above "
+        "0.5 on both straight windows and below in the turn",
+        lambda q: dominance_verdict([q.before, q.after], q.turn),
+    ),
+    Statement(
+        "Straight legs",
+        "What does the IMM cost where nothing happens?",
+        "{straight}",
+        "{r.episodes} episodes, IMM against the adaptive filter without re-arming, paired",
+    ),
+    Statement(
+        "Detection",
+        "Would earlier detection help the adaptive filter?",
+        "whole-run position RMS when the detection is forced at scan {forced}: its ramp runs out before "
+        "the turn is over if it begins early. The detector's first alarm comes at scan {detected} (share of "
+        "episodes without an alarm before); false alarms {false_alarms:.4f} per scan",
+        "exact for forced detection; {r.episodes} episodes for the detector",
+    ),
+    Statement(
+        "Figures' gains",
+        "How good are the gains 0.3 / 0.7 of the figures?",
+        "above the smallest whole-run RMS of the grid: position {excess[0]:+.1%}, velocity {excess[1]:+.1%}",
+        "{r.grid_episodes} episodes a cell, paired",
+    ),
+    Statement(
+        "Single gain",
+        "Does the IMM beat one fixed gain over the whole run?",
+        "IMM {imm[0]} / {imm[1]}; best fixed gain 0.65 {fixed[0]:.1f} / {fixed[1]:.2f} (m / m/s)",
+        "{r.episodes} episodes; fixed gain exact",
+    ),
+    Statement(
+        "Quiet gains",
+        "Which gains are best on the straight leg before the turn?",
+        "{quiet}",
+        f"{{r.grid_episodes}} episodes a cell, scans {WINDOWS['pre'][0]}-{WINDOWS['pre'][1]}",
+    ),
+    Statement(
+        "C2 in other readings",
+        "Which covariance stands in the likelihood? The paper's claim C2 under the other readings:",
+        "{readings}",
+        "plain filters on the same measurements, {r.grid_episodes} episodes a cell, rule of C2",
+    ),
+    Statement(
+        "C1 in other readings",
+        "Does the verdict on C1 depend on what the paper leaves open?",
+        "{others}",
+        "the rule of C1 for every row of the table of comparisons",
+    ),
+)
+"""The paper's claims, and what it does not mention."""
+
+
+def quantities(r: Results) -> dict[str, Any]:
+    """What the claims rest on."""
+    comparison = comparisons(r)
+    imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
+    best = findings(r, "gains used", WINDOWS["all"])
     probability = r.main["imm"].probability
     windows = {name: slice(first - 1, last) for name, (first, last) in WINDOWS.items()}
     before, turn, after = (mean(probability[:, windows[w]].mean(axis=1)) for w in ("pre", "turn", "post"))
-    return [
-        *(
-            Claim(
-                f"C1{suffix}", f"{statement}{more}.", _changes(comparison[key]), rule, comparison[key].verdict
-            )
-            for suffix, more, key in rows
+    begins = SECTION[0]
+    alarms = ramps_begun(r.main["adaptive"].alpha, 0.7)
+    row, column = LOW_GAINS.index(0.3), HIGH_GAINS.index(0.7)
+    return {
+        "r": r,
+        "against": [comparison[name] for _, _, name in AGAINST],
+        "best": best,
+        "best_text": _grid_text(best),
+        "before": before,
+        "turn": turn,
+        "after": after,
+        "handover": _handover(probability.mean(axis=0)),
+        "straight": _straight(imm, adaptive),
+        "forced": ", ".join(
+            f"{k}: {rms(squares, WINDOWS['all'])[0, 0]:.1f} m"
+            for k, squares in r.forced.items()
+            if k < begins + 5
         ),
-        Claim(
-            "C2",
-            f"The smallest RMSE is at alpha_1 = {LOW_BOX[0]:g}..{LOW_BOX[1]:g}, "
-            f"alpha_2 = {HIGH_BOX[0]:g}..{HIGH_BOX[1]:g}.",
-            _grid_text(found),
-            f"{r.grid_episodes} episodes in each of {len(LOW_GAINS)} x {len(HIGH_GAINS)} cells, common noise, RMS "
-            f"along x over all scans; reproduced if the minimum is in the box in {100 * CERTAIN:.0f} % of bootstrap "
-            f"samples and every cell within {100 * NEAR_MINIMUM:.0f} % of it too, for position and velocity. "
-            "The box is half of the grid",
-            box_verdict(found),
-        ),
-        Claim(
-            "C3",
-            "Mode 1 dominates on the straight legs, mode 2 during the turn.",
-            f"mean probability of mode 1: {before:.4f} before the turn, {turn:.4f} in it, {after:.4f} after it; "
-            f"{_handover(probability.mean(axis=0))}",
-            f"{r.episodes} episodes, mean over the windows; reproduced if certainly above "
-            "0.5 on both straight windows and below in the turn",
-            dominance_verdict([before, after], turn),
-        ),
-        *_silent(r, comparison),
-    ]
-
-
-def _changes(comparison: Comparison) -> str:
-    names = (f"scans {SPAN}", "turn", "recovery", "peak")
-    return "; ".join(
-        f"{name}: position {position:+.1%}, velocity {velocity:+.1%}"
-        for name, (position, velocity) in zip(names, comparison, strict=True)
-    )
+        "detected": _detected(alarms, begins),
+        "false_alarms": alarms[:, 8 : begins - 1].mean(),
+        "excess": [
+            measured(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
+            for errors in grid_errors(r.grids["gains used"], WINDOWS["all"])
+        ],
+        "imm": pair(imm, WINDOWS["all"]),
+        "fixed": rms(r.exact["fixed gain 0.65"], WINDOWS["all"])[0],
+        "quiet": _grid_text(findings(r, "gains used", WINDOWS["pre"])),
+        "readings": _readings(r),
+        "others": _others(comparison),
+    }
 
 
 def _grid_text(found: Sequence[GridFinding]) -> str:
@@ -274,9 +359,8 @@ def _handover(mean: numpy.ndarray) -> str:
     )
 
 
-def _silent(r: Results, comparison: Mapping[str, Comparison]) -> list[Claim]:
-    """What the paper does not mention."""
-    imm, adaptive = r.main["imm"].squares, r.main["adaptive"].squares
+def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
+    """RMS on both straight legs, IMM against adaptive filter."""
     straight = []
     for window in (WINDOWS["pre"], WINDOWS["post"]):
         rows = zip(pair(imm, window), pair(adaptive, window), changes(imm, adaptive, window), strict=True)
@@ -285,82 +369,36 @@ def _silent(r: Results, comparison: Mapping[str, Comparison]) -> list[Claim]:
             for (ours, theirs, change), (name, unit) in zip(rows, COMPONENTS, strict=True)
         ]
         straight.append(f"scans {window[0]}-{window[1]}: " + ", ".join(parts))
-    begins = SECTION[0]
-    forced = ", ".join(
-        f"{k}: {rms(squares, WINDOWS['all'])[0, 0]:.1f} m"
-        for k, squares in r.forced.items()
-        if k < begins + 5
-    )
-    alarms = ramps_begun(r.main["adaptive"].alpha, 0.7)
+    return "; ".join(straight)
+
+
+def _detected(alarms: numpy.ndarray, begins: int) -> str:
+    """Share of episodes by the scan of their first alarm, of those without one before the turn begins."""
     later = alarms[:, begins - 1 :][~alarms[:, : begins - 1].any(axis=1)]
     detected = numpy.where(later.any(axis=1), later.argmax(axis=1) + begins, 0)
-    shares = ", ".join(f"{k}: {(detected == k).mean():.3f}" for k in range(begins, begins + 4))
-    row, column = LOW_GAINS.index(0.3), HIGH_GAINS.index(0.7)
-    excess = [
-        measured(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
-        for errors in grid_errors(r.grids["gains used"], WINDOWS["all"])
-    ]
-    readings = "; ".join(
+    return ", ".join(f"{k}: {(detected == k).mean():.3f}" for k in range(begins, begins + 4))
+
+
+def _readings(r: Results) -> str:
+    """Verdict on C2 and the best gains under the other readings of the covariance."""
+    return "; ".join(
         f"{LIKELIHOODS[kind]}: {box_verdict(found)} (position minimum at {found[0].gains[0]:g} / "
         f"{found[0].gains[1]:g}, box {found[0].inside_excess:+.1%} above it; velocity at {found[1].gains[0]:g} / "
         f"{found[1].gains[1]:g})"
         for kind in list(LIKELIHOODS)[1:]
         for found in [findings(r, kind, WINDOWS["all"])]
     )
+
+
+def _others(comparison: Mapping[str, Comparison]) -> str:
+    """Experiments by their verdict on C1, against each adaptive filter."""
     others: dict[tuple[str, Verdict], list[str]] = {}
     for name, change in comparison.items():
         experiment, _, opponent = name.partition("; against ")
         others.setdefault((opponent, change.verdict), []).append(experiment)
-    fixed = rms(r.exact["fixed gain 0.65"], WINDOWS["all"])[0]
-    return [
-        Claim(
-            "Straight legs",
-            "What does the IMM cost where nothing happens?",
-            "; ".join(straight),
-            f"{r.episodes} episodes, IMM against the adaptive filter without re-arming, paired",
-        ),
-        Claim(
-            "Detection",
-            "Would earlier detection help the adaptive filter?",
-            f"whole-run position RMS when the detection is forced at scan {forced}: its ramp runs out before "
-            f"the turn is over if it begins early. The detector's first alarm comes at scan {shares} (share of "
-            f"episodes without an alarm before); false alarms {alarms[:, 8 : begins - 1].mean():.4f} per scan",
-            f"exact for forced detection; {r.episodes} episodes for the detector",
-        ),
-        Claim(
-            "Figures' gains",
-            "How good are the gains 0.3 / 0.7 of the figures?",
-            f"above the smallest whole-run RMS of the grid: position {excess[0]:+.1%}, velocity {excess[1]:+.1%}",
-            f"{r.grid_episodes} episodes a cell, paired",
-        ),
-        Claim(
-            "Single gain",
-            "Does the IMM beat one fixed gain over the whole run?",
-            f"IMM {' / '.join(pair(imm, WINDOWS['all']))}; best fixed gain 0.65 {fixed[0]:.1f} / {fixed[1]:.2f} "
-            "(m / m/s)",
-            f"{r.episodes} episodes; fixed gain exact",
-        ),
-        Claim(
-            "Quiet gains",
-            "Which gains are best on the straight leg before the turn?",
-            _grid_text(findings(r, "gains used", WINDOWS["pre"])),
-            f"{r.grid_episodes} episodes a cell, scans {WINDOWS['pre'][0]}-{WINDOWS['pre'][1]}",
-        ),
-        Claim(
-            "C2 in other readings",
-            "Which covariance stands in the likelihood? The paper's claim C2 under the other readings:",
-            readings,
-            f"plain filters on the same measurements, {r.grid_episodes} episodes a cell, rule of C2",
-        ),
-        Claim(
-            "C1 in other readings",
-            "Does the verdict on C1 depend on what the paper leaves open?",
-            ". ".join(
-                f"Against {who}, {verdict}: {'; '.join(names)}" for (who, verdict), names in others.items()
-            ),
-            "the rule of C1 for every row of the table of comparisons",
-        ),
-    ]
+    return ". ".join(
+        f"Against {who}, {verdict}: {'; '.join(names)}" for (who, verdict), names in others.items()
+    )
 
 
 # --- tables

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -10,7 +10,7 @@ from ...baselines.radar_esm_tracking.metrics import SURE
 from ...filters import class_fusion
 from ..grid import Grid
 from ..measured import Measured, means, measured
-from ..reproduction import Claim, Verdict, verdict_of
+from ..reproduction import Statement, Verdict, verdict_if, verdict_of
 from .experiment import (
     CLASSES,
     COMPONENTS,
@@ -36,6 +36,17 @@ SECONDS = (2, 5, 10, 20, 30, 60)
 def recognition_verdict(at_30: Sequence[Measured]) -> Verdict:
     """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNISED`` in all classes, some, or none."""
     return verdict_of(m.low >= RECOGNISED for m in at_30)
+
+
+def approach_verdict(excess: Sequence[Sequence[Measured]]) -> Verdict:
+    """Verdict on D2: the error is within ``CLOSE`` of the ideal filter's, late in all classes, or sooner in some.
+
+    Args:
+        excess: relative excess of the RMSE of each class, at 10-30 s and after 30 s.
+    """
+    if all(abs(late.value) < CLOSE for _, late in excess):
+        return "reproduced"
+    return "reproduced in part" if any(soon.value < CLOSE for soon, _ in excess) else "not reproduced"
 
 
 class Variant(NamedTuple):
@@ -75,130 +86,149 @@ def _seconds(time: float) -> str:
     return f"{time:g}" if math.isfinite(time) else "later than 60"
 
 
-def claims(r: Results) -> list[Claim]:
-    """The paper's claims and what it does not mention, with what was measured."""
+EACH = "{r.episodes} targets of each class"
+ANY = "{r.episodes} targets of any class"
+CLAIMS = (
+    Statement(
+        "D1",
+        "The class is recognised correctly within a limited time (figure 1).",
+        "{recognition}",
+        f"{EACH}, types drawn anew for every decision; all classes reach a mean of {RECOGNISED} at 30 s",
+        lambda q: recognition_verdict(q.at_30),
+    ),
+    Statement(
+        "D1, one type for each target",
+        "The same for targets that keep their emitter type, as real ones do.",
+        "sure of a wrong class at 60 s in {wrong[0]:.1%} of all runs, in {wrong[1]:.1%} of those with an ordinary "
+        "fighter of class S2; the joint posterior of type and class: {joint[0]:.1%} and {joint[1]:.1%}",
+        f"{ANY}, P >= {SURE} for a wrong class; more than {RARE:.0%} of the runs refutes the claim",
+        lambda q: verdict_if(not q.wrong[0].low > RARE),
+    ),
+    Statement(
+        "D2",
+        "With time the accuracy approaches that of the ideal filter (figures 2-4).",
+        "RMSE of the acceleration above the ideal filter's: {above_ideal}",
+        f"{EACH} against the exact error of the ideal filter; within {CLOSE:.0%} after 30 s for all classes "
+        "(already after 10 s: {close_soon})",
+        lambda q: approach_verdict(q.excess),
+    ),
+    Statement(
+        "D3",
+        "The advantage over the non-adaptive filter is largest for the acceleration.",
+        "RMSE non-adaptive / adaptive at 30-60 s, range, range rate, acceleration: {advantage}. By the filters' own "
+        "deviations for S0: {own}",
+        f"{EACH}; the non-adaptive filter (S2) is exact",
+        lambda q: verdict_if(all(g[2].low > max(g[0].high, g[1].high) for g in q.gains)),
+    ),
+    Statement(
+        "D4",
+        "Accuracy improves for S0 and S1, and targets of all classes are tracked without interruption.",
+        "improved by more than 1 % in both classes: {better}; not: {same}. Largest range error in {all_runs} runs: "
+        "{worst:.1f} sigma of one measurement: no track is lost",
+        f"{EACH}, 30-60 s",
+        lambda q: verdict_of(q.improved),
+    ),
+    Statement(
+        "S2 pays",
+        "What does adaptation cost where the non-adaptive filter is the right one?",
+        "RMSE of the adaptive filter above the non-adaptive one's on S2: range rate {price[0]:+.1%}, acceleration "
+        "{price[1]:+.1%} (0.5-10 s); acceleration {price[2]:+.1%} (10-30 s)",
+        "{r.episodes} targets of S2",
+    ),
+    Statement(
+        "Who recognises",
+        "How much of the recognition is the radar's, how much the ESM's?",
+        "{sensors}",
+        "medians; {r.small} targets of each class for one sensor alone",
+    ),
+    Statement(
+        "Refused decisions",
+        "The gate (6) refuses a tenth of the decisions about the one target. What are they worth?",
+        "using them changes the mean cost by {ungated:+.2%}: with one emitter in sight the gate only throws evidence "
+        "away",
+        f"{ANY}, paired",
+    ),
+    Statement(
+        "Calibration",
+        "Is the algorithm exactly Bayesian under its own assumptions?",
+        "mean square error over mean reported variance, range, range rate, acceleration: {calibration}",
+        f"{ANY}; 1 is exact",
+    ),
+    Statement(
+        "Open constants",
+        "Do the claims depend on what the paper leaves open?",
+        "gain in acceleration on S0, main experiment: {main.gain:.2f}. It needs different manoeuvre noise in the "
+        "classes: with one sigma_a for all it is {common.gain:.2f}, and the radar alone reaches P >= 0.9 in "
+        "{common_sure:.1f} % of the S0 runs. The alphas in reverse order leave the claims standing with a "
+        "smaller gain, {order.gain:.2f}; noise on the acceleration only hardly matters, {noise.gain:.2f}; without "
+        "Doppler the gain is {no_doppler.gain:.2f}, with 1 % class leakage {leak.gain:.2f}",
+        "{r.small} targets of any class for each row of the table of variants",
+    ),
+)
+"""The paper's claims and what it does not mention."""
+
+
+def quantities(r: Results) -> dict[str, Any]:
+    """What the claims rest on."""
     early, middle, _ = WINDOWS.values()
-    counts = f"{r.episodes} targets of each class"
-    at_30 = [run.true_at(30) for run in r.fused]
     printed, joint = r.fixed_type["quasi-optimal"], r.fixed_type["joint-type"]
-    wrong = printed.sure_and_wrong()
     fighter = (printed.true_class == 2) & (printed.true_type == 1)
-    close = [[r.excess(s, 2, window) for window in (middle, LATE)] for s in range(3)]
-    near_late = all(abs(late.value) < CLOSE for _, late in close)
-    near_middle = [name for name, (soon, _) in zip(CLASSES, close, strict=True) if soon.value < CLOSE]
+    at_30 = [run.true_at(30) for run in r.fused]
+    excess = [[r.excess(s, 2, window) for window in (middle, LATE)] for s in range(3)]
     gains = [[r.gain(s, c, LATE) for c in range(3)] for s in (0, 1)]
     improved = [all(gain[c].low > 1.01 for gain in gains) for c in range(3)]
     better, same = (
         ", ".join(n for (n, _), i in zip(COMPONENTS, improved, strict=True) if i == x) for x in (True, False)
     )
-    own = ", ".join(f"{math.sqrt(r.own[c, 2, -1] / r.own[c, 0, -1]):.2f}" for c in range(3))
     worst = max(float(numpy.abs(run.error[..., 0]).max()) for run in r.fused)
     gated, ungated = r.every_decision
-    return [
-        Claim(
-            "D1",
-            "The class is recognised correctly within a limited time (figure 1).",
-            "; ".join(
-                f"{name}: mean P(true class) {run.true_at(10):.3f} at 10 s and {late:.3f} at 30 s, P >= 0.9 first "
-                f"after {run.recognition(0.5):g} s (median), 90 % by {run.recognition(0.9):g} s"
-                for name, run, late in zip(CLASSES, r.fused, at_30, strict=True)
-            ),
-            f"{counts}, types drawn anew for every decision; all classes reach a mean of {RECOGNISED} at 30 s",
-            recognition_verdict(at_30),
-        ),
-        Claim(
-            "D1, one type for each target",
-            "The same for targets that keep their emitter type, as real ones do.",
-            f"sure of a wrong class at 60 s in {wrong:.1%} of all runs, in {printed.sure_and_wrong(fighter):.1%} of "
-            f"those with an ordinary fighter of class S2; the joint posterior of type and class: "
-            f"{joint.sure_and_wrong():.1%} and {joint.sure_and_wrong(fighter):.1%}",
-            f"{r.episodes} targets of any class, P >= {SURE} for a wrong class; more than {RARE:.0%} of the runs "
-            "refutes the claim",
-            "not reproduced" if wrong.low > RARE else "reproduced",
-        ),
-        Claim(
-            "D2",
-            "With time the accuracy approaches that of the ideal filter (figures 2-4).",
-            "RMSE of the acceleration above the ideal filter's: "
-            + "; ".join(
-                f"{name} {soon:+.1%} (10-30 s), {late:+.1%} (30-60 s)"
-                for name, (soon, late) in zip(CLASSES, close, strict=True)
-            ),
-            f"{counts} against the exact error of the ideal filter; within {CLOSE:.0%} after 30 s for all classes "
-            f"(already after 10 s: {', '.join(near_middle) or 'none'})",
-            "reproduced" if near_late else "reproduced in part" if near_middle else "not reproduced",
-        ),
-        Claim(
-            "D3",
-            "The advantage over the non-adaptive filter is largest for the acceleration.",
-            "RMSE non-adaptive / adaptive at 30-60 s, range, range rate, acceleration: "
-            + "; ".join(f"{CLASSES[s]} {', '.join(f'{g:.2f}' for g in gain)}" for s, gain in enumerate(gains))
-            + f". By the filters' own deviations for S0: {own}",
-            f"{counts}; the non-adaptive filter (S2) is exact",
-            "reproduced" if all(g[2].low > max(g[0].high, g[1].high) for g in gains) else "not reproduced",
-        ),
-        Claim(
-            "D4",
-            "Accuracy improves for S0 and S1, and targets of all classes are tracked without interruption.",
-            f"improved by more than 1 % in both classes: {better or 'nothing'}; not: {same or 'nothing'}. Largest "
-            f"range error in {3 * r.episodes} runs: {worst / parameters().range_sigma:.1f} sigma of one measurement: "
-            "no track is lost",
-            f"{counts}, 30-60 s",
-            verdict_of(improved),
-        ),
-        Claim(
-            "S2 pays",
-            "What does adaptation cost where the non-adaptive filter is the right one?",
-            "RMSE of the adaptive filter above the non-adaptive one's on S2: range rate "
-            f"{r.excess(2, 1, early):+.1%}, acceleration {r.excess(2, 2, early):+.1%} (0.5-10 s); acceleration "
-            f"{r.excess(2, 2, middle):+.1%} (10-30 s)",
-            f"{r.episodes} targets of S2",
-        ),
-        Claim(
-            "Who recognises",
-            "How much of the recognition is the radar's, how much the ESM's?",
-            "; ".join(
-                f"{name}: first P >= 0.9 after {_seconds(fused.recognition(0.5))} s together, "
-                f"{_seconds(radar.recognition(0.5))} s by radar alone, {_seconds(esm.recognition(0.5))} s by ESM alone"
-                for name, fused, radar, esm in zip(CLASSES, r.fused, r.radar, r.esm, strict=True)
-            ),
-            f"medians; {r.small} targets of each class for one sensor alone",
-        ),
-        Claim(
-            "Refused decisions",
-            "The gate (6) refuses a tenth of the decisions about the one target. What are they worth?",
-            f"using them changes the mean cost by {measured(means(ungated.cost) / means(gated.cost) - 1.0):+.2%}: with "
-            "one emitter in sight the gate only throws evidence away",
-            f"{r.episodes} targets of any class, paired",
-        ),
-        Claim(
-            "Calibration",
-            "Is the algorithm exactly Bayesian under its own assumptions?",
-            "mean square error over mean reported variance, range, range rate, acceleration: "
-            + "; ".join(
-                f"{name} {', '.join(f'{m:.3f}' for m in gated.calibration(window))}"
-                for name, window in WINDOWS.items()
-            ),
-            f"{r.episodes} targets of any class; 1 is exact",
-        ),
-        Claim(
-            "Open constants",
-            "Do the claims depend on what the paper leaves open?",
-            _sensitivity(r),
-            f"{r.small} targets of any class for each row of the table of variants",
-        ),
-    ]
-
-
-def _sensitivity(r: Results) -> str:
     main, _, _, common, order, noise, _, no_doppler, leak, _ = (variant(r, name, 0) for name in VARIANTS)
-    return (
-        f"gain in acceleration on S0, main experiment: {main.gain:.2f}. It needs different manoeuvre noise in the "
-        f"classes: with one sigma_a for all it is {common.gain:.2f}, and the radar alone reaches P >= 0.9 in "
-        f"{100 * common.radar_sure:.1f} % of the S0 runs. The alphas in reverse order leave the claims standing with a "
-        f"smaller gain, {order.gain:.2f}; noise on the acceleration only hardly matters, {noise.gain:.2f}; without "
-        f"Doppler the gain is {no_doppler.gain:.2f}, with 1 % class leakage {leak.gain:.2f}"
-    )
+    return {
+        "r": r,
+        "at_30": at_30,
+        "recognition": "; ".join(
+            f"{name}: mean P(true class) {run.true_at(10):.3f} at 10 s and {late:.3f} at 30 s, P >= 0.9 first "
+            f"after {run.recognition(0.5):g} s (median), 90 % by {run.recognition(0.9):g} s"
+            for name, run, late in zip(CLASSES, r.fused, at_30, strict=True)
+        ),
+        "wrong": (printed.sure_and_wrong(), printed.sure_and_wrong(fighter)),
+        "joint": (joint.sure_and_wrong(), joint.sure_and_wrong(fighter)),
+        "excess": excess,
+        "above_ideal": "; ".join(
+            f"{name} {soon:+.1%} (10-30 s), {late:+.1%} (30-60 s)"
+            for name, (soon, late) in zip(CLASSES, excess, strict=True)
+        ),
+        "close_soon": ", ".join(n for n, (soon, _) in zip(CLASSES, excess, strict=True) if soon.value < CLOSE)
+        or "none",
+        "gains": gains,
+        "advantage": "; ".join(
+            f"{CLASSES[s]} {', '.join(f'{g:.2f}' for g in gain)}" for s, gain in enumerate(gains)
+        ),
+        "own": ", ".join(f"{math.sqrt(r.own[c, 2, -1] / r.own[c, 0, -1]):.2f}" for c in range(3)),
+        "improved": improved,
+        "better": better or "nothing",
+        "same": same or "nothing",
+        "all_runs": 3 * r.episodes,
+        "worst": worst / parameters().range_sigma,
+        "price": (r.excess(2, 1, early), r.excess(2, 2, early), r.excess(2, 2, middle)),
+        "sensors": "; ".join(
+            f"{name}: first P >= 0.9 after {_seconds(fused.recognition(0.5))} s together, "
+            f"{_seconds(radar.recognition(0.5))} s by radar alone, {_seconds(esm.recognition(0.5))} s by ESM alone"
+            for name, fused, radar, esm in zip(CLASSES, r.fused, r.radar, r.esm, strict=True)
+        ),
+        "ungated": measured(means(ungated.cost) / means(gated.cost) - 1.0),
+        "calibration": "; ".join(
+            f"{name} {', '.join(f'{m:.3f}' for m in gated.calibration(window))}"
+            for name, window in WINDOWS.items()
+        ),
+        "main": main,
+        "common": common,
+        "common_sure": 100 * common.radar_sure,
+        "order": order,
+        "noise": noise,
+        "no_doppler": no_doppler,
+        "leak": leak,
+    }
 
 
 # --- tables

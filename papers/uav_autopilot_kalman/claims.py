@@ -1,6 +1,8 @@
 """The paper's claims and what it does not mention, with verdicts, and the tables of the report."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy
 
@@ -8,7 +10,7 @@ from ...baselines.uav_autopilot.theory import stationary
 from ...filters import linear_systems
 from ..grid import Grid
 from ..measured import means, measured
-from ..reproduction import Claim
+from ..reproduction import Statement
 from .experiment import (
     AFTER_STEP,
     CASES,
@@ -33,96 +35,118 @@ def _excess(datasets: dict) -> str:
     return f"{measured(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
 
 
-def claims(r: Results) -> list[Claim]:
-    """The paper's claims, and what it does not mention."""
-    P, U = r.noise["P, H = I"]["kalman"], r.noise["U"]["kalman"]
-    raw = (r.noise["P, H = I"]["raw-sensors"], r.noise["U"]["raw-sensors"])
-    steps = (r.step["P, H = I"], r.step["U"])
+CLAIMS = (
+    Statement(
+        "1",
+        "The model works correctly even with strongly noisy signals.",
+        "P: noise 0 dB at node 2 is {P.decibel:.1f} dB weaker at node 3 (U: {U.decibel:.1f} dB). Mean output "
+        "after a unit step: P {after_step[0]}, U {after_step[1]}. NEES per coordinate {nees[0]} and {nees[1]}.",
+        f"{{r.episodes}} runs of {HORIZON} measurements, burn-in 200 (300 after the step)",
+        "reproduced",
+    ),
+    Statement(
+        "2",
+        "If A - BL is asymptotically stable, the loop with the filter is too (separation).",
+        "largest distance of a pole of the loop from the union of the separate designs: {defects}",
+        "eigenvalues of the loop written in state and estimate, matched with those of F - BL and (I - KH)F",
+        "reproduced",
+    ),
+    Statement(
+        "3",
+        "The correcting term of the Riccati equation limits the growth of the covariance.",
+        "U, sigma of pitch in 2 min: {settled:.3f} deg with all sensors, {alone:.1f} deg without "
+        "measurements; but {blind:.1f} deg, growing, when no sensor detects pitch. With gusts as the only "
+        "noise the covariance stays bounded, but the gain on the pitch integrator, which gusts do not reach, falls "
+        "as 1/t and the filter goes to sleep: {asleep[0]:.1e} after 12 s, {asleep[1]:.1e} after 2 min.",
+        "recursion (12); the condition is detectability, and for a steady filter that is stable also noise on "
+        "every integrating mode",
+        "reproduced in part",
+    ),
+    Statement(
+        "4",
+        "The model serves to study white and coloured noise, stability, convergence of the filter.",
+        "node 4 is white: spectral flatness {flat}; the spectra of all nodes follow the transfer "
+        "functions of the loop (figures)",
+        "periodograms averaged over runs; flatness of an average over M runs of white noise is about 1 - 1/(2M) = "
+        "{white_flatness:.4f}",
+        "reproduced",
+    ),
+    Statement(
+        "5",
+        "Command: equations (6), (10) print none.",
+        "taken literally a unit command settles at {literal[0]:.3f} (P) and {literal[1]:.3f} (U) in place of 1; with "
+        "the command in the prediction overshoot and settling are {overshoot[0]:.2f} %, {settling[0]:.2f} s (P), "
+        "{overshoot[1]:.2f} %, {settling[1]:.2f} s (U)",
+        "fixed point of the loop; response as difference of runs with and without step on the same noise",
+    ),
+    Statement(
+        "6",
+        "What is the filter worth to the loop?",
+        "cost with raw sensors over cost with the filter: P {cost[0]:.1f}, U {cost[1]:.1f}. The output itself "
+        "gains less: its variance is {variance[0]:.2f} (P) and {variance[1]:.2f} (U) times as large without it. With "
+        "position alone and no filter the loop is unstable (P).",
+        "{r.episodes} runs, same noise",
+    ),
+    Statement(
+        "7",
+        "How wrong may the filter's process noise be?",
+        "cost of the loop above the optimum with Q times 0.01 / 100: P {above[0][0]} / {above[0][2]}, U "
+        "{above[1][0]} / {above[1][2]}. Smallest cost is not smallest output variance: U with Q times 100 has "
+        "{loose[1]:.4f} deg² against {tuned[1]:.4f}, for {control:.1f} times the control variance.",
+        "Lyapunov equation of the loop with the mistuned steady filter",
+    ),
+    Statement(
+        "8",
+        "What happens when the noise is not constant and not known, as the paper assumes?",
+        "cost of the paper's filter above that of the filter told the noise: {excess}",
+        "scenario random, {r.episodes} episodes, same noise; a consistent filter has NEES 1 per coordinate",
+    ),
+)
+"""The paper's claims, and what it does not mention; of pairs the first is of plant P."""
+
+
+def quantities(r: Results) -> dict[str, Any]:
+    """What the claims rest on."""
+    plants = ("P, H = I", "U")
+    ours = P, U = [r.noise[plant]["kalman"] for plant in plants]
+    raw = [r.noise[plant]["raw-sensors"] for plant in plants]
     defects, flat = [], []
     for case, loops in r.noise.items():
         F, B, H, L, K, _, _ = matrices(loops["kalman"].task)
         defects.append(f"{case}: {linear_systems.separation_defect(F, B, H, L, K):.0e}")
         flat.append(f"{case} {flatness(loops['kalman'].innovation[:, SETTLED]):.3f}")
     settled, alone, blind, gusts = covariance_curves(U.task).values()
-    theory = [[loop_theory(s.task, scale) for scale in SCALES] for s in (P, U)]
-    percent = [[f"{100 * (t[0] / plant[1][0] - 1):.0f} %" for t in plant] for plant in theory]
-    after = [settles_without_command(s.task) for s in (P, U)]
-    (over_p, _, settling_p), (over_u, _, settling_u) = r.transient("P, H = I"), r.transient("U")
-    cost = [a.cost[:, SETTLED].mean() / b.cost[:, SETTLED].mean() for a, b in zip(raw, (P, U), strict=True)]
-    squares = [[float(numpy.mean(s.output[:, SETTLED] ** 2)) for s in both] for both in (raw, (P, U))]
-    return [
-        Claim(
-            "1",
-            "The model works correctly even with strongly noisy signals.",
-            f"P: noise 0 dB at node 2 is {P.decibel:.1f} dB weaker at node 3 (U: {U.decibel:.1f} dB). Mean output "
-            f"after a unit step: P {steps[0].text('output', 3, AFTER_STEP)}, U "
-            f"{steps[1].text('output', 3, AFTER_STEP)}. NEES per coordinate {P.text('nees', 3)} and "
-            f"{U.text('nees', 3)}.",
-            f"{r.episodes} runs of {HORIZON} measurements, burn-in 200 (300 after the step)",
-            "reproduced",
-        ),
-        Claim(
-            "2",
-            "If A - BL is asymptotically stable, the loop with the filter is too (separation).",
-            "largest distance of a pole of the loop from the union of the separate designs: "
-            + ", ".join(defects),
-            "eigenvalues of the loop written in state and estimate, matched with those of F - BL and (I - KH)F",
-            "reproduced",
-        ),
-        Claim(
-            "3",
-            "The correcting term of the Riccati equation limits the growth of the covariance.",
-            f"U, sigma of pitch in 2 min: {settled[0, -1]:.3f} deg with all sensors, {alone[0, -1]:.1f} deg without "
-            f"measurements; but {blind[0, -1]:.1f} deg, growing, when no sensor detects pitch. With gusts as the only "
-            "noise the covariance stays bounded, but the gain on the pitch integrator, which gusts do not reach, falls "
-            f"as 1/t and the filter goes to sleep: {gusts[1, 599]:.1e} after 12 s, {gusts[1, -1]:.1e} after 2 min.",
-            "recursion (12); the condition is detectability, and for a steady filter that is stable also noise on "
-            "every integrating mode",
-            "reproduced in part",
-        ),
-        Claim(
-            "4",
-            "The model serves to study white and coloured noise, stability, convergence of the filter.",
-            f"node 4 is white: spectral flatness {', '.join(flat)}; the spectra of all nodes follow the transfer "
-            "functions of the loop (figures)",
-            "periodograms averaged over runs; flatness of an average over M runs of white noise is about 1 - 1/(2M) = "
-            f"{1 - 0.5 / r.episodes:.4f}",
-            "reproduced",
-        ),
-        Claim(
-            "5",
-            "Command: equations (6), (10) print none.",
-            f"taken literally a unit command settles at {after[0]:.3f} (P) and {after[1]:.3f} (U) in place of 1; with "
-            f"the command in the prediction overshoot and settling are {100 * over_p:.2f} %, {settling_p:.2f} s (P), "
-            f"{100 * over_u:.2f} %, {settling_u:.2f} s (U)",
-            "fixed point of the loop; response as difference of runs with and without step on the same noise",
-        ),
-        Claim(
-            "6",
-            "What is the filter worth to the loop?",
-            f"cost with raw sensors over cost with the filter: P {cost[0]:.1f}, U {cost[1]:.1f}. The output itself "
-            f"gains less: its variance is {squares[0][0] / squares[1][0]:.2f} (P) and "
-            f"{squares[0][1] / squares[1][1]:.2f} (U) times as large without it. With position alone and no filter the "
-            "loop is unstable (P).",
-            f"{r.episodes} runs, same noise",
-        ),
-        Claim(
-            "7",
-            "How wrong may the filter's process noise be?",
-            f"cost of the loop above the optimum with Q times 0.01 / 100: P {percent[0][0]} / {percent[0][2]}, U "
-            f"{percent[1][0]} / {percent[1][2]}. Smallest cost is not smallest output variance: U with Q times 100 has "
-            f"{theory[1][2][1]:.4f} deg² against {theory[1][1][1]:.4f}, for {theory[1][2][2] / theory[1][1][2]:.1f} "
-            "times the control variance.",
-            "Lyapunov equation of the loop with the mistuned steady filter",
-        ),
-        Claim(
-            "8",
-            "What happens when the noise is not constant and not known, as the paper assumes?",
-            "cost of the paper's filter above that of the filter told the noise: "
-            + "; ".join(f"{plant}: {_excess(datasets)}" for plant, datasets in r.random.items()),
-            f"scenario random, {r.episodes} episodes, same noise; a consistent filter has NEES 1 per coordinate",
-        ),
-    ]
+    theory = [[loop_theory(s.task, scale) for scale in SCALES] for s in ours]
+    transients = [r.transient(plant) for plant in plants]
+
+    def mean_ratio(values: Callable[[Any], numpy.ndarray]) -> list[float]:
+        """Mean without the filter over that with it, of both plants."""
+        return [float(values(a).mean() / values(b).mean()) for a, b in zip(raw, ours, strict=True)]
+
+    return {
+        "r": r,
+        "P": P,
+        "U": U,
+        "after_step": [r.step[plant].text("output", 3, AFTER_STEP) for plant in plants],
+        "nees": [s.text("nees", 3) for s in ours],
+        "defects": ", ".join(defects),
+        "settled": settled[0, -1],
+        "alone": alone[0, -1],
+        "blind": blind[0, -1],
+        "asleep": (gusts[1, 599], gusts[1, -1]),
+        "flat": ", ".join(flat),
+        "white_flatness": 1 - 0.5 / r.episodes,
+        "literal": [settles_without_command(s.task) for s in ours],
+        "overshoot": [100 * over for over, _, _ in transients],
+        "settling": [settling for _, _, settling in transients],
+        "cost": mean_ratio(lambda s: s.cost[:, SETTLED]),
+        "variance": mean_ratio(lambda s: s.output[:, SETTLED] ** 2),
+        "above": [[f"{100 * (t[0] / plant[1][0] - 1):.0f} %" for t in plant] for plant in theory],
+        "tuned": theory[1][1],
+        "loose": theory[1][2],
+        "control": theory[1][2][2] / theory[1][1][2],
+        "excess": "; ".join(f"{plant}: {_excess(datasets)}" for plant, datasets in r.random.items()),
+    }
 
 
 def tables(r: Results) -> list[Grid]:

@@ -1,0 +1,116 @@
+"""Pictures of this project's own pages, as wide as a paper's columns."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy
+from filtergym.evaluation.looks import styles
+from filtergym.evaluation.print_layout import figure_with_axes, in_print, titled
+
+
+@in_print
+def draw_learning_curves(
+    curves: Mapping[str, Sequence[tuple[Sequence[float], Sequence[float]]]],
+    title: str,
+    paper: str,
+    *,
+    columns: int = 2,
+) -> Any:
+    """Cost of validations against the paper's algorithm over training, one line for each run.
+
+    Args:
+        curves: algorithm -> for each of its runs the environment steps, and the relative cost differences there.
+        title: of the figure.
+        paper: name of the paper's algorithm, whose line is at zero.
+        columns: of a paper, as wide as which it is.
+    """
+    figure, axes = figure_with_axes(columns=columns, height={1: 2.4, 2: 3.2}[columns])
+    axis = axes[0]
+    for (name, runs), style in zip(curves.items(), styles(list(curves)).values(), strict=True):
+        for i, (steps, differences) in enumerate(runs):
+            plural = "s" if len(runs) > 1 else ""
+            label = f"{name}, {len(runs)} run{plural}" if i == 0 else None
+            millions, percent = numpy.array(steps) / 1e6, 100.0 * numpy.array(differences)
+            axis.plot(millions, percent, label=label, **style | {"linewidth": 1.1})
+            best = percent.argmin()
+            axis.plot(millions[best], percent[best], "o", ms=4, color=style["color"])
+    axis.axhline(0.0, color="0.3", lw=1.0)
+    everything = numpy.concatenate([values for runs in curves.values() for _, values in runs])
+    if everything.max() > 1.0:
+        # An untrained agent can cost a hundred times as much; what is learned is told apart near zero.
+        axis.set_yscale("symlog", linthresh=10.0, linscale=1.5)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.set_ylim(bottom=min(1.2 * 100.0 * everything.min(), -2.0))
+    axis.set_xlim(left=0.0)
+    axis.set_xlabel("environment steps, millions")
+    axis.set_ylabel(f"validation cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4)
+    return titled(figure, title)
+
+
+@in_print
+def draw_differences(
+    differences: Mapping[str, Mapping[str, Sequence[float]]],
+    names: Sequence[str],
+    learned: Sequence[str],
+    unranked: Sequence[str],
+    title: str,
+    paper: str,
+    *,
+    columns: int = 2,
+) -> Any:
+    """Dots with intervals: cost of policies against the paper's algorithm, scenario by scenario.
+
+    Args:
+        differences: scenario -> policy -> difference in percent, lower and upper end of its interval.
+        names: policies in the order of the legend.
+        learned: those that are drawn as diamonds.
+        unranked: references, which are drawn as grey squares.
+        title: of the figure.
+        paper: name of the paper's algorithm, whose line is at zero.
+        columns: of a paper, as wide as which it is.
+    """
+    height = 0.8 + len(differences) * (0.25 + 0.07 * len(names))
+    figure, axes = figure_with_axes(columns=columns, height=height)
+    axis = axes[0]
+    gap = 0.8 / len(names)
+    ranked = styles([name for name in names if name not in unranked])
+    for i, name in enumerate(names):
+        colour = ranked[name]["color"] if name in ranked else "0.45"
+        marker = "s" if name not in ranked else "D" if name in learned else "o"
+        for row, found in enumerate(differences.values()):
+            if name not in found:
+                continue
+            value, low, high = found[name]
+            axis.errorbar(
+                value,
+                row + gap * (i - 0.5 * (len(names) - 1)),
+                xerr=[[max(value - low, 0.0)], [max(high - value, 0.0)]],
+                fmt=marker,
+                ms=4.5 if name in learned else 3.5,
+                color=colour,
+                markerfacecolor="white" if marker == "o" else colour,
+                elinewidth=1.2,
+                label=name if row == 0 else None,
+            )
+    for row in range(0, len(differences), 2):
+        axis.axhspan(row - 0.5, row + 0.5, color="0.95", zorder=0, lw=0)
+    axis.axvline(0.0, color="0.3", lw=1.0)
+    ends = [x for found in differences.values() for interval in found.values() for x in interval]
+    if ends and (max(ends) > 100.0 or min(ends) < -80.0):
+        # Logarithmic in the ratio of the costs: half and twice the paper's are as far from it.
+        ratio = (lambda x: numpy.log(numpy.maximum(1.0 + x / 100.0, 1e-9)), lambda y: 100.0 * numpy.expm1(y))
+        axis.set_xscale("function", functions=ratio)
+        low, high = max(1.0 + min(*ends, 0.0) / 100.0, 1e-6), 1.0 + max(*ends, 0.0) / 100.0
+        margin = (high / low) ** 0.04
+        axis.set_xlim(100.0 * (low / margin - 1.0), 100.0 * (high * margin - 1.0))
+        span = high / low
+        digits = (1, 1.5, 2, 3, 5, 7) if span < 10.0 else (1, 2, 5) if span < 200.0 else (1,)
+        ticks = [digit * 10.0**power for power in range(-6, 7) for digit in digits]
+        axis.set_xticks([100.0 * (x - 1.0) for x in ticks if low / margin <= x <= high * margin])
+        axis.xaxis.set_major_formatter("{x:.6g}")
+    axis.set_yticks(range(len(differences)), list(differences))
+    axis.set_ylim(len(differences) - 0.5, -0.5)
+    axis.set_xlabel(f"cost against {paper}, %")
+    axis.grid(alpha=0.25, lw=0.4, axis="x")
+    return titled(figure, title)
