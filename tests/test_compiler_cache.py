@@ -3,8 +3,13 @@
 import errno
 import hashlib
 import os
+import re
+import shutil
 import subprocess
 import sys
+import tempfile
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,8 +118,76 @@ def test_a_folder_that_cannot_be_written_is_no_trouble(place, loaded, call, monk
 
 def test_a_folder_that_cannot_be_read_is_no_trouble(place, loaded, monkeypatch):
     loaded()
-    monkeypatch.setattr("pathlib.Path.read_bytes", refuse)
+    monkeypatch.setattr("os.open", refuse)
     assert loaded() == 1
+
+
+SOMEBODY = 65534
+"""Another user."""
+posix = pytest.mark.skipif(os.name != "posix", reason="there are no owners")
+as_root = pytest.mark.skipif(
+    os.name != "posix" or os.getuid() != 0, reason="only root can act as another user"
+)
+
+
+def exchange(place, loaded):
+    """Put the code of another program in place of the small program's, with the right checksum."""
+    loaded()
+    [entry] = place.iterdir()
+    Function(lambda x: x * 7.0, Graph())(NUMBERS)
+    [other] = set(place.iterdir()) - {entry}
+    return other.replace(entry)
+
+
+def link(path):
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to(path.with_name("elsewhere"))
+
+
+@posix
+@pytest.mark.parametrize(
+    ("of_folder", "change", "reason"),
+    [
+        (True, lambda path: path.chmod(0o777), r"others may write to .* \(mode 777\)"),
+        (True, lambda path: path.chmod(0o770), r"others may write to .* \(mode 770\)"),
+        (False, lambda path: path.chmod(0o666), r"others may write to .* \(mode 666\)"),
+        (True, link, "the folder is a symbolic link"),
+        (False, link, None),
+        (False, lambda path: (path.unlink(), os.mkfifo(path)), None),
+        pytest.param(True, lambda path: os.chown(path, SOMEBODY, 0), "belongs to user 65534", marks=as_root),
+        pytest.param(False, lambda path: os.chown(path, SOMEBODY, 0), "belongs to user 65534", marks=as_root),
+    ],
+)
+def test_what_somebody_else_can_have_written_is_not_executed(place, loaded, of_folder, change, reason):
+    entry = exchange(place, loaded)
+    change(place if of_folder else entry)
+    with warnings.catch_warnings(record=True) as noted:
+        warnings.simplefilter("always")
+        assert [loaded(), loaded()] == [1, int(of_folder)]  # which checks what comes out
+    said = [str(warning.message) for warning in noted]
+    assert len(said) == (reason is not None)
+    assert all(re.search(reason, text) and str(place) in text and cache.SWITCH in text for text in said)
+
+
+@as_root
+def test_another_user_has_nothing_executed(loaded, monkeypatch):
+    with tempfile.TemporaryDirectory() as above:
+        os.chmod(above, 0o1777)
+        monkeypatch.setenv(cache.SWITCH, f"{above}/own")
+        name = exchange(Path(above, "own"), loaded).name
+        shutil.copyfile(Path(above, "own", name), Path(above, "code"))
+
+        def as_somebody(words):
+            told = {"user": SOMEBODY, "group": SOMEBODY, "extra_groups": [], "cwd": above}
+            return subprocess.run(words, shell=True, capture_output=True, check=False, **told).returncode
+
+        os.chmod(Path(above, "code"), 0o644)
+        assert as_somebody(f"cp code own/{name}") != 0
+        assert as_somebody(f"mkdir -m 777 his && cp code his/{name}") == 0
+        monkeypatch.setenv(cache.SWITCH, f"{above}/his")
+        with pytest.warns(UserWarning, match="belongs to user 65534"):
+            assert loaded() == 1
+        assert files(Path(above, "his")) == [name]
 
 
 def test_an_entry_that_cannot_be_touched_is_used(place, loaded, monkeypatch):
