@@ -20,7 +20,7 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
   test_command_line.py::test_evaluate_writes_tidy_records_and_figures)
 # What reads files beside the packages, so that an unpacked source distribution must hold them.
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
-  test_example_environment.py test_observation.py)
+  test_example_environment.py test_observation.py test_reproduction.py)
 # A link that leads nowhere, or a page that no other leads to, is an error.
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
