@@ -11,6 +11,7 @@ process or a machine is lost. joblib's backend for Ray is a pool of actors, and 
 
 import os
 import pickle
+import secrets
 import sys
 import threading
 import time
@@ -32,7 +33,11 @@ RETRIES = 10
 """How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
 GUESSED = 16
 """Processes that a cluster elsewhere is thought to have, where work is cut for it."""
-CLUSTERS = "ray, ray://HOST:PORT, dask or tcp://HOST:PORT"
+UNSERVED: dict[str, Any] = {
+    f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker", "nanny")
+}
+"""Dask's web servers tell whoever asks of the work, and have no authentication: nothing is served."""
+CLUSTERS = "ray, ray://HOST:PORT, ray://auto, dask, tcp://HOST:PORT or tls://HOST:PORT"
 
 Function = Callable[[Any, Progress], Any]
 """Of a module: from a piece of work, and what is told of measurements done, to its result."""
@@ -113,9 +118,11 @@ class Workers:
 
     Args:
         jobs: processes; 1: this one; -1: as many as there are cores.
-        cluster: ``ray://HOST:PORT``, or of Dask ``tcp://HOST:PORT``; ``"ray"``: the one that runs on this machine, or
-            else a new one; ``"dask"``: a new one on this machine. A new one has ``jobs`` processes, where that is more
-            than one, or as many as there are cores. None: no cluster.
+        cluster: ``"ray"`` or ``"dask"``: a new one on this machine, which lets nobody else in, with ``jobs`` processes,
+            where that is more than one, or as many as there are cores. One that runs already: ``ray://HOST:PORT``;
+            ``ray://auto``, that of this machine, whoever has begun it; of Dask ``tls://HOST:PORT``, with the
+            certificates of Dask's configuration, or ``tcp://HOST:PORT``, which is open to whoever reaches the port.
+            None: no cluster.
 
     Raises:
         ValueError: for another number or word, or where the packages of a cluster are missing.
@@ -203,7 +210,8 @@ class Workers:
         calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         told: set[tuple[str, type[Warning]]] = set()
-        with _safe_path():
+        # Processes that begin do not search the working directory for libraries; :func:`_done` tells them the paths.
+        with _environment(PYTHONSAFEPATH="1"):
             for outcome in spread(calls):
                 for text, category in outcome.warnings:
                     if (text, category) not in told:
@@ -255,17 +263,29 @@ class Workers:
 
     def _over_dask(self, calls: Iterator[tuple[Any, ...]]) -> Iterator[Outcome]:
         try:
-            from distributed import Client, KilledWorker, as_completed
+            import dask
+            from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+
+            # Certificates that this process tells its workers alone: whoever else connects is refused.
+            begin = self._dask is None and self.cluster == "dask"
+            security = Security.temporary() if begin else None
         except ImportError as error:
             raise _missing(error) from error
         if self._dask is None:
+            where: Any = self.cluster
             try:
-                if self.cluster == "dask":
-                    self._dask = Client(
-                        n_workers=self._cores, threads_per_worker=1, processes=True, dashboard_address=None
-                    )
-                else:
-                    self._dask = Client(self.cluster, timeout=30)
+                if begin:
+                    with dask.config.set(UNSERVED):
+                        where = LocalCluster(
+                            n_workers=self._cores,
+                            threads_per_worker=1,
+                            processes=True,
+                            dashboard_address=None,
+                            protocol="tls://",
+                            security=security,
+                        )
+                    self._ended.callback(where.close)
+                self._dask = Client(where, timeout=30)
             except (OSError, ValueError) as error:
                 raise ValueError(f"there is no cluster of Dask at {self.cluster}: {error}") from error
             self._ended.callback(self._dask.close)
@@ -324,26 +344,28 @@ class Workers:
     def _begin_ray(self, ray: Any) -> None:
         quiet = {"log_to_driver": False, "logging_level": "error"}
         if self.cluster != "ray":
-            ray.init(self.cluster, **quiet)
+            ray.init("auto" if self.cluster == "ray://auto" else self.cluster, **quiet)
             return
-        try:
-            ray.init("auto", **quiet)
-        except ConnectionError:
-            ray.init(num_cpus=self._cores, include_dashboard=False, **quiet)
+        # A new one, whatever runs here. Since 2.59 Ray lets in only who knows its token; without one of ours it would
+        # leave one in a file that other users may be able to read.
+        if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        ray.init("local", num_cpus=self._cores, include_dashboard=False, **quiet)
 
 
 @contextmanager
-def _safe_path() -> Iterator[None]:
-    """Let processes that begin meanwhile not search the working directory for libraries; :func:`_done` tells paths."""
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = "1"
+def _environment(**variables: str) -> Iterator[None]:
+    """Set variables of the environment for a while, and for the processes that begin in it."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
     try:
         yield
     finally:
-        if before is None:
-            os.environ.pop("PYTHONSAFEPATH", None)
-        else:
-            os.environ["PYTHONSAFEPATH"] = before
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
 def _missing(error: ImportError) -> ValueError:

@@ -8,6 +8,8 @@ import shutil
 import signal
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 from contextlib import suppress
 from pathlib import Path
 
@@ -267,7 +269,7 @@ def test_what_cannot_be_sent_is_said_before_the_work(two):
         (("--jobs", "0"), "jobs must be at least 1, or -1 for all cores, got 0"),
         (
             ("--cluster", "slurm"),
-            "cluster must be ray, ray://HOST:PORT, dask or tcp://HOST:PORT, got 'slurm'",
+            "cluster must be ray, ray://HOST:PORT, ray://auto, dask, tcp://HOST:PORT or tls://HOST:PORT, got 'slurm'",
         ),
         (("--cluster", "dask://here"), "got 'dask://here'"),
         (("--cluster", "ray://nowhere:1", "--jobs", "2"), "leave out jobs"),
@@ -357,15 +359,59 @@ def lost_once(item, tick):
 
 @pytest.fixture(scope="module", params=["ray", "dask"])
 def clustered(request):
-    if request.param == "ray":
-        ray = pytest.importorskip("ray", reason="a cluster needs filtergym[cluster]")
-        ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="error")
-        yield Workers(cluster="ray")
-        ray.shutdown()
-        return
-    pytest.importorskip("distributed", reason="a cluster needs filtergym[cluster]")
-    with Workers(2, "dask") as workers:
+    pytest.importorskip(
+        {"dask": "distributed"}.get(request.param, "ray"), reason="a cluster needs filtergym[cluster]"
+    )
+    with Workers(2, request.param) as workers:
         yield workers
+
+
+STRANGER = """
+import sys
+engine, address = sys.argv[1:]
+if engine == "ray":
+    import ray
+    print("connecting", flush=True)
+    ray.init(address, log_to_driver=False)
+    print("executed", ray.get(ray.remote(abs).remote(-1), timeout=20))
+else:
+    from distributed import Client
+    print("connecting", flush=True)
+    print("executed", Client(address, timeout=5).submit(abs, -1).result(timeout=20))
+"""
+
+
+def test_a_cluster_lets_nobody_else_in(clustered):
+    """Another process, of another user where there can be one, whatever it says."""
+    assert clustered.results(warned_not, [1, 2]) == [1, 2]
+    if clustered.engine == "ray":
+        address = sys.modules["ray"].get_runtime_context().gcs_address
+        addresses, mode = [address], {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": "0" * 64}
+    else:
+        address = clustered._dask.scheduler.address
+        assert address.startswith("tls://127.0.0.1:")
+        addresses, mode = [address, address.replace("tls", "tcp")], {}
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen("http://127.0.0.1:8787/info/main/workers.html", timeout=5)
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+    other = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
+    if os.getuid() != 0 or shutil.which("setpriv") is None:
+        other = []
+    for address in addresses:
+        done = subprocess.run(
+            [*other, sys.executable, "-c", STRANGER, clustered.engine, address],
+            env={**inherited, "HOME": "/tmp", **mode},
+            cwd="/tmp",
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode != 0
+        assert done.stdout.split() == ["connecting"]
+
+
+def warned_not(item, tick):
+    return item
 
 
 def test_a_cluster_has_the_same_bits_and_loses_nothing(clustered, tmp_path, monkeypatch):

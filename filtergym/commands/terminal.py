@@ -132,7 +132,8 @@ Cluster = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="Share the work over a cluster (with filtergym[cluster]): ray, ray://HOST:PORT, dask or tcp://HOST:PORT.",
+        help="Share the work over a cluster (with filtergym[cluster]): ray or dask for a new one on "
+        "this machine; ray://HOST:PORT, ray://auto, tcp://HOST:PORT or tls://HOST:PORT for one that runs.",
         autocompletion=one_of("ray", "dask"),
     ),
 ]
