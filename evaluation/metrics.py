@@ -15,7 +15,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, Sums, added, block_of, mean_of_sums
 from .competitors import RANKED
-from .dataset import groups_of, seed_of, slices_of, windows_of, with_windows
+from .dataset import Losses, groups_of, losses_of, seed_of, slices_of, windows_of, with_windows
 from .threads import one_thread
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
@@ -147,13 +147,17 @@ class Judged(NamedTuple):
     averaged: dict[Key, Averaged]
     costs: list[numpy.ndarray]
     """Mean cost of every episode, piece by piece; nothing of bounds, and without truth."""
+    losses: Losses | None
 
     def and_of(self, later: "Judged") -> "Judged":
         """Add the episodes that come next."""
         averaged = dict(self.averaged)
         for key, (of, sums) in later.averaged.items():
             averaged[key] = of, added(averaged[key][1], sums) if key in averaged else sums
-        return Judged(averaged, self.costs + later.costs)
+        losses = self.losses or later.losses
+        if self.losses is not None and later.losses is not None:
+            losses = self.losses._replace(count=self.losses.count + later.losses.count)
+        return Judged(averaged, self.costs + later.costs, losses)
 
     def cost(self) -> numpy.ndarray | None:
         """Mean cost of every episode, ``(episodes,)``; None of bounds, and without truth."""
@@ -186,7 +190,8 @@ def _judged(run: xarray.Dataset, bootstrap: Bootstrap, first: int) -> Judged:
     for s in _statistics(run, bootstrap.episodes):
         averaged[s.metric, s.component, s.window, s.unit] = s.of, bootstrap.sums(s.values, first)
     told = "cost" in run and str(run["kind"].values) != "bound"
-    return Judged(averaged, [mean_over_time(run, run["cost"].values)] if told else [])
+    costs = [mean_over_time(run, run["cost"].values)] if told else []
+    return Judged(averaged, costs, losses_of(run, first))
 
 
 def _itself(means: numpy.ndarray) -> numpy.ndarray:
@@ -243,6 +248,9 @@ def _statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
         charge = run["charge"].values
         total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
         yield Statistic("return", "", "all", "1", total, _minus)
+    if "lost" in run and not numpy.isnan(run["lost"].values).all():
+        lost = (run["lost"].values > 0.0).any(axis=1).astype(float)
+        yield Statistic("lost_episodes", "", "all", "1", lost, _itself)
 
 
 def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -> Iterator[Statistic]:
@@ -327,6 +335,7 @@ class Contender(NamedTuple):
     """The environment's own."""
     costs: numpy.ndarray | None
     """Mean cost of every episode; None of bounds, and without truth."""
+    losses: Losses | None
 
 
 def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
@@ -405,8 +414,8 @@ def tidy_records(
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
-    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards). Without truth what
-    needs it is left out.
+    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
+    ``lost_episodes`` of estimators (share). Without truth what needs it is left out.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -440,7 +449,7 @@ def contender(
     own = metrics is not None and not run.attrs.get("recorded")
     further = metrics(run, bootstrap) if metrics is not None and own else []
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.cost())
+    return Contender(name, kind, control, judged.measures(bootstrap), further, judged.cost(), judged.losses)
 
 
 def records_of(

@@ -17,6 +17,7 @@ import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
 from .curves import BAND_RESAMPLES, Drawn, Finished, drawn_from, joined
+from .dataset import Losses
 from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Judged, Measure, Record, judge, records_of
@@ -48,6 +49,7 @@ class Asked(NamedTuple):
     keywords: dict[str, Any] | None = None
     metrics: OwnMetrics | None = None
     """The environment's own."""
+    strict: bool = False
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -108,7 +110,7 @@ class Part(NamedTuple):
         further = []
         if metrics is not None and self.own is not None:
             further = metrics.measures(self.own.gathered(), bootstrap, self.head)
-        found = Contender(name, kind, control, measures, further, self.judged.cost())
+        found = Contender(name, kind, control, measures, further, self.judged.cost(), self.judged.losses)
         return Summary(found, self.drawn.finished(), self.head, bootstrap.episodes)
 
 
@@ -137,6 +139,7 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
         asked.paper,
         asked.reference,
         asked.keywords or {},
+        asked.strict,
     )
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
@@ -250,6 +253,10 @@ def told_together(found: Sequence[Summary]) -> tuple[list[Record], xarray.Datase
 
 def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
     heads = [one.head for one in found]
+    notes = [heads[0].attrs["notes"]] if heads[0].attrs["notes"] else []
+    for one in found:
+        if (losses := one.contender.losses) is not None:
+            notes.append(losses.sentence(one.contender.name, one.episodes))
     coords: dict[str, Any] = {}
     for head in heads:
         coords |= {str(n): c.variable for n, c in head.coords.items() if n not in coords}
@@ -264,7 +271,9 @@ def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
                 stacked[i] = head[name].values
         variables[name] = (("policy", *example.dims), stacked)
     # A file has an order of its own.
-    return xarray.Dataset(variables, dict(sorted(coords.items())), heads[0].attrs)
+    return xarray.Dataset(
+        variables, dict(sorted(coords.items())), {**heads[0].attrs, "notes": "\n".join(notes)}
+    )
 
 
 def write_summary(path: Path, summary: Summary, made_by: str) -> None:
@@ -288,6 +297,7 @@ def write_summary(path: Path, summary: Summary, made_by: str) -> None:
         "further": own.further,
         "actions": summary.finished.actions,
         "gains": summary.finished.gains,
+        "losses": own.losses,
         "episodes": summary.episodes,
     }
     arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.finished.curves.items()}
@@ -317,7 +327,9 @@ def read_summary(path: Path, made_by: str) -> Summary | None:
                 [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[name]]
                 for name in ("measures", "further")
             )
-            contender = Contender(words["name"], words["kind"], words["control"], measures, further, costs)
+            losses = Losses(*words["losses"]) if words["losses"] else None
+            named = (words[name] for name in ("name", "kind", "control"))
+            contender = Contender(*named, measures, further, costs, losses)
             finished = Finished(curves, words["actions"], words["gains"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None  # what a crash has left half: it is made again
