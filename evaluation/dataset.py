@@ -8,7 +8,7 @@ remains in words: see the functions of this module for what they mean.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy
 import xarray
@@ -19,6 +19,59 @@ MOST_BYTES = 2**31 - 1
 """Of one variable in NetCDF's classic format, as SciPy writes it."""
 MOST_WHOLE = 2**31 - 1
 """Largest whole number of an attribute in NetCDF's classic format."""
+
+FAULTS = (
+    "the mean is not finite",
+    "the covariance is not finite",
+    "the covariance is not positive definite",
+    "the covariance is not symmetric",
+    "the estimate is not finite after a missed measurement (what is not received is NaN: predict without it)",
+)
+"""Why an estimator loses an episode; ``lost`` holds their numbers from 1 on, and 0 where none is lost."""
+
+
+class Losses(NamedTuple):
+    """Episodes that an estimator has lost."""
+
+    count: int
+    episode: int
+    """The first of them."""
+    measurement: int
+    """At which it was lost."""
+    fault: int
+    """Number of the reason among ``FAULTS``, from 1 on."""
+
+    def sentence(self, name: str, episodes: int) -> str:
+        """Say how many of the episodes are lost, and why the first is."""
+        return (
+            f"{name}: {self.count} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
+            f"in episode {self.episode} at measurement {self.measurement}; the last valid answer is held from there on"
+        )
+
+
+def losses_in(run: xarray.Dataset) -> numpy.ndarray:
+    """Return at which measurement each episode was lost, and why, ``(episodes, 2)``; zeros where it was not.
+
+    Args:
+        run: one policy's part of an evaluation.
+    """
+    faults = numpy.nan_to_num(run["lost"].values) if "lost" in run else numpy.zeros((run.sizes["episode"], 1))
+    first = (faults > 0.0).argmax(axis=1)
+    fault = numpy.take_along_axis(faults, first[:, None], axis=1)[:, 0]
+    return numpy.stack([numpy.where(fault > 0.0, first + 1.0, 0.0), fault], axis=1)
+
+
+def count_losses(losses: numpy.ndarray) -> Losses | None:
+    """Count lost episodes; None if none is.
+
+    Args:
+        losses: of all episodes, as :func:`losses_in` returns them.
+    """
+    lost = losses[:, 1] > 0.0
+    if not lost.any():
+        return None
+    i = int(lost.argmax())
+    return Losses(int(lost.sum()), i, int(losses[i, 0]), int(losses[i, 1]))
 
 
 def fits_classic(dataset: xarray.Dataset) -> bool:
@@ -120,5 +173,9 @@ def seed_of(dataset: xarray.Dataset) -> int:
 
 
 def notes_of(dataset: xarray.Dataset) -> list[str]:
-    """What is to be told of the scenario, a line each."""
-    return str(dataset.attrs["notes"]).splitlines()
+    """What is to be told of the scenario, and of lost episodes, a line each."""
+    notes = str(dataset.attrs["notes"]).splitlines()
+    for name in dataset["policy"].values.tolist() if "lost" in dataset else ():
+        if (losses := count_losses(losses_in(dataset.sel(policy=name)))) is not None:
+            notes.append(losses.sentence(name, dataset.sizes["episode"]))
+    return notes

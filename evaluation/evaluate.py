@@ -147,6 +147,7 @@ def evaluate(
     backend: str = "auto",
     threads: int = 1,
     workers: Workers | None = None,
+    strict: bool = False,
     **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, estimators, references and bounds over the same episodes.
@@ -171,13 +172,15 @@ def evaluate(
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
         workers: who runs competitors and chunks of episodes; default: this process, one after the other.
+        strict: raise where an estimator would lose an episode, see :func:`.rollout.run_estimator`.
         **keywords: parameters of the task.
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
         truth), ``cost``, ``charge`` (minus the ``cost`` reward), ``nees``, whatever the task records (``nis``,
-        ``mode_probability``), ``mean_square`` of bounds, and ``action`` (also over action_name) of policies whose
-        action is a box. Coordinates: ``unit`` and ``group`` of every component,
+        ``mode_probability``), ``mean_square`` of bounds, ``action`` (also over action_name) of policies whose
+        action is a box, and ``lost`` of estimators, zero, or once an episode is lost the number of the reason, see
+        :data:`.dataset.FAULTS`. Coordinates: ``unit`` and ``group`` of every component,
         ``kind`` and ``control`` of every policy, ``episode_seed`` (in words: a file may have no room for so large a
         number), ``window_first`` and ``window_last`` of every window, and ``elapsed``, seconds since the start of the
         track, where measurements come regularly. Of a set of flights ``flight`` and ``length`` say which each episode
@@ -203,6 +206,7 @@ def evaluate(
         paper,
         reference,
         keywords,
+        strict,
     )
     if tracks and drawn_episodes:
         raise ValueError("tracks keeps every episode: leave out drawn_episodes")
@@ -244,6 +248,7 @@ class Piece(NamedTuple):
     horizon: int
     tracks: bool
     drawn_episodes: int
+    strict: bool
     task: Task | None
     """That was made already, in this process."""
 
@@ -276,6 +281,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         piece.first,
         actions=True,
         only={DRAWN: piece.drawn_episodes - piece.first},
+        strict=piece.strict,
     )
     return found
 
@@ -312,6 +318,7 @@ class Plan(NamedTuple):
     paper: str
     reference: str
     keywords: dict[str, Any]
+    strict: bool
 
     def piece(
         self, name: str, first: int, count: int, tracks: bool, drawn_episodes: int, here: bool
@@ -333,6 +340,7 @@ class Plan(NamedTuple):
             self.tasks[name].horizon,
             tracks,
             drawn_episodes,
+            self.strict,
             self.tasks[name] if here else None,
         )
 
@@ -385,6 +393,7 @@ def plan_of(
     paper: str,
     reference: str,
     keywords: dict[str, Any],
+    strict: bool = False,
 ) -> Plan:
     """Return the plan of an evaluation; arguments and refusals as of :func:`evaluate`."""
     cls = task_class(env)
@@ -438,6 +447,7 @@ def plan_of(
         paper,
         reference,
         keywords,
+        strict,
     )
 
 

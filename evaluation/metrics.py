@@ -15,7 +15,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate
 from .competitors import RANKED
-from .dataset import groups_of, seed_of, slices_of, windows_of, with_windows
+from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
 from .statistics import ALL, Key, Statistic, reduce_run
 from .threads import one_thread
 
@@ -183,6 +183,11 @@ def record_statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]
         yield Statistic(("record", "return", "", "all", "1"), total, _minus)
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+    if "lost" in run and not numpy.isnan(run["lost"].values).all():
+        losses = losses_in(run)
+        share = (losses[:, 1] > 0.0).astype(float)
+        yield Statistic(("record", "lost_episodes", "", "all", "1"), share)
+        yield Statistic(("losses",), losses, count_losses, sample=ALL)
 
 
 def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -> Iterator[Statistic]:
@@ -277,6 +282,7 @@ class Contender(NamedTuple):
     """The environment's own."""
     costs: numpy.ndarray | None
     """Mean cost of every episode; None of bounds, and without truth."""
+    losses: Losses | None
 
 
 def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
@@ -364,8 +370,8 @@ def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -
     ``mean_error``; ``anees`` and ``anis`` (mean NEES and NIS over their dimension; one if consistent), ``nees_inside``
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
-    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards). Without truth what
-    needs it is left out.
+    ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
+    ``lost_episodes`` of estimators (share). Without truth what needs it is left out.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -410,7 +416,7 @@ def contender_of(
             measures.append(Measure(metric, component, window, estimate, unit))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, measures, further, results.get(("cost",)))
+    return Contender(name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)))
 
 
 def records_of(

@@ -15,6 +15,7 @@ from ..envs.lanes import Lanes
 from ..envs.observation import Array
 from ..envs.task import Episode, Outside, Task, named_arrays
 from .competitors import Kind
+from .dataset import FAULTS
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
@@ -116,8 +117,14 @@ def run_estimator(
     tick: Progress,
     name: str = "estimator",
     first_episode: int = 0,
+    strict: bool = False,
+    lost: Callable[[Array], None] = lambda faults: None,
 ) -> None:
     """Run an estimator in place of actions, and check what it says.
+
+    An episode in which an answer is not finite, or no covariance, is lost from that measurement on: the last valid
+    answer, or else what was told of the start, is held to the end. Any estimator could give that answer itself, so that
+    nobody gains by losing an episode.
 
     Args:
         task: the estimation problem.
@@ -127,26 +134,33 @@ def run_estimator(
         tick: likewise.
         name: of the estimator, in errors.
         first_episode: number of the first episode, in errors.
+        strict: raise where an episode would be lost.
+        lost: called before every ``record`` with the number of the reason why each episode is lost, ``(N,)``; see
+            :data:`.dataset.FAULTS`.
 
     Raises:
-        ValueError: if the estimator raises, or returns what is no mean and covariance.
+        ValueError: if the estimator raises, or returns what is no mean and covariance in shape.
     """
     width = padded_width(len(seeds))
     filled = numpy.minimum(numpy.arange(width), len(seeds) - 1)  # the last episode is repeated
     memory: Any = None
     step = 0
-    missed = numpy.zeros(width, dtype=int)
+    missed = numpy.zeros(width, dtype=bool)
+    held: tuple[numpy.ndarray, ...] = ()
+    faults = numpy.zeros(width)
 
     def start(episode: Episode) -> None:
-        nonlocal memory
+        nonlocal memory, held
+        initial = chosen_lanes(episode.measurement, filled)
+        held = initial.mean.copy(), initial.covariance.copy()
         with told(f"estimator {name!r} failed at the start of the track"):
-            memory = estimator.start(chosen_lanes(episode.measurement, filled), width)
+            memory = estimator.start(initial, width)
 
     def update(episode: Episode) -> tuple[Array, Array]:
-        nonlocal memory, step
+        nonlocal memory, step, held
         step += 1
         measurement = chosen_lanes(task.world.received(episode.measurement), filled)
-        missed[_lacking(measurement)] = step
+        missed[:] |= _lacking(measurement)
         with told(f"estimator {name!r} failed at measurement {step}"):
             answer = estimator.update(measurement, memory)
             try:
@@ -155,7 +169,21 @@ def run_estimator(
                 raise TypeError(
                     "update must return mean, covariance and memory, not " + type(answer).__name__
                 ) from None
-        return _checked_estimate(task, name, step, first_episode, mean, covariance, missed)
+        mean, covariance = _checked_estimate(task, name, step, mean, covariance, width)
+        found = _faults(mean, covariance, faults > 0.0, missed)
+        if strict and found[: len(seeds)].any():
+            i = int(numpy.argmax(found > 0.0))
+            raise ValueError(
+                f"estimator {name!r}: {FAULTS[int(found[i]) - 1]} in episode {first_episode + i} at measurement {step}"
+            )
+        faults[:] += found
+        lost(faults.copy())
+        # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
+        estimate = numpy.copy(mean, order="K"), numpy.copy(covariance, order="K")
+        for array, last in zip(estimate, held, strict=True):
+            array[..., faults > 0.0] = last[..., faults > 0.0]
+        held = estimate
+        return held[0], held[1]
 
     _run_outside(task, start, update, seeds, record, tick)
 
@@ -181,19 +209,10 @@ def told(what: str) -> Iterator[None]:
 
 
 def _checked_estimate(
-    task: Task,
-    name: str,
-    step: int,
-    first_episode: int,
-    mean: Any,
-    covariance: Any,
-    missed: numpy.ndarray,
+    task: Task, name: str, step: int, mean: Any, covariance: Any, width: int
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Return an estimate as float64, or raise ValueError that names episode and measurement.
-
-    ``missed`` is the last measurement of which each episode did not receive everything, zero for none.
-    """
-    count, width = len(task.components), len(missed)
+    """Return an estimate as float64, or raise ValueError if it has another shape."""
+    count = len(task.components)
     found = []
     for word, values, shape in (
         ("mean", mean, (count, width)),
@@ -211,26 +230,37 @@ def _checked_estimate(
                 f"estimator {name!r}: the {word} at measurement {step} must have shape {shape}, {count} components "
                 f"({components}) of {width} episodes, got {array.shape}"
             )
-        finite = numpy.asarray(numpy.isfinite(array).reshape(-1, width).all(axis=0))
-        if not finite.all():
-            last = missed[numpy.argmin(finite)]
-            hint = f"; of this episode measurement {last} was missed: what is not received is NaN, predict without it"
-            where = _where(name, word, "is not finite", first_episode, finite, step)
-            raise ValueError(where + hint if last else where)
         found.append(array)
-    P = numpy.moveaxis(found[1], -1, 0)
+    return found[0], found[1]
+
+
+def _faults(
+    mean: numpy.ndarray, covariance: numpy.ndarray, lost: numpy.ndarray, missed: numpy.ndarray
+) -> numpy.ndarray:
+    """Return what is wrong with an estimate, of the episodes that are not lost yet.
+
+    Args:
+        mean: ``(C, N)``.
+        covariance: ``(C, C, N)``.
+        lost: whether the episode was lost before, ``(N,)``.
+        missed: whether not everything was received so far, ``(N,)``.
+
+    Returns:
+        Numbers of ``FAULTS`` from 1 on, zero where nothing is, ``(N,)``.
+    """
+    finite = numpy.isfinite(mean).all(axis=0), numpy.isfinite(covariance).all(axis=(0, 1))
+    usable = finite[1] & ~lost
+    P = numpy.where(usable[:, None, None], numpy.moveaxis(covariance, -1, 0), numpy.eye(len(mean)))
+    definite = numpy.ones(len(P), dtype=bool)
     try:
         numpy.linalg.cholesky(P)
     except numpy.linalg.LinAlgError:
         definite = numpy.array([numpy.linalg.eigvalsh(p)[0] > 0.0 for p in P])
-        if not definite.all():
-            wrong = "is not positive definite"
-            raise ValueError(_where(name, "covariance", wrong, first_episode, definite, step)) from None
     asymmetry = numpy.abs(P - P.transpose(0, 2, 1)).max(axis=(1, 2))
     symmetric = asymmetry <= 1e-6 * numpy.abs(P).max(axis=(1, 2))
-    if not symmetric.all():
-        raise ValueError(_where(name, "covariance", "is not symmetric", first_episode, symmetric, step))
-    return found[0], found[1]
+    wrong = [~(fine | lost) for fine in (*finite, definite, symmetric)]
+    overlooked = missed & (wrong[0] | wrong[1])
+    return numpy.select([overlooked, *wrong], [float(len(FAULTS)), *numpy.arange(1.0, len(FAULTS))], 0.0)
 
 
 def _lacking(measurement: Any) -> numpy.ndarray:
@@ -240,11 +270,6 @@ def _lacking(measurement: Any) -> numpy.ndarray:
         for _, values in named_arrays(measurement)
     ]
     return numpy.asarray(numpy.any(parts, axis=0))
-
-
-def _where(name: str, word: str, wrong: str, first_episode: int, fine: numpy.ndarray, step: int) -> str:
-    episode = first_episode + int(numpy.argmin(fine))
-    return f"estimator {name!r}: the {word} {wrong} in episode {episode} at measurement {step}"
 
 
 def run_bound(
@@ -282,6 +307,7 @@ def run_competitor(
     first_episode: int = 0,
     actions: bool = False,
     only: Mapping[str, int] | None = None,
+    strict: bool = False,
 ) -> dict[str, numpy.ndarray]:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -298,9 +324,11 @@ def run_competitor(
         actions: of a policy whose action is a box, report too what was applied: ``action``, ``(episodes, time, A)``,
             within the limits of the box, as every bank takes it.
         only: beginning of names -> of how many of the first episodes these are kept.
+        strict: raise where an estimator would lose an episode.
 
     Returns:
-        Arrays ``(episodes, time, ...)`` by name; of a bound its ``mean_square``.
+        Arrays ``(episodes, time, ...)`` by name; of a bound its ``mean_square``; of an estimator also ``lost``, see
+        :func:`run_estimator`.
     """
     series: dict[str, list[numpy.ndarray]] = {}
 
@@ -316,10 +344,10 @@ def run_competitor(
         series[name].append(numpy.moveaxis(kept.copy() if counts[name] < len(seeds) else kept, -1, 0))
 
     def keep_all(found: dict[str, numpy.ndarray]) -> None:
-        if actions and "action" in found:
+        for name in {"action", "lost"} & found.keys() if actions else ():
             raise ValueError(
-                f"{task.id} records something under the name 'action', under which an evaluation keeps what was "
-                "applied: call it something else"
+                f"{task.id} records something under the name {name!r}, under which an evaluation keeps which actions "
+                "were applied or episodes lost: call it something else"
             )
         for name, values in found.items():
             keep(name, values)
@@ -337,7 +365,17 @@ def run_competitor(
         acted = keep_action if actions and isinstance(space, gymnasium.spaces.Box) else None
         run_policy(task, competitor, seeds, keep_all, tick, report, acted)
     elif kind == "estimator":
-        run_estimator(task, competitor, seeds, record, tick, name, first_episode)
+        run_estimator(
+            task,
+            competitor,
+            seeds,
+            record,
+            tick,
+            name,
+            first_episode,
+            strict,
+            lambda faults: keep("lost", faults),
+        )
     elif kind == "reference":
         run_reference(task, competitor, seeds, record, tick)
     else:

@@ -17,6 +17,7 @@ import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
+from .dataset import Losses
 from .evaluate import DRAWN, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Measure, Record, contender_of, record_statistics, records_of
@@ -49,6 +50,7 @@ class Asked(NamedTuple):
     keywords: dict[str, Any] | None = None
     metrics: OwnMetrics | None = None
     """The environment's own."""
+    strict: bool = False
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -157,6 +159,7 @@ def reduce_episodes(
         asked.paper,
         asked.reference,
         asked.keywords or {},
+        asked.strict,
     )
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
@@ -266,6 +269,10 @@ def combine_summaries(found: Sequence[Summary]) -> tuple[list[Record], xarray.Da
 
 def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
     heads = [one.head for one in found]
+    notes = [heads[0].attrs["notes"]] if heads[0].attrs["notes"] else []
+    for one in found:
+        if (losses := one.contender.losses) is not None:
+            notes.append(losses.sentence(one.contender.name, one.episodes))
     coords: dict[str, Any] = {}
     for head in heads:
         coords |= {str(n): c.variable for n, c in head.coords.items() if n not in coords}
@@ -280,7 +287,9 @@ def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
                 stacked[i] = head[name].values
         variables[name] = (("policy", *example.dims), stacked)
     # A file has an order of its own.
-    return xarray.Dataset(variables, dict(sorted(coords.items())), heads[0].attrs)
+    return xarray.Dataset(
+        variables, dict(sorted(coords.items())), {**heads[0].attrs, "notes": "\n".join(notes)}
+    )
 
 
 def write_summary(path: Path, summary: Summary, made_by: str) -> None:
@@ -304,6 +313,7 @@ def write_summary(path: Path, summary: Summary, made_by: str) -> None:
         "further": own.further,
         "actions": summary.curves.actions,
         "gains": summary.curves.gains,
+        "losses": own.losses,
         "episodes": summary.episodes,
     }
     arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.curves.curves.items()}
@@ -333,7 +343,9 @@ def read_summary(path: Path, made_by: str) -> Summary | None:
                 [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[name]]
                 for name in ("measures", "further")
             )
-            contender = Contender(words["name"], words["kind"], words["control"], measures, further, costs)
+            losses = Losses(*words["losses"]) if words["losses"] else None
+            named = (words[name] for name in ("name", "kind", "control"))
+            contender = Contender(*named, measures, further, costs, losses)
             own = CompetitorCurves(curves, words["actions"], words["gains"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None  # what a crash has left half: it is made again

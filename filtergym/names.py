@@ -105,8 +105,8 @@ def evaluate(
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
         trust: load models' zips, which can execute code.
-        **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes`` and
-            ``workers``, see :func:`.evaluation.evaluate.evaluate`.
+        **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes``, ``strict``
+            and ``workers``, see :func:`.evaluation.evaluate.evaluate`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
@@ -152,6 +152,7 @@ def asked_of(
     drawn_episodes: int = 0,
     backend: str = "auto",
     threads: int = 1,
+    strict: bool = False,
     **keywords: Any,
 ) -> list[Asked]:
     """Return what :func:`.evaluation.summary.summaries` makes, for each competitor; arguments as of :func:`evaluate`.
@@ -180,6 +181,7 @@ def asked_of(
             threads,
             keywords,
             known.metrics,
+            strict,
             horizon,
         )
         for name, maker in makers.items()

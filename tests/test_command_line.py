@@ -13,8 +13,8 @@ import commands
 import pytest
 from made_results import results_of
 
-from filtergym.commands import terminal
 from filtergym.__main__ import COMMANDS, GROUPS, main
+from filtergym.commands import terminal
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
 from filtergym.reports.results import read_results, settings_of, write_results

@@ -1,5 +1,6 @@
 """An estimator that a user brings: the same noise, the same start, and a sentence for whatever goes wrong."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -7,9 +8,11 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
+from filtergym.evaluation.dataset import notes_of
 
 import filtergym
 from filtergym.__main__ import main
+from filtergym.reports.results import read_results
 
 ID = "filtergym/ManeuveringTarget-v0"
 EXAMPLES = Path(__file__).parent.parent / "docs" / "examples"
@@ -154,7 +157,44 @@ def make_asymmetric(mean, covariance, lane):
 def test_a_wrong_answer_is_named_with_episode_and_measurement(change, message):
     wrong = wrong_at(3, 9, change)
     with pytest.raises(ValueError, match=f"estimator 'mine': {message.format(9)}"):
-        filtergym.evaluate(ID, {"mine": wrong}, episodes=12, horizon=5)
+        filtergym.evaluate(ID, {"mine": wrong}, episodes=12, horizon=5, strict=True)
+
+
+@pytest.mark.parametrize("step", [1, 3])
+def test_a_lost_episode_keeps_its_last_valid_answer_to_the_end(env_id, short, step):
+    """As of an estimator that gives the same answer again and again by itself, also in a closed loop."""
+
+    class Holding(Start):
+        lost = range(0)
+
+        def start(self, initial, N):
+            return (*super().start(initial, N), 0)
+
+        def update(self, measurement, memory):
+            mean, covariance, k = memory
+            drift = np.full(mean.shape[-1], k + 1.0)
+            drift[9:] = min(k + 1, step - 1)
+            answer = mean + drift
+            if k + 1 in self.lost:
+                answer[0, 9:] = np.nan
+            return answer, covariance, (mean, covariance, k + 1)
+
+    class Losing(Holding):
+        lost = (step,)
+
+    dataset = filtergym.evaluate(env_id, {"losing": Losing, "holding": Holding}, episodes=12, **short)
+    losing, holding = (dataset.sel(policy=name) for name in ("losing", "holding"))
+    expected = np.zeros((12, losing.sizes["time"]))
+    expected[9:, step - 1 :] = 1.0
+    np.testing.assert_array_equal(losing["lost"], expected)
+    assert not holding["lost"].any()
+    for name in ("error", "cost"):
+        np.testing.assert_array_equal(losing[name], holding[name])
+        assert np.isfinite(losing[name]).all()
+    assert notes_of(dataset) == [
+        f"losing: 3 of 12 episodes lost: the mean is not finite in episode 9 at measurement {step}; the last valid "
+        "answer is held from there on"
+    ]
 
 
 def test_episodes_are_counted_over_all_chunks(monkeypatch):
@@ -173,7 +213,56 @@ def test_episodes_are_counted_over_all_chunks(monkeypatch):
             return mean, memory[1], memory
 
     with pytest.raises(ValueError, match="in episode 11 at measurement 1"):
-        filtergym.evaluate(ID, {"mine": Late}, episodes=20, horizon=3)
+        filtergym.evaluate(ID, {"mine": Late}, episodes=20, horizon=3, strict=True)
+    chunks.clear()
+    [told] = notes_of(filtergym.evaluate(ID, {"mine": Late}, episodes=20, horizon=3))
+    assert told.startswith(
+        "mine: 1 of 20 episodes lost: the mean is not finite in episode 11 at measurement 1"
+    )
+
+
+LOSING = """import numpy
+
+class Losing:
+    def __init__(self, task):
+        self.episodes = 0
+
+    def start(self, initial, N):
+        return initial.mean, initial.covariance
+
+    def update(self, measurement, memory):
+        mean, covariance = memory[0].copy(), memory[1].copy()
+        covariance[0, 1, 3] = numpy.inf
+        return mean, covariance, memory
+"""
+
+
+def test_lost_episodes_stand_in_table_records_and_results(command, monkeypatch, tmp_path):
+    """Two of twenty, in two pieces of work; what others have finished is not lost."""
+    monkeypatch.delitem(sys.modules, "losing", raising=False)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
+    Path("losing.py").write_text(LOSING)
+    words = ["evaluate", ID, "--episodes", 14, "--set", "horizon=4"]
+    words += ["--policy", "losing:Losing", "--policy", "imm", "--json", "records.json"]
+    code, output, errors = command(*words, "--strict")
+    assert (code, errors.count("\n")) == (2, 1)
+    assert "losing:Losing': the covariance is not finite in episode 3 at measurement 1" in errors
+    told = "losing:Losing: 2 of 14 episodes lost: the covariance is not finite in episode 3 at measurement 1"
+    # Every number kept, and summaries alone, in pieces: the same is told.
+    for further in ((), ("--out", "out"), ("--out", "small", "--no-netcdf")):
+        monkeypatch.setattr("filtergym.evaluation.summary.TOGETHER", 8)
+        code, output, errors = command(*words, *further)
+        assert code == 0, errors
+        assert told in " ".join(output.split())
+        [record] = [
+            record for record in json.loads(Path("records.json").read_text())
+            if record["metric"] == "lost_episodes"
+        ]  # fmt: skip
+        assert (record["policy"], round(14 * record["value"])) == ("losing:Losing", 2)
+        if further:
+            [result], _ = read_results(Path(further[1]))
+            assert [note for note in result.notes if note.startswith(told)]
 
 
 def test_an_estimate_in_place_of_three_is_refused():

@@ -1,9 +1,12 @@
 """What sensors did not receive is NaN to an estimator, in every environment; the shipped ones predict without it."""
 
+import re
+
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.rollout import run_estimator
 
 from filtergym import evaluate, record
@@ -88,11 +91,11 @@ def test_what_is_not_received_is_nan(id, replayed):
 
 
 def test_an_estimator_that_overlooks_a_missed_scan_is_told():
-    sentence = (
-        r"mean is not finite in episode \d+ at measurement (\d+); of this episode measurement \1 was missed"
-    )
+    sentence = r"not finite after a missed measurement .* in episode \d+ at measurement \d+"
     with pytest.raises(ValueError, match=sentence):
-        evaluate(RADAR, {"mine": Careless}, episodes=8)
+        evaluate(RADAR, {"mine": Careless}, episodes=8, strict=True)
+    (note,) = notes_of(evaluate(RADAR, {"mine": Careless}, episodes=8))
+    assert re.match(f"mine: 8 of 8 episodes lost: the estimate is {sentence}", note)
     result = evaluate(RADAR, {"mine": Careful}, episodes=8)
     assert np.abs(result["error"].sel(component="position_x")).max() < 10e3  # of a target 50 km away
 

@@ -143,6 +143,13 @@ def evaluate_policies(
         typer.Option(help="File (CSV or NetCDF) for every estimate with its sigma, NIS and log-likelihood."),
     ] = None,
     trust: Trust = False,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict",
+            help="Stop where an estimator's answer is not finite or no covariance; default: the episode is lost.",
+        ),
+    ] = False,
     backend: Backend = "auto",
     threads: Threads = 1,
     jobs: Jobs = 1,
@@ -232,6 +239,7 @@ def evaluate_policies(
         "drawn_episodes": int(out is not None and estimates is None),
         "backend": backend,
         "threads": threads,
+        "strict": strict,
         **keywords,
     }
     curves, kept = None, []

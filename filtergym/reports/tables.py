@@ -141,6 +141,9 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
         "ANEES": lambda name: consistency(found.get((name, "anees", "state", "all"))),
         "score": lambda name: score_text(found.get((name, "score", "", "all"))).partition(" [")[0],
     }
+    lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
+    if lost:
+        costs["lost"] = lambda name: f"{lost.get(name, 0)}"
     names = ranked(records)
     title = (
         f"{first.environment}, scenario {first.scenario} "
@@ -165,6 +168,10 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
         "score: 0 = the paper's algorithm, 1 = the reference that it is measured against; no room where that is not "
         "significantly better.",
     ]
+    if lost:
+        notes.append(
+            "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."
+        )
     notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
     tables[-1].caption = "\n".join(notes)
     return tables
