@@ -28,7 +28,7 @@ from ..evaluation.evaluate import check_sendable
 from ..evaluation.figures import draw_learning_curves
 from ..evaluation.files import whole_file
 from ..evaluation.metrics import reported_components, score, squared_errors
-from ..evaluation.parallel import Workers
+from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.summary import Asked
 from ..names import competitor
 from .tables import shown_components, with_interval
@@ -239,7 +239,7 @@ def episode_means(
             known_as = "agent" if name in agents else name
             asked = Asked(importable, known_as, maker, scenario, episodes, seed, split, control)
             work.append(asked._replace(horizon=horizon))
-    workers = workers or Workers()
+    workers = check_workers(workers)
     if not workers.alone:
         for asked in work:
             check_sendable(importable, {asked.name: asked.maker})
