@@ -226,6 +226,15 @@ def test_evaluation_arguments(arguments, message):
         evaluate(ID, ["random"], **{"episodes": 1, **arguments})
 
 
+def test_further_arguments_of_another_type():
+    with pytest.raises(ValueError, match="competitors are a name, a sequence of names, or a mapping"):
+        evaluate(ID, 3)
+    with pytest.raises(ValueError, match=r"speeds must be 2 numbers, got 1\.5"):
+        filtergym.read_flights("nowhere.csv", speeds=1.5)
+    with pytest.raises(ValueError, match="horizon must be an integer of at least 1, got 1000"):
+        gym.make(ID, horizon=10**400)
+
+
 class Answering:
     """An estimator that answers with one mean."""
 
