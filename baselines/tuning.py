@@ -23,7 +23,7 @@ from ..envs.task import Episode, Task
 from ..evaluation.code import code_digest
 from ..evaluation.competitors import Kind
 from ..evaluation.files import append_line, write_text
-from ..evaluation.parallel import Workers
+from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress, run_estimator, run_policy
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import fits, read_json
@@ -96,7 +96,7 @@ def mean_cost(
     workers: Workers | None = None,
 ) -> float:
     """Mean uncapped cost of a candidate over some episodes, which the workers share."""
-    workers = workers or Workers()
+    workers = check_workers(workers)
     share = max(FEWEST, -(-len(seeds) // workers.width))
     name = importable_name(task_class(id))
     pieces = [

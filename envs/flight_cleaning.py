@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from .parameters import Limits, check
+from .parameters import Limits, check, frozen
 from .plausibility import check_speed, check_velocity, isolated, speeds_of
 from .trajectory import Trajectory
 
@@ -23,7 +23,7 @@ class Cleaning(NamedTuple):
     def check(self) -> None:
         """Raise ValueError if a limit cannot be."""
         check("longest_gap", self.longest_gap, float, Limits(above=0.0))
-        check("speeds", tuple(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
+        check("speeds", frozen(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
         check("reach", self.reach, float, Limits(above=0.0))
         check("smoothing", self.smoothing, float, Limits(at_least=0.0))
 

@@ -223,7 +223,13 @@ def _traffic_sample(name: str) -> Path:
 
 
 def files_of(source: str | Path) -> list[Path]:
-    """Files that a path or a pattern stands for, in the order of their names."""
+    """Files that a path or a pattern stands for, in the order of their names.
+
+    Raises:
+        ValueError: for what is no path, and where there are none.
+    """
+    if not isinstance(source, str | Path):
+        raise ValueError(f"files are named by a path or a pattern such as 'plots/*.csv', got {source!r}")
     if isinstance(source, str) and source.startswith(TRAFFIC):
         return [_traffic_sample(source.removeprefix(TRAFFIC))]
     path = Path(source)

@@ -139,7 +139,8 @@ def _number(name: str, value: Any, limits: Limits) -> None:
 
 
 def _integer(name: str, value: Any, limits: Limits) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or not _within(value, limits):
+    is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST
+    if not is_whole or not _within(value, limits):
         stated = f" of {_stated(limits)}" if _stated(limits) else ""
         raise ValueError(f"{name} must be an integer{stated}, got {value!r}")
 

@@ -8,6 +8,7 @@ from PIL import Image
 
 from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
+from ..envs.parameters import check_integer
 from .competitors import kind_of, made
 from .evaluate import control_of
 from .files import whole_file
@@ -34,8 +35,7 @@ def episode_frames(
     Raises:
         ValueError: for unknown names, and for reference estimators and bounds, which do not act.
     """
-    if every < 1:
-        raise ValueError(f"every must be at least 1, got {every}")
+    every = check_integer("every", every, 1)
     if kind_of(policy) != "policy":
         raise ValueError(f"{name!r} is no policy: it does not act in the environment")
     cls = task_class(env)

@@ -15,13 +15,14 @@ import xarray
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, opened, task_class
 from ..envs.compiled import Report
+from ..envs.parameters import check_integer
 from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .competitors import RANKED, Kind, check_competitor, kind_of, made
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
-from .parallel import Workers
+from .parallel import Workers, check_workers
 from .rollout import Progress, run_competitor, told
 from .seeds import episode_seeds
 from .threads import one_thread
@@ -208,9 +209,10 @@ def evaluate(
         keywords,
         strict,
     )
+    drawn_episodes = check_integer("drawn_episodes", drawn_episodes, 0)
     if tracks and drawn_episodes:
         raise ValueError("tracks keeps every episode: leave out drawn_episodes")
-    workers = workers or Workers()
+    workers = check_workers(workers)
     block = block_of(next(iter(plan.tasks.values())).horizon)
     pieces = [
         plan.piece(name, first, block, tracks, drawn_episodes, workers.alone)
@@ -403,8 +405,6 @@ def plan_of(
         raise nearest("control", control, cls.controls)
     if not competitors:
         raise ValueError("name at least one policy")
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}

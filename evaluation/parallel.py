@@ -113,6 +113,19 @@ def _sendable(error: Exception) -> Exception:
     return error.with_traceback(None)
 
 
+def check_workers(workers: Any) -> "Workers":
+    """Return who does the work; where nobody is named, this process.
+
+    Raises:
+        ValueError: for anything else, such as a number.
+    """
+    if workers is not None and not isinstance(workers, Workers):
+        raise ValueError(
+            f"workers must be filtergym.evaluation.parallel.Workers, such as Workers(2), got {workers!r}"
+        )
+    return workers or Workers()
+
+
 class Workers:
     """Who does the work; ``with Workers(4) as workers`` ends what was begun for it.
 

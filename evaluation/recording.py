@@ -47,8 +47,7 @@ def record(
         ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
     """
     cls = import_task(env)
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    seeds = episode_seeds(split, seed, episodes)
     chosen = find_scenario(cls, opened(cls, scenario), keywords)
     plain = task_on("numpy", cls.id, scenario=chosen, **keywords)
     if chosen.recording is not None:
@@ -61,7 +60,6 @@ def record(
             "that a recording may hold: record fewer"
         )
     task = task_on(backend, cls.id, scenario=chosen, **keywords).estimated_outside()
-    seeds = episode_seeds(split, seed, episodes)
     chunks = [
         _recorded(task, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
     ]

@@ -219,7 +219,12 @@ def _checked_estimate(
         ("covariance", covariance, (count, count, width)),
     ):
         try:
-            array = numpy.asarray(values, dtype=numpy.float64)
+            given = numpy.asanyarray(values)
+            # What float64 has no room for would vanish in it: masks, imaginary parts, words.
+            if isinstance(given, numpy.ma.MaskedArray) or given.dtype.kind not in "fiub":
+                masked = "a masked array of " * isinstance(given, numpy.ma.MaskedArray)
+                raise TypeError(f"expected an array of real numbers, got {masked}{given.dtype}")
+            array = numpy.asarray(given, dtype=numpy.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"estimator {name!r}: the {word} at measurement {step} is no array: {error}"

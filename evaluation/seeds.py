@@ -3,6 +3,7 @@
 import numpy
 
 from ..envs.catalogue import nearest
+from ..envs.parameters import check_integer
 
 SPLITS = {"train": 0, "validation": 1, "test": 2}
 
@@ -19,12 +20,12 @@ def episode_seeds(split: str, seed: int, episodes: int, first: int = 0) -> list[
         first: how many to skip.
 
     Raises:
-        ValueError: for an unknown split or a negative seed.
+        ValueError: for an unknown split, a seed below zero, or fewer episodes than one.
     """
-    if split not in SPLITS:
+    if not isinstance(split, str) or split not in SPLITS:
         raise nearest("split", split, SPLITS)
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
+    episodes = check_integer("episodes", episodes, 1)
+    seed = check_integer("seed", seed, 0)
     sequence = numpy.random.SeedSequence([SPLITS[split], seed])
     words = sequence.generate_state(first + episodes, numpy.uint64)
     return [int(word) for word in words[first:]]

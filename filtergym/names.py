@@ -126,6 +126,10 @@ def competitors_of(
     """Return what makes each of some competitors, by their names; arguments and refusals as of :func:`evaluate`."""
     if isinstance(competitors, str | Path):
         competitors = [competitors]
+    if not isinstance(competitors, Mapping | Sequence):
+        raise ValueError(
+            f"competitors are a name, a sequence of names, or a mapping from names to policies, got {competitors!r}"
+        )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     id = import_task(env).id
     for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():

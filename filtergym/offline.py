@@ -119,8 +119,6 @@ def write_datasets(
     cls = import_task(env)
     asked = list(policies or default_policies(cls.id, control))
     chosen = [str(policy) for policy in asked]
-    if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, got {episodes}")
     seeds = episode_seeds(split, seed, episodes)
     if split != "test":
         try:

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 from rich.table import Table
 
 from ..evaluation.files import whole_files, write_text
-from ..evaluation.parallel import Workers
+from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.print_layout import save
 from .grid import Grid, markdown_table
 
@@ -53,7 +53,7 @@ def gathered(results: Any, progress: Progress, workers: Workers | None = None) -
     """
     units: list[Later] = []
     _places(results, units.append)
-    done = (workers or Workers()).results(_unit, units, [1] * len(units), progress)
+    done = check_workers(workers).results(_unit, units, [1] * len(units), progress)
     found = iter(done)
     return _places(results, lambda unit: next(found))
 

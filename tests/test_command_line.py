@@ -227,7 +227,7 @@ def test_a_table_says_what_its_references_know(run):
         (("evaluate", ENV, "--set", "gains=(0.3,"), "cannot read the value"),
         (("evaluate", ENV, "--set", "gains=(0.3, 1.7)"), "gains[1] must be a finite number above"),
         (("evaluate", ENV, "--set", "transition=((0.5, 0.4), (0.1, 0.9))"), "must sum to 1"),
-        (("evaluate", ENV, "--episodes", "0"), "episodes must be at least 1"),
+        (("evaluate", ENV, "--episodes", "0"), "episodes must be an integer of at least 1"),
         (("evaluate", ENV, "--out", "/proc/nowhere"), "cannot write to folder"),
         (("evaluate", ENV, "--scenario", "missing.csv"), "cannot read trajectory"),
         (("tune", ENV, "--policy", "imm", "--scenario", "atc"), "held out"),

@@ -7,6 +7,7 @@ from filtergym.envs.catalogue import catalogue, make_task, task_class
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.evaluation.seeds import episode_seeds
 
+import filtergym
 from filtergym import evaluate
 from filtergym.names import competitor
 
@@ -202,17 +203,69 @@ class TestPolicies:
     ("arguments", "message"),
     [
         ({"scenario": "papper"}, "did you mean 'paper'"),
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"seed": -1}, "seed must not be negative"),
+        ({"episodes": 0}, "episodes must be an integer of at least 1"),
+        ({"seed": -1}, "seed must be an integer of at least 0"),
         ({"split": "tset"}, "did you mean 'test'"),
         ({"control": "wieghts"}, "did you mean 'weights'"),
         ({"gains": (0.3, 1.5)}, "gains"),
         ({"gain": (0.3, 0.5)}, "did you mean 'gains'"),
+        ({"episodes": 1.5}, "episodes must be an integer of at least 1, got 1.5"),
+        ({"episodes": True}, "episodes must be an integer of at least 1, got True"),
+        ({"seed": 1.5}, "seed must be an integer of at least 0, got 1.5"),
+        ({"split": ["test"]}, "unknown split"),
+        ({"drawn_episodes": -1}, "drawn_episodes must be an integer of at least 0, got -1"),
+        ({"workers": 2}, r"workers must be .*Workers\(2\), got 2"),
+        (
+            {"sampling_interval": 1e300},
+            "sampling_interval must be a finite number .* at most 86400.0, got 1e",
+        ),
     ],
 )
 def test_evaluation_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         evaluate(ID, ["random"], **{"episodes": 1, **arguments})
+
+
+def test_further_arguments_of_another_type():
+    with pytest.raises(ValueError, match="competitors are a name, a sequence of names, or a mapping"):
+        evaluate(ID, 3)
+    with pytest.raises(ValueError, match=r"speeds must be 2 numbers, got 1\.5"):
+        filtergym.read_flights("nowhere.csv", speeds=1.5)
+    with pytest.raises(ValueError, match="horizon must be an integer of at least 1, got 1000"):
+        gym.make(ID, horizon=10**400)
+
+
+class Answering:
+    """An estimator that answers with one mean."""
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def start(self, initial, N):
+        return initial
+
+    def update(self, measurement, memory):
+        return self.answer(memory.mean), memory.covariance, memory
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (lambda mean: mean + 0j, "no array: expected an array of real numbers, got complex128"),
+        (lambda mean: np.ma.masked_array(mean, mean > 0.0), "real numbers, got a masked array of float64"),
+        (lambda mean: mean.astype(str), "expected an array of real numbers, got <U"),
+        (lambda mean: None, "expected an array of real numbers, got object"),
+    ],
+)
+def test_means_that_are_no_numbers(answer, message):
+    with pytest.raises(ValueError, match=message):
+        evaluate(ID, {"own": Answering(answer)}, episodes=1)
+
+
+@pytest.mark.parametrize("path", [None, 3, [None], {}])
+def test_a_recording_that_is_no_path(path):
+    with pytest.raises(ValueError, match="files are named by a path or a pattern"):
+        filtergym.read_recording(path)
 
 
 def test_splits_and_seeds_share_no_episode():

@@ -212,7 +212,7 @@ def test_the_command_writes_and_refuses(minari, command, tmp_path):
         (("--control", "gain"), "made for control 'weights'"),
         (("--namespace", "../x"), "Malformed"),
         (("--set", "rewrd=cost"), "did you mean 'reward'"),
-        (("--episodes", "0"), "episodes must be at least 1"),
+        (("--episodes", "0"), "episodes must be an integer of at least 1"),
     ):
         code, _, errors = command(*words, "--namespace", "other", *more)
         assert code == 2

@@ -24,7 +24,7 @@ from filtergym.evaluation.dataset import groups_of, windows_of
 from filtergym.evaluation.evaluate import check_sendable
 from filtergym.evaluation.files import whole_file
 from filtergym.evaluation.metrics import reported_components, score, squared_errors
-from filtergym.evaluation.parallel import Workers
+from filtergym.evaluation.parallel import Workers, check_workers
 from filtergym.evaluation.summary import Asked
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
@@ -239,7 +239,7 @@ def episode_means(
             known_as = "agent" if name in agents else name
             asked = Asked(importable, known_as, maker, scenario, episodes, seed, split, control)
             work.append(asked._replace(horizon=horizon))
-    workers = workers or Workers()
+    workers = check_workers(workers)
     if not workers.alone:
         for asked in work:
             check_sendable(importable, {asked.name: asked.maker})

@@ -9,7 +9,7 @@ from ..parameters import TaskParameters, parameter, sized, square_matrix
 class ManeuveringTargetParameters(TaskParameters):
     """Every constant of the task; each is a keyword of ``gym.make``."""
 
-    sampling_interval: float = parameter(6.0, above=0.0)
+    sampling_interval: float = parameter(6.0, above=0.0, at_most=86400.0)
     """Scan period T, s (paper)."""
     horizon: int = parameter(100, at_least=1)
     """Scans acted on in one episode (paper: the axis of its figure 5)."""

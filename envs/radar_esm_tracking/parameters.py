@@ -13,7 +13,7 @@ STANDARD_GRAVITY = 9.81
 class RadarEsmTrackingParameters(TaskParameters):
     """Every constant of the task; each is a keyword of ``gym.make``."""
 
-    sampling_interval: float = parameter(0.5, above=0.0)
+    sampling_interval: float = parameter(0.5, above=0.0, at_most=86400.0)
     """Radar revisit time T, s (paper)."""
     horizon: int = parameter(120, at_least=1)
     """Scans acted on in one episode (ours: 60 s; the paper does not say)."""

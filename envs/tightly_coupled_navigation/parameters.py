@@ -47,7 +47,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Measurements in an episode. Paper: 3000; ours for training: 6 s."""
     decision_interval: int = parameter(10, at_least=1)
     """Measurements for which an action holds. Ours: ten decisions a second."""
-    sampling_interval: float = parameter(0.01, above=0.0)
+    sampling_interval: float = parameter(0.01, above=0.0, at_most=86400.0)
     """Step T, s. Ours: the paper's smallest adaptation time must be one step at least."""
 
     latitude: float = parameter(53.9, at_least=-90.0, at_most=90.0)

@@ -53,7 +53,7 @@ class UavAutopilotParameters(TaskParameters):
     plant: str = parameter("U", choices=tuple(COORDINATES))
     """"P": the paper's double integrator. "U": the pitch channel of a small aircraft, ours, because the
     paper's model has neither actuator nor gusts."""
-    sampling_interval: float | None = parameter(None, above=0.0)
+    sampling_interval: float | None = parameter(None, above=0.0, at_most=86400.0)
     """T, s. P: 0.25 (paper). U: 0.02, ours: fast against the actuator."""
     horizon: int = parameter(600, at_least=1)
     """Measurements in an episode. Ours: some thirty settling times of either loop."""

@@ -17,7 +17,7 @@ from ..envs.catalogue import catalogue, short_name, task_class
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
-from ..evaluation.parallel import Workers
+from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.summary import Asked, Summary, combine_summaries, summaries
 from ..names import asked_of
 from .results import (
@@ -218,7 +218,7 @@ def run_benchmark(
             finished(due)
             told += 1
 
-    workers = workers or Workers()
+    workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
             key=lambda one: -one[0].measurements * baselines_of(one[0].environment).measurement_seconds
