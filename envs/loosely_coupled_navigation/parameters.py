@@ -22,9 +22,9 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     """Length of the episode, s; where given it sets the horizon to the nearest number of measurements."""
     decision_interval: int = parameter(1, at_least=1)
     """Measurements for which one action holds; ours: the time-varying gain is exact only with 1."""
-    sampling_interval: float = parameter(0.01, above=0.0)
+    sampling_interval: float = parameter(0.01, above=0.0, at_most=1e3)
     """From one measurement to the next, s; ours: K times it stays below 0.05 for every tuning, so sampling
-    costs little."""
+    costs little. From 1e5 on the filter of the augmented state overflows."""
 
     reference_amplitude: float = parameter(2.0, at_least=0.0)
     """Of the reference motion, m; ours, as in Figs. 4 and 5."""

@@ -12,6 +12,17 @@ from ..parameters import TaskParameters, parameter, sized, square_matrix
 REST, LINE, SINGER = 0, 1, 2
 HYPOTHESES = ("rest", "constant-velocity", "singer")
 DEGREE = math.pi / 180.0
+KNOWN_BY = {
+    "pseudorange_sigma": ("initial_position_sigma", "initial_clock_sigma"),
+    "rate_sigma": (
+        "initial_velocity_sigma", "initial_drift_sigma", "rest_velocity_sigma", "increment_sigma",
+    ),
+    "accelerometer_sigma": ("initial_acceleration_sigma", "reset_acceleration_sigma", "singer_sigma"),
+    "attitude_sigma": ("initial_attitude_sigma", "attitude_rate_sigma", "angle_walk"),
+}  # fmt: skip
+"""Standard deviations of what each sensor reads, as they are before it does."""
+LARGEST_RATIO = 1e6
+"""Of them to that of the sensor: squared, it takes twelve of the sixteen digits."""
 
 
 class SensorGroup(NamedTuple):
@@ -122,7 +133,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     """Of the random course. Ours."""
     leg_duration: tuple[float, float] = parameter((1.0, 3.0), at_least=0.0, ascending=True)
     """Limits of the duration of a random leg, s. Ours."""
-    strength: tuple[float, float] = parameter((2.0, 40.0), at_least=0.0, ascending=True)
+    strength: tuple[float, float] = parameter((2.0, 40.0), at_least=0.0, at_most=1e4, ascending=True)
     """Limits of the acceleration with which a random manoeuvre begins, m/s^2. Ours."""
     initial_speed: tuple[float, float] = parameter((0.0, 300.0), at_least=0.0, ascending=True)
     """Limits of the speed of a random course that does not start at rest, m/s. Ours."""
@@ -214,6 +225,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
             raise ValueError(
                 f"satellites_outage_probability takes two satellites, got {self.satellites!r}: set it to 0"
             )
+        self._check_digits()
         times = self.epoch + self.sampling_interval * numpy.array([0.0, self.horizon + 1.0])
         local, _ = satellites.local_orbits(self.satellites, times, *self.site)
         lowest = satellites.look_angles(local)[1].min(axis=1) / DEGREE
@@ -226,6 +238,17 @@ class TightlyCoupledNavigationParameters(TaskParameters):
         if len(self.satellites) >= 4:
             first = local[:, :, 0]
             satellites.dilution_of_precision(first / numpy.sqrt((first**2).sum(axis=0)))
+
+    def _check_digits(self) -> None:
+        """Check that a reading leaves a covariance digits: its square is subtracted from that of what was unknown."""
+        for sensor, unknowns in KNOWN_BY.items():
+            known = getattr(self, sensor)
+            for name in unknowns:
+                if (unknown := getattr(self, name)) > LARGEST_RATIO * known:
+                    raise ValueError(
+                        f"{name} must be at most {LARGEST_RATIO:g} times {sensor}, got {unknown!r} and {known!r}: "
+                        "the covariance would have no digits left"
+                    )
 
     @property
     def site(self) -> tuple[float, float, float]:
