@@ -42,9 +42,9 @@ core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch
 	build/$(ENVIRONMENT)/bin/python -m pip install --quiet --constraint $(VERSIONS) --editable . pytest hypothesis
 	OMP_NUM_THREADS=1 build/$(ENVIRONMENT)/bin/python -m pytest $(CORE_TESTS)
 
-test-lowest:  ## core tests with the lowest versions that pyproject.toml declares
+test-lowest: $(VENV)/.dev  ## core tests with the lowest versions that pyproject.toml declares
 	mkdir -p build
-	$(PYTHON) tests/check_extras.py --lowest > build/lowest.txt
+	$(BIN)/python tests/check_extras.py --lowest > build/lowest.txt
 	$(MAKE) core-tests ENVIRONMENT=lowest VERSIONS=build/lowest.txt
 
 test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages change what others import
@@ -63,7 +63,7 @@ test-extras: test-cluster test-lowest  ## each extra alone does its work, and is
 	OMP_NUM_THREADS=1 build/lowest/bin/python tests/check_extras.py build/extras-lowest --present
 
 test-pythons:  ## core tests with every newer Python that is found
-	@for version in 3.12 3.13; do \
+	@for version in 3.12 3.13 3.14; do \
 	  if python$$version -c "" 2> /dev/null; then \
 	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
 	  else echo "Python $$version is not here: its core tests are skipped."; fi; \
