@@ -21,11 +21,12 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
 # What reads files beside the packages, so that an unpacked source distribution must hold them.
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
   test_example_environment.py test_observation.py test_reproduction.py)
+EXTRAS := agents,fast,search,tensorboard,report,render,flights,adapters,offline,cluster
 # A link that leads nowhere, or a page that no other leads to, is an error.
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-pythons distributions check format docs clean
+.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -41,10 +42,9 @@ core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch
 	build/$(ENVIRONMENT)/bin/python -m pip install --quiet --constraint $(VERSIONS) --editable . pytest hypothesis
 	OMP_NUM_THREADS=1 build/$(ENVIRONMENT)/bin/python -m pytest $(CORE_TESTS)
 
-test-lowest:  ## core tests with the lowest versions that pyproject.toml declares
+test-lowest: $(VENV)/.dev  ## core tests with the lowest versions that pyproject.toml declares
 	mkdir -p build
-	$(PYTHON) -c "import tomllib; project = tomllib.load(open('pyproject.toml', 'rb'))['project']; \
-	  print('\n'.join(project['dependencies']).replace('>=', '=='))" > build/lowest.txt
+	$(BIN)/python tests/check_extras.py --lowest > build/lowest.txt
 	$(MAKE) core-tests ENVIRONMENT=lowest VERSIONS=build/lowest.txt
 
 test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages change what others import
@@ -54,8 +54,16 @@ test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages
 	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[cluster]"
 	OMP_NUM_THREADS=1 build/cluster/bin/python -m pytest tests/test_parallel.py -k cluster
 
+test-extras: test-cluster test-lowest  ## each extra alone does its work, and is asked for where it is missing; lowest versions
+	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	OMP_NUM_THREADS=1 build/cluster/bin/python tests/check_extras.py build/extras
+	# Torch stays the tested one: older ones come with all of CUDA.
+	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest/lib/python*/site-packages/
+	build/lowest/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
+	OMP_NUM_THREADS=1 build/lowest/bin/python tests/check_extras.py build/extras-lowest --present
+
 test-pythons:  ## core tests with every newer Python that is found
-	@for version in 3.12 3.13; do \
+	@for version in 3.12 3.13 3.14; do \
 	  if python$$version -c "" 2> /dev/null; then \
 	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
 	  else echo "Python $$version is not here: its core tests are skipped."; fi; \

@@ -207,6 +207,23 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
         )
 
 
+def _riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+    """Stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
+
+    Raises:
+        ValueError: where it exists, but has no digits left in float64.
+    """
+    from scipy import linalg
+
+    try:
+        return getattr(linalg, f"solve_{kind}_are")(A, B, Q, R)
+    except numpy.linalg.LinAlgError as error:
+        raise ValueError(
+            "the numbers of the plant must be nearer to each other: the Riccati equation cannot be solved in "
+            f"float64, with Q = {Q.tolist()} and R = {R.tolist()} ({error})"
+        ) from error
+
+
 def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
     """Steady discrete Kalman filter (12), from the discrete algebraic Riccati equation.
 
@@ -219,10 +236,8 @@ def steady_kalman(F: Matrix, H: Matrix, Q: Matrix, R: Matrix) -> SteadyFilter:
     Raises:
         ValueError: where no stabilising solution exists, with the mode to blame.
     """
-    from scipy.linalg import solve_discrete_are
-
     _check_filter(F, H, Q, R, continuous=False)
-    predicted = solve_discrete_are(F.T, H.T, Q, R)
+    predicted = _riccati_solution("discrete", F.T, H.T, Q, R)
     gain = numpy.linalg.solve(H @ predicted @ H.T + R, H @ predicted).T
     rest = numpy.eye(len(F)) - gain @ H
     posterior = rest @ predicted @ rest.T + gain @ R @ gain.T
@@ -243,13 +258,11 @@ def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: Arra
     Raises:
         ValueError: where no stabilising solution exists, with the mode to blame.
     """
-    from scipy.linalg import solve_continuous_are
-
     A = square_matrix("A", A)
     H = numpy.atleast_2d(numpy.asarray(H, float))
     intensity, R = intensity_matrix("intensity", intensity, len(A)), square_matrix("R", R, len(H))
     _check_filter(A, H, intensity, R, continuous=True)
-    P = solve_continuous_are(A.T, H.T, intensity, R)
+    P = _riccati_solution("continuous", A.T, H.T, intensity, R)
     gain = numpy.linalg.solve(R, H @ P).T
     return SteadyFilter(gain, P, P, numpy.linalg.eigvals(A - gain @ H))
 
@@ -293,10 +306,8 @@ def discrete_regulator(F: Matrix, B: Matrix, weight: Matrix, control_weight: Mat
     Raises:
         ValueError: where no stabilising solution exists, with the reason.
     """
-    from scipy.linalg import solve_discrete_are
-
     _check_regulator(F, B, weight, control_weight)
-    S = solve_discrete_are(F, B, weight, control_weight)
+    S = _riccati_solution("discrete", F, B, weight, control_weight)
     regret = control_weight + B.T @ S @ B
     return Regulator(numpy.linalg.solve(regret, B.T @ S @ F), regret)
 

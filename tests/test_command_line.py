@@ -165,7 +165,6 @@ def test_list_of_one_environment(run):
 
 
 def test_animate_draws_every_policy(tmp_path, run):
-    pytest.importorskip("PIL")
     result = run(
         "animate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--policy", "ppo", "--every", "50",
         "--out", "new",

@@ -523,12 +523,8 @@ def animate(
 
     Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
     """
-    try:
-        from ..evaluation.animation import episode_frames, write_animation
-    except ImportError as error:
-        raise ValueError(
-            f"animations need more packages: pip install 'filtergym[render]' ({error})"
-        ) from error
+    from ..evaluation.animation import episode_frames, write_animation
+
     cls = task_class(environment)
     writable_folder(out)
     for name in policy:
