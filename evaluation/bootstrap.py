@@ -16,7 +16,7 @@ too narrow.
 
 import functools
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -39,12 +39,15 @@ class Estimate(NamedTuple):
     high: float
 
 
+def ratio(sums: numpy.ndarray) -> numpy.ndarray:
+    """First over second of what stands on the second axis, ``(n, 2, ...)``; NaN where the second is zero."""
+    first, second = sums[:, 0], sums[:, 1]
+    return numpy.divide(first, second, out=numpy.full(first.shape, numpy.nan), where=second > 0.0)
+
+
 def mean_of_sums(sums: numpy.ndarray) -> numpy.ndarray:
     """Means from what all episodes contribute to :meth:`Bootstrap.sums`; NaN where nobody has a number."""
-    if sums.shape[1] == 1:
-        return sums[:, 0]
-    values, present = sums[:, 0], sums[:, 1]
-    return numpy.divide(values, present, out=numpy.full(values.shape, numpy.nan), where=present > 0.0)
+    return sums[:, 0] if sums.shape[1] == 1 else ratio(sums)
 
 
 def percentile_interval(samples: numpy.ndarray) -> numpy.ndarray:
@@ -122,11 +125,6 @@ class Bootstrap:
             self._last = episodes, self.counts[:, episodes] / self.totals[:, None]
         return self._last[1]
 
-    def by_resamples(self, order: numpy.ndarray) -> Iterator[numpy.ndarray]:
-        """Share of the episodes in an order, ``(some, episodes)``, of the data and some resamples after the other."""
-        for i in range(0, len(self.counts), AT_ONCE):
-            yield self.counts[i : i + AT_ONCE, order] / self.totals[i : i + AT_ONCE, None]
-
     def sums(
         self, values: Sequence[numpy.ndarray], first: int = 0, resamples: int | None = None
     ) -> list[numpy.ndarray]:
@@ -168,19 +166,28 @@ class Bootstrap:
         parts = (self.sums([values[i : i + BLOCK]], i)[0] for i in range(0, len(values), BLOCK))
         return mean_of_sums(functools.reduce(operator.add, parts))
 
-    def medians(self, values: numpy.ndarray) -> numpy.ndarray:
-        """Medians over the episodes and over every resample of them, ``(1 + resamples,)``.
+    def quantiles(
+        self, values: numpy.ndarray, share: float = 0.5, chosen: numpy.ndarray | None = None
+    ) -> numpy.ndarray:
+        """Quantiles over the episodes and over every resample of them, ``(1 + resamples,)``.
+
+        The smallest value that at least that share of the weight does not exceed; NaN where nobody is chosen.
 
         Args:
             values: one for each episode, ``(episodes,)``.
+            share: such as 0.5 for the median.
+            chosen: which episodes count, ``(episodes,)`` booleans; None: all.
         """
-        order = numpy.argsort(values)
-        # The smallest value that at least half of the sample does not exceed; a little off for rounding.
-        found = [
-            (numpy.cumsum(weights, axis=1) >= 0.5 - 1e-9).argmax(axis=1)
-            for weights in self.by_resamples(order)
-        ]
-        return values[order][numpy.concatenate(found)]
+        chosen = numpy.ones(len(values), dtype=bool) if chosen is None else chosen
+        order = numpy.argsort(numpy.where(chosen, values, numpy.inf))
+        ordered, found = values[order], []
+        for i in range(0, len(self.counts), AT_ONCE):
+            weights = self.counts[i : i + AT_ONCE, order] / self.totals[i : i + AT_ONCE, None]
+            weights = numpy.cumsum(weights * chosen[order], axis=1)
+            # Rounding of the sums must not move a share that is met exactly.
+            enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
+            found.append(numpy.where(weights[:, -1] > 0.0, ordered[enough.argmax(axis=1)], numpy.nan))
+        return numpy.concatenate(found)
 
     def interval(self, statistics: numpy.ndarray) -> Estimate:
         """Percentile interval of a statistic computed from :meth:`means`, ``(1 + resamples,)``."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .bootstrap import block_of, percentile_interval
+from .bootstrap import block_of, percentile_interval, ratio
 from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
@@ -91,7 +91,7 @@ class CompetitorCurves(NamedTuple):
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
     """Take the curves out of the results of :func:`curve_statistics` over all episodes of a competitor."""
-    curves: dict[str, numpy.ndarray] = {}
+    curves = {"mean_cost": numpy.array(results["cost",].mean())} if ("cost",) in results else {}
     labels: dict[str, list[str]] = {}
     for (kind, *words), endings in results.items():
         if kind == "curve":
@@ -123,9 +123,7 @@ def curve_statistics(
         yield Statistic(("curve", "rmse"), squares, _rmse, resamples)
         if str(run["kind"].values) != "bound":
             yield Statistic(("curve", "error_exceeded"), squares, _exceeded, sample=distributed)
-            yield Statistic(
-                ("curve", "mean_cost"), mean_over_time(run, run["cost"].values), _mean, sample=ALL
-            )
+            yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     for name in ("mode_probability", "true_class_probability"):
         if name in run:
             values = run[name].transpose("episode", ..., "time").values
@@ -303,16 +301,9 @@ def _exceeded(squares: numpy.ndarray) -> Curve:
     return {"": numpy.stack([exceeded_errors(each) for each in errors])}
 
 
-def _mean(values: numpy.ndarray) -> Curve:
-    return {"": numpy.array(values.mean())}
-
-
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:
     """Mean NEES or NIS over its dimension, and the sum of the dimensions, from the means of both, ``(1, 2, time)``."""
-    total, dimension = means[0]
-    nothing = numpy.full(len(total), numpy.nan)
-    mean = numpy.divide(total, dimension, out=nothing, where=dimension > 0.0)
-    return {"": mean, "_dimension": episodes * dimension}
+    return {"": ratio(means)[0], "_dimension": episodes * means[0, 1]}
 
 
 def _present(name: str, dims: tuple[str, ...], values: numpy.ndarray) -> dict[str, Series]:

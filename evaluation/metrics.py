@@ -13,10 +13,10 @@ import numpy
 import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
-from .bootstrap import RESAMPLES, Bootstrap, Estimate
+from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
-from .statistics import ALL, Key, Statistic, reduce_run
+from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
 from .threads import one_thread
 
 if TYPE_CHECKING:
@@ -71,28 +71,17 @@ def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
     return units | {name: units[parts[0]] for name, parts in groups_of(dataset).items()}
 
 
-def mean_of_present(values: numpy.ndarray, bootstrap: Bootstrap) -> Estimate:
-    """Mean over episodes and times of what is there: NaN stands for no measurement, or no event.
-
-    A ratio of two sums, so that an episode counts by what it has; NaN where nothing is there at all.
+def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
+    """Sum of every episode over the times, and how many there are, of which :func:`.bootstrap.ratio` is the mean.
 
     Args:
-        values: ``(episodes, time)``.
-        bootstrap: over the episodes.
+        values: ``(episodes, time)``; NaN stands for no measurement, or no event.
+
+    Returns:
+        ``(episodes, 2)``.
     """
-    return bootstrap.estimate(_sums_of_present(values), _ratio)
-
-
-def _sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
-    """Sum over the times of every episode, and how many there are, ``(episodes, 2)``."""
     present = ~numpy.isnan(values)
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
-
-
-def _ratio(means: numpy.ndarray) -> numpy.ndarray:
-    """First over second; NaN where the second is zero."""
-    nothing = numpy.full(len(means), math.nan)
-    return numpy.divide(means[:, 0], means[:, 1], out=nothing, where=means[:, 1] > 0.0)
 
 
 def bootstrap_of(dataset: xarray.Dataset, resamples: int = RESAMPLES) -> Bootstrap:
@@ -110,18 +99,7 @@ def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
     """
     if "flight" not in run.coords:
         return values.mean(axis=1)
-    present = ~numpy.isnan(values)
-    nothing = numpy.full(len(values), math.nan)
-    return numpy.divide(
-        numpy.where(present, values, 0.0).sum(axis=1),
-        present.sum(axis=1),
-        out=nothing,
-        where=present.any(axis=1),
-    )
-
-
-def _minus(means: numpy.ndarray) -> numpy.ndarray:
-    return -means
+    return ratio(sums_of_present(values))
 
 
 def _peak(means: numpy.ndarray) -> numpy.ndarray:
@@ -130,57 +108,50 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
     return found
 
 
-def record_statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]:
+def record_statistics(
+    run: xarray.Dataset, episodes: int, metrics: "OwnMetrics | None" = None
+) -> Iterator[Statistic]:
     """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
 
     Args:
         run: some episodes of one competitor.
         episodes: of the whole evaluation.
+        metrics: the environment's own.
     """
     groups, slices = groups_of(run), slices_of(run)
     is_bound = str(run["kind"].values) == "bound"
     judged = run.attrs.get("truth", True)
+
+    def means(metric: str, component: str, unit: str, values: Any, function: Function = identity) -> Any:
+        """Mean over every window."""
+        for window, times in slices.items():
+            mean = mean_over_time(run, values[:, times])
+            yield Statistic(("record", metric, component, window, unit), mean, function)
+
     for component, unit in reported_components(run).items() if judged else ():
         squares = squared_errors(run, component, groups)
-        for window, times in slices.items():
-            yield Statistic(
-                ("record", "rmse", component, window, unit),
-                mean_over_time(run, squares[:, times]),
-                numpy.sqrt,
-            )
+        yield from means("rmse", component, unit, squares, numpy.sqrt)
         yield Statistic(("record", "peak_rmse", component, "all", unit), squares, _peak)
         if not is_bound and component not in groups:
-            signed = run["error"].sel(component=component).values
-            for window, times in slices.items():
-                values = mean_over_time(run, signed[:, times])
-                yield Statistic(("record", "mean_error", component, window, unit), values)
+            yield from means("mean_error", component, unit, run["error"].sel(component=component).values)
     for metric in consistency_metrics(run):
-        for window, times in slices.items():
-            yield from _consistency(run.isel(time=times), metric, window, episodes)
+        yield from _consistency(run, metric, episodes)
     if "mode_probability" in run and not numpy.isnan(run["mode_probability"].values).all():
         for mode in run["mode"].values.tolist():
-            probability = run["mode_probability"].sel(mode=mode).values
-            for window, times in slices.items():
-                values = mean_over_time(run, probability[:, times])
-                yield Statistic(("record", "mean_mode_probability", mode, window, "1"), values)
+            yield from means(
+                "mean_mode_probability", mode, "1", run["mode_probability"].sel(mode=mode).values
+            )
     says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
     if says or not judged:  # there is nothing else of an estimator of one's own then
+        shape = (run.sizes["episode"], run.sizes["time"])
+        said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
         for window, times in slices.items():
-            shape = (run.sizes["episode"], run.sizes["time"])
-            said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
-            yield Statistic(
-                ("record", "log_likelihood", "measurement", window, "nat"),
-                _sums_of_present(said[:, times]),
-                _ratio,
-                optional=True,
-            )
+            yield _mean_of_present("log_likelihood", "measurement", window, "nat", said[:, times])
     if not is_bound and judged:
-        cost = run["cost"].values
-        for window, times in slices.items():
-            yield Statistic(("record", "cost", "", window, "1"), mean_over_time(run, cost[:, times]))
+        yield from means("cost", "", "1", run["cost"].values)
         charge = run["charge"].values
         total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
-        yield Statistic(("record", "return", "", "all", "1"), total, _minus)
+        yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     if "lost" in run and not numpy.isnan(run["lost"].values).all():
@@ -188,9 +159,18 @@ def record_statistics(run: xarray.Dataset, episodes: int) -> Iterator[Statistic]
         share = (losses[:, 1] > 0.0).astype(float)
         yield Statistic(("record", "lost_episodes", "", "all", "1"), share)
         yield Statistic(("losses",), losses, count_losses, sample=ALL)
+    if metrics is not None:
+        yield from metrics.statistics(run)
 
 
-def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -> Iterator[Statistic]:
+def _mean_of_present(metric: str, component: str, window: str, unit: str, values: numpy.ndarray) -> Statistic:
+    """Mean over episodes and times of what is there; a block of episodes may have nothing."""
+    return Statistic(
+        ("record", metric, component, window, unit), sums_of_present(values), ratio, optional=True
+    )
+
+
+def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[Statistic]:
     """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
 
     The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
@@ -199,27 +179,17 @@ def _consistency(run: xarray.Dataset, metric: str, window: str, episodes: int) -
     component = "state" if metric == "nees" else "measurement"
     values, degrees = run[metric].values, consistency_degrees(run, metric)
     normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
-    yield Statistic(
-        ("record", f"a{metric}", component, window, "1"), _sums_of_present(normalised), _ratio, optional=True
-    )
+    there = ~numpy.isnan(normalised)
     low, high = chi_square_band(degrees)
-    inside = numpy.where(numpy.isnan(normalised), numpy.nan, (values >= low) & (values <= high))
-    yield Statistic(
-        ("record", f"{metric}_inside", component, window, "1"),
-        _sums_of_present(inside),
-        _ratio,
-        optional=True,
-    )
-    if metric == "nis":
-        there = ~numpy.isnan(normalised)
-        inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
-        sums = numpy.stack([there.sum(axis=1), inverse.sum(axis=1)], axis=1)
-        yield Statistic(
-            ("record", "anis_band", component, window, "1"),
-            sums,
-            functools.partial(_band, episodes=episodes),
-            optional=True,
-        )
+    inside = numpy.where(there, (values >= low) & (values <= high), numpy.nan)
+    inverse = numpy.divide(1.0, degrees, out=numpy.zeros(degrees.shape), where=there)
+    for window, times in slices_of(run).items():
+        yield _mean_of_present(f"a{metric}", component, window, "1", normalised[:, times])
+        yield _mean_of_present(f"{metric}_inside", component, window, "1", inside[:, times])
+        if metric == "nis":
+            sums = numpy.stack([there[:, times].sum(axis=1), inverse[:, times].sum(axis=1)], axis=1)
+            key = ("record", "anis_band", component, window, "1")
+            yield Statistic(key, sums, functools.partial(_band, episodes=episodes), optional=True)
 
 
 def _band(means: numpy.ndarray, episodes: int) -> Estimate:
@@ -323,7 +293,7 @@ class _Against:
         found = {
             "cost_difference": bootstrap.interval(cost - paper),
             "relative_cost_difference": bootstrap.relative_difference(cost, paper),
-            "median_cost_ratio": bootstrap.interval(bootstrap.medians(self.ratios[name])),
+            "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
             "win_rate": bootstrap.interval(self.wins[name]),
         }
         if self.reference in self.costs:
@@ -384,12 +354,7 @@ def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -
     bootstrap = bootstrap_of(dataset)
     # Of a recording, an environment's own metrics would ask for more of the truth than it holds.
     own = None if dataset.attrs.get("recorded") else metrics
-
-    def declare(run: xarray.Dataset) -> Iterator[Statistic]:
-        yield from record_statistics(run, bootstrap.episodes)
-        if own is not None:
-            yield from own.statistics(run)
-
+    declare = functools.partial(record_statistics, episodes=bootstrap.episodes, metrics=own)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
     contenders = [
         contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own) for run in runs
@@ -403,7 +368,7 @@ def contender_of(
     """Return what the records of a competitor are made of.
 
     Args:
-        results: of :func:`record_statistics`, and of the environment's own metrics.
+        results: of :func:`record_statistics`.
         run: its part of an evaluation, of whose variables none is needed.
         bootstrap: over the episodes.
         metrics: the environment's own.

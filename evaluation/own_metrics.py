@@ -14,7 +14,7 @@ import xarray
 
 from .bootstrap import Bootstrap
 from .metrics import Measure
-from .statistics import ALL, Key, Statistic, reduce_run
+from .statistics import ALL, Key, Statistic
 
 Arrays = Mapping[str, numpy.ndarray]
 
@@ -67,12 +67,3 @@ class OwnMetrics:
             *({key[1]: results[key] for key in results if key[0] == f} for f in Gathered._fields)
         )
         return self.measures(gathered, bootstrap, evaluation)
-
-    def __call__(self, run: xarray.Dataset, bootstrap: Bootstrap) -> list[Measure]:
-        """Return the measures of one competitor.
-
-        Args:
-            run: one policy's part of an evaluation, all of its episodes.
-            bootstrap: over them.
-        """
-        return self.measures_of(reduce_run(run, self.statistics, bootstrap).results(), bootstrap, run)

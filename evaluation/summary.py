@@ -117,13 +117,11 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
     """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
 
     Raises:
-        ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
+        ValueError: as :func:`reduce_episodes`.
     """
 
     def declare(run: xarray.Dataset) -> Iterator[Statistic]:
-        yield from record_statistics(run, asked.episodes)
-        if asked.metrics is not None:
-            yield from asked.metrics.statistics(run)
+        yield from record_statistics(run, asked.episodes, asked.metrics)
         yield from curve_statistics(run, asked.episodes)
 
     part = reduce_episodes(asked, declare, tick)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import xarray
-from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.metrics import mean_of_present
+from filtergym.evaluation.bootstrap import Bootstrap, ratio
+from filtergym.evaluation.metrics import sums_of_present
 from filtergym.evaluation.statistics import ALL, Statistic, reduce_run
 from scipy import stats
 
@@ -60,14 +60,14 @@ def test_the_mean_of_what_is_present_pools_over_episodes():
     values[rng.random(values.shape) < 0.4] = np.nan
     values[3] = np.nan
     bootstrap = Bootstrap(30)
-    found = mean_of_present(values, bootstrap)
+    found = bootstrap.estimate(sums_of_present(values), ratio)
     assert found.value == pytest.approx(np.nanmean(values), rel=1e-12)
     assert found.low < found.value < found.high
     full = rng.normal(size=(30, 20))
     np.testing.assert_allclose(
-        mean_of_present(full, bootstrap), bootstrap.estimate(full.mean(axis=1)), rtol=1e-10
+        bootstrap.estimate(sums_of_present(full), ratio), bootstrap.estimate(full.mean(axis=1)), rtol=1e-10
     )
-    assert np.isnan(mean_of_present(np.full((30, 5), np.nan), bootstrap)).all()
+    assert np.isnan(bootstrap.estimate(sums_of_present(np.full((30, 5), np.nan)), ratio)).all()
 
 
 @pytest.mark.parametrize("clusters", [None, list("aabbbcddd")])

@@ -78,7 +78,7 @@ def test_medians_are_those_of_the_resamples():
     bootstrap = Bootstrap(31, resamples=50)
     counts = np.rint(bootstrap.weights * 31).astype(int)
     expected = [np.median(np.repeat(values, count)) for count in counts]  # 31 is odd: a value of the sample
-    np.testing.assert_array_equal(bootstrap.medians(values), expected)
+    np.testing.assert_array_equal(bootstrap.quantiles(values), expected)
 
 
 def test_typical_episodes(dataset, found):

@@ -354,12 +354,12 @@ def test_lasting_and_switches_are_what_a_loop_finds():
 def test_quantiles_are_those_of_the_episodes():
     values = numpy.random.default_rng(1).random(101)
     bootstrap = Bootstrap(101)
-    assert metrics.quantile(bootstrap, values, 0.5).value == numpy.median(values)
+    assert bootstrap.quantiles(values)[0] == numpy.median(values)
     chosen = values > 0.5
-    found = metrics.quantile(bootstrap, values, 0.5, chosen)
+    found = bootstrap.interval(bootstrap.quantiles(values, 0.5, chosen))
     assert found.value == numpy.sort(values[chosen])[math.ceil(0.5 * chosen.sum()) - 1]
     assert found.low < found.value < found.high
-    assert math.isnan(metrics.quantile(bootstrap, values, 0.5, values > 2.0).value)
+    assert numpy.isnan(bootstrap.quantiles(values, 0.5, values > 2.0)).all()
 
 
 def test_metrics_follow_from_the_dataset(on_random):

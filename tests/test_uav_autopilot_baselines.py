@@ -20,6 +20,7 @@ from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import Record
 from filtergym.evaluation.rollout import run_reference
 from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.statistics import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
 from filtergym.papers.uav_autopilot_kalman import experiment
 
@@ -362,7 +363,9 @@ def hand_made(output: numpy.ndarray, **more: Any) -> xarray.Dataset:
 
 
 def own(dataset: xarray.Dataset) -> dict[tuple[str, str], float]:
-    found = METRICS(dataset, Bootstrap(dataset.sizes["episode"], 20))
+    bootstrap = Bootstrap(dataset.sizes["episode"], 20)
+    results = reduce_run(dataset, METRICS.statistics, bootstrap).results()
+    found = METRICS.measures_of(results, bootstrap, dataset)
     return {(m.metric, m.window): m.estimate.value for m in found}
 
 

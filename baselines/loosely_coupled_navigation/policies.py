@@ -14,10 +14,10 @@ from ...envs.catalogue import task_class
 from ...envs.loosely_coupled_navigation.banks import GainBank
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.task import Task
-from ...evaluation.bootstrap import Bootstrap
+from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...evaluation.dataset import keywords_of
-from ...evaluation.metrics import Measure, mean_of_present
+from ...evaluation.metrics import Measure, sums_of_present
 from ...evaluation.own_metrics import Gathered, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
@@ -320,15 +320,16 @@ def _recoveries(run: xarray.Dataset) -> Gathered:
     held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))
     times = recovery_times(size, run["available"].values, limit, held, longest)
     lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
-    return Gathered({"time": times * parameters.sampling_interval, "lost": lost})
+    found = {"time": times * parameters.sampling_interval, "lost": lost}
+    return Gathered({}, {name: sums_of_present(values[:, None]) for name, values in found.items()})
 
 
 def _outage_measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
-    each = gathered.each
-    if not each or numpy.isnan(each["time"]).all():
+    means = gathered.averaged
+    if not means or not means["time"][0, 1]:
         return []
-    time, lost = (mean_of_present(each[name][:, None], bootstrap) for name in ("time", "lost"))
+    time, lost = (bootstrap.interval(ratio(means[name])) for name in ("time", "lost"))
     return [
         Measure("recovery_time", "position", "all", time, "s"),
         Measure("not_recovered", "position", "all", lost, "1"),

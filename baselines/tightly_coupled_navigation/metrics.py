@@ -24,30 +24,6 @@ def _ratio(bootstrap: Bootstrap, values: numpy.ndarray, counts: numpy.ndarray) -
         return bootstrap.interval(bootstrap.means(values) / bootstrap.means(counts))
 
 
-def quantile(
-    bootstrap: Bootstrap, values: numpy.ndarray, share: float, chosen: numpy.ndarray | None = None
-) -> Estimate:
-    """Quantile over the chosen episodes (default: all), with its interval.
-
-    The smallest value that at least ``share`` of the chosen weight does not exceed.
-
-    Args:
-        bootstrap: of the episodes.
-        values: ``(episodes,)``.
-        share: such as 0.5 for the median.
-        chosen: ``(episodes,)`` booleans.
-    """
-    chosen = numpy.ones(len(values), dtype=bool) if chosen is None else chosen
-    order = numpy.argsort(numpy.where(chosen, values, numpy.inf))
-    found = []
-    for some in bootstrap.by_resamples(order):
-        weights = numpy.cumsum(some * chosen[order], axis=1)
-        # Rounding of the sums must not move a share that is met exactly.
-        enough = weights >= share * weights[:, -1:] * (1.0 - 1e-9)
-        found.append(numpy.where(weights[:, -1] > 0.0, values[order][enough.argmax(axis=1)], numpy.nan))
-    return bootstrap.interval(numpy.concatenate(found))
-
-
 def lasting(condition: numpy.ndarray, steps: int = LASTING) -> numpy.ndarray:
     """Where a condition begins to hold for some steps in a row; false where the end is too near.
 
@@ -163,8 +139,10 @@ def _errors(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
                 value = _ratio(bootstrap, each["squares"][:, k, i], each["share"][:, i])
                 root = Estimate(*(math.sqrt(v) for v in value))
                 yield Measure("rmse_by_hypothesis", f"{component} {name}", "all", root, unit)
-    yield Measure("cost_median", "", "all", quantile(bootstrap, each["cost"], 0.5), "1")
-    yield Measure("cost_95_quantile", "", "all", quantile(bootstrap, each["cost"], 0.95), "1")
+    yield Measure("cost_median", "", "all", bootstrap.interval(bootstrap.quantiles(each["cost"])), "1")
+    yield Measure(
+        "cost_95_quantile", "", "all", bootstrap.interval(bootstrap.quantiles(each["cost"], 0.95)), "1"
+    )
 
 
 def _of_bank(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
@@ -177,7 +155,7 @@ def _of_bank(each: Arrays, bootstrap: Bootstrap) -> Iterator[Measure]:
     lost = each["lost"]
     yield Measure("track_loss_rate", "", "all", bootstrap.estimate(lost.astype(float)), "1")
     if lost.any():
-        value = quantile(bootstrap, each["lost_after"], 0.5, lost)
+        value = bootstrap.interval(bootstrap.quantiles(each["lost_after"], 0.5, lost))
         yield Measure("track_loss_time", "", "all", value, "s")
 
 

@@ -137,7 +137,7 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
             difference = bootstrap.relative_difference(bootstrap.means(own), bootstrap.means(paper))
             row += [
                 with_interval(difference, 100.0, negligible=0.005),
-                f"{100.0 * (bootstrap.medians(own / paper)[0] - 1.0):+.1f}",
+                f"{100.0 * (bootstrap.quantiles(own / paper)[0] - 1.0):+.1f}",
             ]
         row.append(consistency(Estimate(float(line.means["anees"].mean()), 0.0, 0.0)))
         passed = line.beat_paper
