@@ -36,23 +36,25 @@ def moved(part, pattern):
 
 
 def _moved(leaf, pattern):
-    if isinstance(leaf, np.ndarray):
-        return _with_other_last_bits(leaf, pattern) if leaf.dtype == np.float64 else leaf
-    if not hasattr(leaf, "detach") or not leaf.is_floating_point():
+    plain = leaf if isinstance(leaf, np.ndarray) else leaf.detach().cpu().numpy()
+    if plain.dtype != np.float64:
         return leaf
-    plain = leaf.detach().cpu().numpy()
-    other = leaf + leaf.new_tensor(_with_other_last_bits(plain, pattern) - plain)
+    changes = _changes_of_last_bits(plain, pattern)
+    if plain is leaf:
+        return leaf + changes
+    other = leaf + leaf.new_tensor(changes)
     if other.requires_grad:
         other.register_hook(lambda gradient: _moved(gradient.detach(), pattern))
     return other
 
 
-def _with_other_last_bits(values, pattern):
+def _changes_of_last_bits(values, pattern):
     others = np.ascontiguousarray(values).view(np.uint64) >> np.uint64(1)
     mixed = (others + np.asarray(pattern, dtype=np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+    changed = (others << np.uint64(1) | mixed >> np.uint64(63)).view(np.float64)
     with np.errstate(over="ignore", under="ignore"):
         inexact = np.isfinite(values) & (values.astype(np.float32) != values)
-    return np.where(inexact, (others << np.uint64(1) | mixed >> np.uint64(63)).view(np.float64), values)
+    return np.subtract(changed, values, out=np.zeros_like(values), where=inexact)
 
 
 def move_roundings(env, repetition=0):
