@@ -9,18 +9,13 @@ import pytest
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.reward import charge
+from rounding import REPETITIONS, assert_near, move_roundings
 
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
 
-DECISIONS = 12
+DECISIONS = 8
 LANES = 5
-# Both backends do the same float64 operations in the same order; only exp, log and trigonometry differ, by
-# one unit in the last place, and the recursions amplify that. Observations are of order one (4e-13 seen over
-# whole episodes of ManeuveringTarget), rewards go to 1e4 and are compared relative to their size.
-TOLERANCE = 1e-10
-# A pseudorange of 2.5e7 m is known to 4e-9 m in float64, and the filter is linearised around one: 5e-9 seen.
-WIDER = {"filtergym/TightlyCoupledNavigation-v0": 5e-8}
 
 CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
 CONTINUOUS = [
@@ -39,11 +34,17 @@ CELLS = [(id, control, scenario) for id, control in CONTROLS for scenario in sce
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
-def pair(id, device="cpu", **keywords):
-    """The same environment on NumPy and on torch."""
-    make = gymnasium.make_vec
+def on_torch(id, device="cpu", **keywords):
+    return gymnasium.make_vec(id, backend="torch", device=device, **{"num_envs": LANES, **keywords})
+
+
+def on_numpy(id, **keywords):
+    """The same environment on NumPy, and several with roundings moved."""
     keywords = {"num_envs": LANES, **keywords}
-    return make(id, **keywords), make(id, backend="torch", device=device, **keywords)
+    envs = [gymnasium.make_vec(id, backend="numpy", **keywords) for _ in (None, *REPETITIONS)]
+    for env, repetition in zip(envs[1:], REPETITIONS, strict=True):
+        move_roundings(env, repetition)
+    return envs
 
 
 def sampled(env):
@@ -52,93 +53,90 @@ def sampled(env):
     return action.astype(float) if action.dtype.kind == "f" else action
 
 
-def assert_close(tensor, array, id=None):
+def assert_close(tensor, arrays, name=""):
+    """A tensor is the first array, as near as the others say; the largest of its kind counts for all."""
     assert isinstance(tensor, torch.Tensor)
-    tolerance = WIDER.get(id, TOLERANCE)
-    numpy.testing.assert_allclose(tensor.detach().cpu().numpy(), array, rtol=tolerance, atol=tolerance)
+    reference, *others = arrays
+    assert_near(tensor.detach().cpu().numpy(), reference, others, name, lanes=tuple(range(reference.ndim)))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(("id", "control", "scenario"), CELLS)
 def test_torch_equals_numpy(id, control, scenario, device):
-    reference, env = pair(id, device, control=control, scenario=scenario, detailed_info=True)
-    reference.action_space.seed(1)
-    expected, _ = reference.reset(seed=11)
+    keywords = {"control": control, "scenario": scenario, "detailed_info": True}
+    env, references = on_torch(id, device, **keywords), on_numpy(id, **keywords)
+    env.action_space.seed(1)
     observation, _ = env.reset(seed=11)
     assert observation.dtype == torch.float64
     assert observation.device.type == device
-    assert_close(observation, expected, id)
+    assert_close(observation, [reference.reset(seed=11)[0] for reference in references])
     for _ in range(DECISIONS):
-        action = sampled(reference)
+        action = sampled(env)
         observation, reward, terminated, truncated, info = env.step(torch.tensor(action, device=device))
-        expected = reference.step(action)
-        assert_close(observation, expected[0], id)
-        assert_close(reward, expected[1], id)
+        expected = [reference.step(action) for reference in references]
+        assert_close(observation, [answer[0] for answer in expected], "observation")
+        assert_close(reward, [answer[1] for answer in expected], "reward")
         assert reward.shape == (LANES,)
-        for mask, values in ((terminated, expected[2]), (truncated, expected[3])):
+        for mask, values in ((terminated, expected[0][2]), (truncated, expected[0][3])):
             assert mask.dtype == torch.bool
             assert mask.device.type == device
             assert (mask.cpu().numpy() == values).all()
-        # Errors are in metres and the like, hence only relative to the largest of their kind.
-        for name, values in expected[4].items():
-            numpy.testing.assert_allclose(
-                info[name].cpu().numpy(),
-                values,
-                rtol=0.0,
-                atol=WIDER.get(id, TOLERANCE) * max(1.0, numpy.abs(values).max()),
-            )
+        for name in expected[0][4]:
+            assert_close(info[name], [answer[4][name] for answer in expected], name)
 
 
 @pytest.mark.parametrize("reward", ["log-likelihood", "relative"])
 @pytest.mark.parametrize("id", list(catalogue()))
 def test_other_rewards_equal_numpy(id, reward):
-    reference, env = pair(id, reward=reward)
-    reference.action_space.seed(2)
-    reference.reset(seed=5)
-    env.reset(seed=5)
+    env, references = on_torch(id, reward=reward), on_numpy(id, reward=reward)
+    env.action_space.seed(2)
+    for each in (env, *references):
+        each.reset(seed=5)
     for _ in range(DECISIONS):
-        action = sampled(reference)
-        assert_close(env.step(action)[1], reference.step(action)[1], id)
+        action = sampled(env)
+        paid = env.step(torch.tensor(action))[1]
+        assert_close(paid, [reference.step(action)[1] for reference in references])
 
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("id", list(catalogue()))
 def test_autoreset_equals_numpy(id, mode):
     last = 4
-    reference, env = pair(id, autoreset_mode=mode, max_episode_steps=last, detailed_info=True)
-    reference.action_space.seed(3)
-    reference.reset(seed=7)
-    env.reset(seed=7)
+    keywords = {"autoreset_mode": mode, "max_episode_steps": last, "detailed_info": True}
+    env, references = on_torch(id, **keywords), on_numpy(id, **keywords)
+    env.action_space.seed(3)
+    for each in (env, *references):
+        each.reset(seed=7)
     restarted = numpy.array([True, False, True, False, True])
     ends = 0
     for _ in range(3 * last):
-        action = sampled(reference)
-        expected = reference.step(action)
+        action = sampled(env)
         observation, reward, _, truncated, info = env.step(torch.tensor(action))
-        assert_close(observation, expected[0], id)
-        assert_close(reward, expected[1], id)
-        assert (truncated.numpy() == expected[3]).all()
+        expected = [reference.step(action) for reference in references]
+        details = expected[0][4]
+        assert_close(observation, [answer[0] for answer in expected])
+        assert_close(reward, [answer[1] for answer in expected])
+        assert (truncated.numpy() == expected[0][3]).all()
         ends += int(truncated.sum())
         if mode == "SameStep" and truncated.any():
             finished = info["_final_obs"].numpy()
-            assert (finished == expected[4]["_final_obs"]).all()
-            assert_close(
-                info["final_obs"][info["_final_obs"]], numpy.stack(expected[4]["final_obs"][finished]), id
-            )
-            assert set(info["final_info"]) == set(expected[4]["final_info"])
+            assert (finished == details["_final_obs"]).all()
+            final = [numpy.stack(answer[4]["final_obs"][finished]) for answer in expected]
+            assert_close(info["final_obs"][info["_final_obs"]], final)
+            assert set(info["final_info"]) == set(details["final_info"])
         if mode == "Disabled" and truncated.any():
             with pytest.raises(gymnasium.error.ResetNeeded, match="reset_mask"):
                 env.step(torch.tensor(action))
             # In two parts, so that a mask that is a tensor meets lanes that must not be disturbed.
             for part in (restarted, ~restarted):
-                values, _ = reference.reset(options={"reset_mask": part.copy()})
                 shown, _ = env.reset(options={"reset_mask": torch.tensor(part)})
-                assert_close(shown, values, id)
+                values = [each.reset(options={"reset_mask": part.copy()})[0] for each in references]
+                assert_close(shown, values)
     assert ends >= 2 * LANES
 
 
 def test_lanes_that_restart_do_not_disturb_the_others():
-    _, env = pair("filtergym/ManeuveringTarget-v0", autoreset_mode="Disabled", control="weights")
+    env = on_torch("filtergym/ManeuveringTarget-v0", autoreset_mode="Disabled", control="weights")
     before, _ = env.reset(seed=1)
     kept = before.clone()
     after, _ = env.reset(seed=9, options={"reset_mask": torch.tensor([True] + [False] * (LANES - 1))})
@@ -150,16 +148,15 @@ def test_lanes_that_restart_do_not_disturb_the_others():
 @pytest.mark.parametrize("id", list(catalogue()))
 def test_actions_may_be_arrays_lists_or_whole_numbers(id):
     def paid(convert):
-        _, env = pair(id)
+        env = on_torch(id)
         env.action_space.seed(4)
         env.reset(seed=3)
         action = sampled(env)
         return env.step(convert(numpy.round(action) if action.dtype.kind == "f" else action))[1]
 
     first = paid(torch.tensor)
-    assert_close(paid(lambda a: a), first.numpy())
-    assert_close(paid(lambda a: a.tolist()), first.numpy())
-    assert_close(paid(lambda a: torch.tensor(a.astype(numpy.int64))), first.numpy())
+    for convert in (lambda a: a, lambda a: a.tolist(), lambda a: torch.tensor(a.astype(numpy.int64))):
+        assert torch.equal(paid(convert), first)
 
 
 @pytest.mark.parametrize(("id", "control"), CONTINUOUS)
@@ -170,7 +167,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
     1e-5 balances them near 1e-10 of the loss, and 1e-5 of the largest gradient leaves room for curvature.
     A pseudorange of 2.5e7 m is rounded to 4e-9 m: there the balance lies at 1e-4.
     """
-    horizon, lanes, step = 6, 8, 1e-4 if id in WIDER else 1e-5
+    horizon, lanes, step = 6, 8, 1e-4 if id == "filtergym/TightlyCoupledNavigation-v0" else 1e-5
     task = make_task(id, control, xp=xp)
     generator = numpy.random.default_rng(0)
     noise = task.noise
@@ -218,7 +215,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
 
 def test_gradient_through_the_vector_environment_crosses_an_autoreset():
     """What comes back to the caller is attached to the actions, also while other episodes start."""
-    _, env = pair(
+    env = on_torch(
         "filtergym/ManeuveringTarget-v0", control="gain", max_episode_steps=3, autoreset_mode="SameStep"
     )
     env.reset(seed=2)
@@ -245,7 +242,10 @@ def test_gradient_through_the_vector_environment_crosses_an_autoreset():
     ],
 )
 def test_wrong_tensors_are_refused(control, action, message):
-    for env in pair("filtergym/ManeuveringTarget-v0", control=control):
+    for backend in ("auto", "torch"):
+        env = gymnasium.make_vec(
+            "filtergym/ManeuveringTarget-v0", num_envs=LANES, control=control, backend=backend
+        )
         env.reset(seed=0)
         with pytest.raises(ValueError, match=message):
             env.step(action)
