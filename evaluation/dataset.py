@@ -33,7 +33,8 @@ FAULTS = (
 class Losses(NamedTuple):
     """Episodes that an estimator has lost."""
 
-    count: int
+    number: int
+    """How many."""
     episode: int
     """The first of them."""
     measurement: int
@@ -44,7 +45,7 @@ class Losses(NamedTuple):
     def sentence(self, name: str, episodes: int) -> str:
         """Say how many of the episodes are lost, and why the first is."""
         return (
-            f"{name}: {self.count} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
+            f"{name}: {self.number} of {episodes} episode{'s' if episodes > 1 else ''} lost: {FAULTS[self.fault - 1]} "
             f"in episode {self.episode} at measurement {self.measurement}; the last valid answer is held from there on"
         )
 

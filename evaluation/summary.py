@@ -338,12 +338,12 @@ def read_summary(path: Path, made_by: str) -> Summary | None:
             curves = {n.removeprefix("curve "): kept[n] for n in kept.files if n.startswith("curve ")}
             costs = kept["costs"] if "costs" in kept.files else None
             measures, further = (
-                [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[name]]
-                for name in ("measures", "further")
+                [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[word]]
+                for word in ("measures", "further")
             )
             losses = Losses(*words["losses"]) if words["losses"] else None
-            named = (words[name] for name in ("name", "kind", "control"))
-            contender = Contender(*named, measures, further, costs, losses)
+            name, kind, control = (words[word] for word in ("name", "kind", "control"))
+            contender = Contender(name, kind, control, measures, further, costs, losses)
             own = CompetitorCurves(curves, words["actions"], words["gains"])
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
         return None  # what a crash has left half: it is made again

@@ -77,7 +77,7 @@ def program_of(groups: dict[str, Commands]) -> Any:
         callback=_general,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,  # the extra in filtergym[fast] would be taken for a style
+        rich_markup_mode="markdown",  # in rich's own, the extra in filtergym[fast] would be taken for a style
         result_callback=close_output,
     )
     for group, commands in groups.items():

@@ -95,7 +95,7 @@ def test_an_estimator_that_overlooks_a_missed_scan_is_told():
     with pytest.raises(ValueError, match=sentence):
         evaluate(RADAR, {"mine": Careless}, episodes=8, strict=True)
     (note,) = notes_of(evaluate(RADAR, {"mine": Careless}, episodes=8))
-    assert re.match(f"mine: 8 of 8 episodes lost: the estimate is {sentence}", note)
+    assert re.match(rf"mine: \d of 8 episodes lost: the estimate is {sentence}", note)
     result = evaluate(RADAR, {"mine": Careful}, episodes=8)
     assert np.abs(result["error"].sel(component="position_x")).max() < 10e3  # of a target 50 km away
 
