@@ -25,7 +25,7 @@ SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py 
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-pythons distributions check format docs clean
+.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-processors test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -60,6 +60,9 @@ test-pythons:  ## core tests with every newer Python that is found
 	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
 	  else echo "Python $$version is not here: its core tests are skipped."; fi; \
 	done
+
+test-processors: $(VENV)/.dev  ## parity, gradients and stored trajectories as other processors compute them
+	OMP_NUM_THREADS=1 $(BIN)/python tests/check_processors.py -n 2 --dist worksteal
 
 distributions: $(VENV)/.dev  ## build what would be published; try the wheel, and the tests of the unpacked source
 	rm -rf $(DISTRIBUTIONS)
