@@ -26,7 +26,7 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,adapters,offline,
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: benchmark test coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -68,6 +68,9 @@ test-pythons:  ## core tests with every newer Python that is found
 	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
 	  else echo "Python $$version is not here: its core tests are skipped."; fi; \
 	done
+
+test-processors: $(VENV)/.dev  ## parity, gradients and stored trajectories as other processors compute them
+	OMP_NUM_THREADS=1 $(BIN)/python tests/check_processors.py -n 2 --dist worksteal
 
 distributions: $(VENV)/.dev  ## build what would be published; try the wheel, and the tests of the unpacked source
 	rm -rf $(DISTRIBUTIONS)
