@@ -57,10 +57,13 @@ test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages
 test-extras: test-cluster test-lowest  ## each extra alone does its work, and is asked for where it is missing; lowest versions
 	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	OMP_NUM_THREADS=1 build/cluster/bin/python tests/check_extras.py build/extras
+	$(PYTHON) -m venv build/lowest-extras
+	echo "import site; site.addsitedir('$$(echo $(CURDIR)/build/lowest/lib/python*/site-packages)')" \
+	  > $$(echo build/lowest-extras/lib/python*/site-packages)/beneath.pth
 	# Torch stays the tested one: older ones come with all of CUDA.
-	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest/lib/python*/site-packages/
-	build/lowest/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
-	OMP_NUM_THREADS=1 build/lowest/bin/python tests/check_extras.py build/extras-lowest --present
+	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest-extras/lib/python*/site-packages/
+	build/lowest-extras/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
+	OMP_NUM_THREADS=1 build/lowest-extras/bin/python tests/check_extras.py --present build/extras-lowest
 
 test-pythons:  ## core tests with every newer Python that is found
 	@for version in 3.12 3.13 3.14; do \
