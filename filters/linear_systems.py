@@ -18,7 +18,7 @@ One model at a time, plain NumPy and SciPy: this is work done once, before a fil
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy
 from numpy.typing import ArrayLike, NDArray
@@ -207,7 +207,7 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
         )
 
 
-def _riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Matrix:
+def _riccati_solution(kind: str, A: Matrix, B: Matrix, Q: Matrix, R: Matrix) -> Any:
     """Stabilising solution of an algebraic Riccati equation, "discrete" or "continuous".
 
     Raises:
