@@ -346,7 +346,7 @@ def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_refle
 
 
 def test_a_pseudorange_drifts_off_as_stated():
-    quiet = make("satellite-ramp", pseudorange_sigma=1e-6)
+    quiet = make("satellite-ramp", pseudorange_sigma=1e-4)
     for k, state, _, _ in drive(quiet, 8, 23, 350):
         s = state.truth
         place, first = s.faults.ramp_satellite.astype(int), s.faults.ramp[0]
@@ -357,8 +357,8 @@ def test_a_pseudorange_drifts_off_as_stated():
         ranges, _ = gnss_ins.observe(
             s.state, *quiet.satellites_at(s.step), state.measurement.ins_angles, quiet.parameters.gravity
         )
-        # Ranges of 2e7 m are rounded by 4e-9, the noise is 1e-6.
-        assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-5)
+        # Ranges of 2e7 m are rounded by 4e-9, the noise is 1e-4: ten sigma.
+        assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-3)
     assert ((first >= 101) & (first <= 301)).all()
     assert (error > 0.0).sum(axis=0).all()
 
