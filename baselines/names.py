@@ -1,11 +1,12 @@
 """Names of an environment's own competitors, and evaluation by them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import xarray
 
-from ..envs.catalogue import nearest
+from ..envs.catalogue import importable_name, nearest, task_class
 from ..evaluation import evaluate as evaluation
 from .catalogue import baselines_of
 from .tuning import tuned_names, tuned_policy
@@ -30,6 +31,23 @@ def own_competitor(id: str, name: str) -> Any:
     if name.endswith("-tuned"):
         return tuned_policy(id, name.removesuffix("-tuned"))
     raise nearest("policy", name, own_names(id))
+
+
+def experiment_on(id: str, *arguments: Any, **fields: Any) -> evaluation.Experiment:
+    """Return an experiment on an environment, with the paper's algorithm and the reference of its baselines.
+
+    Args:
+        id: environment id.
+        *arguments: what follows in :class:`.evaluation.evaluate.Experiment`.
+        **fields: likewise.
+
+    Raises:
+        ValueError: for an unknown environment.
+    """
+    cls = task_class(id)
+    known = baselines_of(cls.id)
+    experiment = evaluation.Experiment(importable_name(cls), *arguments, **fields)
+    return replace(experiment, paper=known.score_paper, reference=known.score_reference)
 
 
 def evaluate(

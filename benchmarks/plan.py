@@ -32,6 +32,7 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
@@ -44,10 +45,12 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import FILES, Bookkeeping, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
+from filtergym.baselines.names import experiment_on
 from filtergym.baselines.tuning import mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTED
+from filtergym.evaluation.evaluate import Experiment
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
@@ -110,6 +113,11 @@ def start_seconds() -> dict[str, float]:
     return {"imports": imports, "resampling": spent(lambda: Bootstrap(EPISODES, RESAMPLES))[1]}
 
 
+def long_experiment(id: str) -> Experiment:
+    """Return the experiment of the plan on an environment, of which the first episodes are measured."""
+    return experiment_on(id, None, EPISODES, drawn_episodes=1)
+
+
 def competitor_units(asked: Asked, two_sizes: bool) -> Units:
     """Seconds of a competitor's episodes and of what becomes of them, for one measurement of one episode.
 
@@ -167,8 +175,9 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
 
 def told_seconds(id: str, episodes: int) -> float:
     """What the process that began it does for one more competitor of a cell of so many episodes."""
-    [asked] = asked_of(id, baselines_of(id).score_paper, None, EPISODES, drawn_episodes=1)
-    whole: Any = summarise(asked._replace(episodes=8 * WARM, metrics=None), lambda _: None)
+    [asked] = asked_of(long_experiment(id), baselines_of(id).score_paper)
+    few = replace(asked.experiment, episodes=8 * WARM)
+    whole: Any = summarise(asked._replace(experiment=few, metrics=None), lambda _: None)
     costs = numpy.resize(whole.contender.costs, episodes)
     one = whole._replace(contender=whole.contender._replace(costs=costs), episodes=episodes)
     other = one._replace(contender=one.contender._replace(name="other"))
@@ -292,12 +301,12 @@ def _there(units: Units, keys: Sequence[str]) -> bool:
 def _competitor(id: str, name: str, trained: Path | None, two_sizes: bool) -> Units:
     """Unit costs of a competitor, or of the agent of a short run, which is trained if it is not there."""
     if trained is None:
-        return competitor_units(*asked_of(id, name, None, EPISODES, drawn_episodes=1), two_sizes)
+        return competitor_units(*asked_of(long_experiment(id), name), two_sizes)
     if not trained.exists():
         training_units(id, name, trained)
     # A name of its own: the agent that is shipped has that of the algorithm.
     named = {f"trained {name}": trained}
-    return competitor_units(*asked_of(id, named, None, EPISODES, drawn_episodes=1), two_sizes)
+    return competitor_units(*asked_of(long_experiment(id), named), two_sizes)
 
 
 def classical(id: str) -> list[str]:
@@ -407,7 +416,7 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
     for cell in cells(True):
         id = cell.environment
         T = cell.measurements // (cell.episodes * len(cell.policies))
-        [one] = asked_of(id, cell.policies[:1], cell.scenario, episodes)
+        [one] = asked_of(experiment_on(id, cell.scenario, episodes), cell.policies[:1])
         pieces = [piece.measurements // T for piece in one.pieces()]
         block = units["competitors"][id][baselines_of(id).score_paper]["block"]
         told = units["told"][id] * episodes / EPISODES
@@ -478,7 +487,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(Asked("", "", None, None, episodes).pieces())
+        pieces = len(Asked(Experiment("", episodes=episodes), "", None).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(

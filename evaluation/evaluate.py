@@ -5,6 +5,7 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import cloudpickle
@@ -130,7 +131,6 @@ def _report(task: Task, tracks: bool, drawn: bool) -> Report:
     return _said_and_tracked if tracks else _said
 
 
-@one_thread()
 def evaluate(
     env: str,
     competitors: Mapping[str, Any],
@@ -194,33 +194,73 @@ def evaluate(
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
             the control.
     """
-    plan = plan_of(
+    experiment = Experiment(
         env,
-        competitors,
         scenario,
         episodes,
         seed,
         split,
         control,
-        backend,
-        threads,
+        tracks,
+        drawn_episodes,
         paper,
         reference,
-        keywords,
+        backend,
+        threads,
         strict,
+        keywords,
     )
-    drawn_episodes = check_integer("drawn_episodes", drawn_episodes, 0)
-    if tracks and drawn_episodes:
-        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
+    return run_experiment(experiment, competitors, progress, workers)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Over which episodes competitors are run, and how: plain data for any process.
+
+    Fields as the arguments of :func:`evaluate`.
+    """
+
+    environment: str
+    scenario: Any = None
+    episodes: int = 500
+    seed: int = 0
+    split: str = "test"
+    control: str | None = None
+    tracks: bool = False
+    drawn_episodes: int = 0
+    paper: str = ""
+    reference: str = ""
+    backend: str = "auto"
+    threads: int = 1
+    strict: bool = False
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+
+    def make_task(self, maker: Any, control: str) -> Task:
+        """Make the task of a competitor; the experiment's keywords win over those that were tuned with it."""
+        keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
+        return task_on(
+            self.backend, self.environment, control, self.scenario, threads=self.threads, **keywords
+        )
+
+
+@one_thread()
+def run_experiment(
+    experiment: Experiment,
+    competitors: Mapping[str, Any],
+    progress: Progress | None = None,
+    workers: Workers | None = None,
+) -> xarray.Dataset:
+    """Run competitors over the episodes of an experiment; arguments, result and refusals as of :func:`evaluate`."""
+    plan = plan_of(experiment, competitors)
     workers = check_workers(workers)
     block = block_of(next(iter(plan.tasks.values())).horizon)
     pieces = [
-        plan.piece(name, first, block, tracks, drawn_episodes, workers.alone)
+        plan.piece(name, first, block, workers.alone)
         for name in competitors
         for first in range(0, len(plan.seeds), block)
     ]
     if not workers.alone:
-        check_sendable(plan.id, competitors)
+        check_sendable(plan.experiment.environment, competitors)
     sizes = [piece.measurements for piece in pieces]
     chunks = workers.results(run_piece, pieces, sizes, progress)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
@@ -228,29 +268,21 @@ def evaluate(
     for i, name in enumerate(competitors):
         per_policy[name] = _in_one(chunks[i * count : (i + 1) * count])
         chunks[i * count : (i + 1) * count] = [None] * count
-    return plan.dataset(per_policy, plan.seeds, drawn_episodes)
+    return plan.dataset(per_policy, plan.seeds)
 
 
 class Piece(NamedTuple):
     """Some episodes of one competitor, as plain data for any process."""
 
-    environment: str
-    """Id, with the module that registers it."""
+    experiment: Experiment
     name: str
     maker: Any
     kind: Kind
     control: str
-    scenario: Any
-    backend: str
-    threads: int
-    keywords: dict[str, Any]
     seeds: list[int]
     first: int
     """Number of the first episode."""
     horizon: int
-    tracks: bool
-    drawn_episodes: int
-    strict: bool
     task: Task | None
     """That was made already, in this process."""
 
@@ -262,28 +294,21 @@ class Piece(NamedTuple):
 
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``."""
-    task = piece.task
-    if task is None:
-        task = task_on(
-            piece.backend,
-            piece.environment,
-            piece.control,
-            piece.scenario,
-            threads=piece.threads,
-            **piece.keywords,
-        )
+    experiment = piece.experiment
+    task = piece.task or experiment.make_task(piece.maker, piece.control)
+    drawn = experiment.drawn_episodes - piece.first
     found: dict[str, numpy.ndarray] = run_competitor(
         task,
         _made(piece.name, piece.maker, piece.kind, task),
         piece.kind,
         piece.seeds,
-        _report(task, piece.tracks, piece.drawn_episodes > piece.first),
+        _report(task, experiment.tracks, drawn > 0),
         tick,
         piece.name,
         piece.first,
         actions=True,
-        only={DRAWN: piece.drawn_episodes - piece.first},
-        strict=piece.strict,
+        only={DRAWN: drawn},
+        strict=experiment.strict,
     )
     return found
 
@@ -301,106 +326,75 @@ def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
 class Plan(NamedTuple):
     """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
 
-    id: str
-    """Of the environment, with the module that registers it where that is a user's."""
+    experiment: Experiment
+    """Its environment with the module that registers it, where that is a user's; its scenario opened."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
     controls: dict[str, str]
     tasks: dict[str, Task]
-    scenario: Any
-    chosen: Scenario
+    scenario: Scenario
     seeds: list[int]
     flown: numpy.ndarray | None
     """Number of the flight of each episode."""
     lengths: numpy.ndarray | None
-    split: str
-    seed: int
-    backend: str
-    threads: int
-    paper: str
-    reference: str
-    keywords: dict[str, Any]
-    strict: bool
 
-    def piece(
-        self, name: str, first: int, count: int, tracks: bool, drawn_episodes: int, here: bool
-    ) -> Piece:
+    def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
         """Return some episodes of a competitor as a piece of work, with its task if it is done here."""
-        maker = self.competitors[name]
+        task = self.tasks[name]
         return Piece(
-            self.id,
+            self.experiment,
             name,
-            maker,
+            self.competitors[name],
             self.kinds[name],
             self.controls[name],
-            self.scenario,
-            self.backend,
-            self.threads,
-            {**getattr(maker, "task_keywords", {}), **self.keywords},
             self.seeds[first : first + count],
             first,
-            self.tasks[name].horizon,
-            tracks,
-            drawn_episodes,
-            self.strict,
-            self.tasks[name] if here else None,
+            task.horizon,
+            task if here else None,
         )
 
     def dataset(
-        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int], drawn_episodes: int
+        self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
     ) -> xarray.Dataset:
         """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
-        dataset = _dataset(
-            per_policy,
-            self.kinds,
-            self.controls,
-            self.tasks,
-            self.chosen,
-            seeds,
-            self.split,
-            self.seed,
-            self.keywords,
-        )
+        experiment = self.experiment
+        dataset = _dataset(per_policy, self, seeds)
         if self.flown is not None and self.lengths is not None:
             beyond = dataset["time"].values <= self.lengths[:, None]
             there = xarray.DataArray(beyond, dims=("episode", "time"))
-            of_drawn = there.isel(episode=slice(drawn_episodes)).rename(episode="drawn_episode")
+            of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
             present = {
                 name: values.where(of_drawn if "drawn_episode" in values.dims else there)
                 for name, values in dataset.data_vars.items()
             }
             dataset = dataset.assign(present).assign_coords(
-                flight=("episode", [self.chosen.flights[i] for i in self.flown]),
+                flight=("episode", [self.scenario.flights[i] for i in self.flown]),
                 length=("episode", self.lengths),
             )
         return dataset.assign_attrs(
-            paper=self.paper,
-            reference=self.reference,
-            notes="\n".join(self.chosen.notes),
-            recorded=int(self.chosen.recording is not None),
+            paper=experiment.paper,
+            reference=experiment.reference,
+            notes="\n".join(self.scenario.notes),
+            recorded=int(self.scenario.recording is not None),
             truth=int(next(iter(self.tasks.values())).has_truth),
         )
 
 
-def plan_of(
-    env: str,
-    competitors: Mapping[str, Any],
-    scenario: Any,
-    episodes: int,
-    seed: int,
-    split: str,
-    control: str | None,
-    backend: str,
-    threads: int,
-    paper: str,
-    reference: str,
-    keywords: dict[str, Any],
-    strict: bool = False,
-) -> Plan:
-    """Return the plan of an evaluation; arguments and refusals as of :func:`evaluate`."""
-    cls = task_class(env)
-    scenario = opened(cls, scenario)
-    chosen = find_scenario(cls, scenario, keywords)
+def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
+    """Return the plan of an evaluation; refusals as of :func:`evaluate`."""
+    cls = task_class(experiment.environment)
+    experiment = replace(
+        experiment,
+        environment=importable_name(cls),
+        scenario=opened(cls, experiment.scenario),
+        drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
+    )
+    if experiment.tracks and experiment.drawn_episodes:
+        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
+    chosen = find_scenario(cls, experiment.scenario, experiment.keywords)
+    episodes, seed, split, control = (
+        experiment.episodes, experiment.seed, experiment.split, experiment.control
+    )  # fmt: skip
     if control is not None and control not in cls.controls:
         raise nearest("control", control, cls.controls)
     if not competitors:
@@ -411,11 +405,8 @@ def plan_of(
     tasks: dict[str, Task] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
-        tuned_keywords = getattr(maker, "task_keywords", {})
         controls[name] = control_of(maker, kinds[name], control, cls, name)
-        tasks[name] = task_on(
-            backend, cls.id, controls[name], scenario, threads=threads, **{**tuned_keywords, **keywords}
-        )
+        tasks[name] = experiment.make_task(maker, controls[name])
     for name, task in tasks.items():
         check_shown(task, competitors[name], name)
     first = next(iter(tasks.values()))
@@ -429,26 +420,7 @@ def plan_of(
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    return Plan(
-        importable_name(cls),
-        competitors,
-        kinds,
-        controls,
-        tasks,
-        scenario,
-        chosen,
-        seeds,
-        flown,
-        lengths,
-        split,
-        seed,
-        backend,
-        threads,
-        paper,
-        reference,
-        keywords,
-        strict,
-    )
+    return Plan(experiment, competitors, kinds, controls, tasks, chosen, seeds, flown, lengths)
 
 
 def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
@@ -565,16 +537,9 @@ def _actions_aligned(
 
 
 def _dataset(
-    per_policy: dict[str, dict[str, numpy.ndarray]],
-    kinds: Mapping[str, str],
-    controls: dict[str, str],
-    tasks: dict[str, Task],
-    scenario: Scenario,
-    seeds: Sequence[int],
-    split: str,
-    seed: int,
-    keywords: dict[str, Any],
+    per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
 ) -> xarray.Dataset:
+    kinds, controls, tasks, scenario = plan.kinds, plan.controls, plan.tasks, plan.scenario
     task = next(iter(tasks.values()))
     names = list(per_policy)
     components = [c.name for c in task.components]
@@ -612,9 +577,9 @@ def _dataset(
         attrs={
             "environment": task.id,
             "scenario": scenario.name,
-            "keywords": keywords_as_text(keywords),
-            "split": split,
-            "seed": whole_number(seed),
+            "keywords": keywords_as_text(plan.experiment.keywords),
+            "split": plan.experiment.split,
+            "seed": whole_number(plan.experiment.seed),
             "cost": task.cost_description,
         },
     )

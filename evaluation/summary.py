@@ -18,7 +18,7 @@ import xarray
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
 from .dataset import Losses
-from .evaluate import DRAWN, check_sendable, plan_of, run_piece
+from .evaluate import DRAWN, Experiment, check_sendable, plan_of, run_piece
 from .files import whole_file
 from .metrics import Contender, Measure, Record, contender_of, record_statistics, records_of
 from .own_metrics import OwnMetrics
@@ -32,25 +32,13 @@ TOGETHER = 4 * BLOCK
 
 
 class Asked(NamedTuple):
-    """One competitor over episodes of a scenario; fields as the arguments of :func:`.evaluate.evaluate`."""
+    """One competitor of an experiment."""
 
-    environment: str
+    experiment: Experiment
     name: str
     maker: Any
-    scenario: Any
-    episodes: int
-    seed: int = 0
-    split: str = "test"
-    control: str | None = None
-    drawn_episodes: int = 0
-    paper: str = ""
-    reference: str = ""
-    backend: str = "auto"
-    threads: int = 1
-    keywords: dict[str, Any] | None = None
     metrics: OwnMetrics | None = None
     """The environment's own."""
-    strict: bool = False
     horizon: int = 1
     """Measurements of an episode, for the progress."""
     first: int = 0
@@ -59,10 +47,19 @@ class Asked(NamedTuple):
     """Episode before which it ends; None: the end."""
 
     @property
+    def episodes(self) -> int:
+        """How many the experiment has."""
+        return self.experiment.episodes
+
+    @property
+    def end(self) -> int:
+        """Episode before which it ends."""
+        return self.episodes if self.last is None else self.last
+
+    @property
     def measurements(self) -> int:
         """How many there are."""
-        last = self.episodes if self.last is None else self.last
-        return (last - self.first) * self.horizon
+        return (self.end - self.first) * self.horizon
 
     def pieces(self) -> list["Asked"]:
         """Return the pieces of work that this is: one, unless there are many episodes."""
@@ -125,8 +122,7 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
         yield from curve_statistics(run, asked.episodes)
 
     part = reduce_episodes(asked, declare, tick)
-    last = asked.episodes if asked.last is None else asked.last
-    if last - asked.first < asked.episodes:
+    if asked.end - asked.first < asked.episodes:
         return part
     return part.summary(_resampling(asked.episodes), asked.metrics)
 
@@ -144,31 +140,16 @@ def reduce_episodes(
     Raises:
         ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
     """
-    plan = plan_of(
-        asked.environment,
-        {asked.name: asked.maker},
-        asked.scenario,
-        asked.episodes,
-        asked.seed,
-        asked.split,
-        asked.control,
-        asked.backend,
-        asked.threads,
-        asked.paper,
-        asked.reference,
-        asked.keywords or {},
-        asked.strict,
-    )
+    plan = plan_of(asked.experiment, {asked.name: asked.maker})
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)
-    last = asked.episodes if asked.last is None else asked.last
     block = block_of(plan.tasks[asked.name].horizon)
 
     def parts() -> Iterator[Part]:
-        for i in range(asked.first, last, block):
-            piece = plan.piece(asked.name, i, min(block, last - i), False, asked.drawn_episodes, True)
-            run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds, asked.drawn_episodes)
+        for i in range(asked.first, asked.end, block):
+            piece = plan.piece(asked.name, i, min(block, asked.end - i), True)
+            run = plan.dataset({asked.name: run_piece(piece, tick)}, piece.seeds)
             run = run.isel(policy=0)
             yield Part(reduce_run(run, declare, bootstrap, i), _head(run))
 
@@ -223,7 +204,7 @@ def _summarised(
 ) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
         for i in missing:
-            check_sendable(asked[i].environment, {asked[i].name: asked[i].maker})
+            check_sendable(asked[i].experiment.environment, {asked[i].name: asked[i].maker})
     pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
     work = [piece for _, piece in pieces]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}

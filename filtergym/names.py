@@ -11,11 +11,11 @@ from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
 from .baselines.catalogue import baselines_of
-from .envs.catalogue import import_task, importable_name, imported, make_task, nearest, task_class
+from .envs.catalogue import import_task, imported, make_task, nearest, task_class
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
-from .evaluation.evaluate import check_shown, control_of
+from .evaluation.evaluate import Experiment, check_shown, control_of
 from .evaluation.metrics import Record
 from .evaluation.recording import record as record
 from .evaluation.rollout import Progress
@@ -144,52 +144,25 @@ def competitors_of(
 
 
 def asked_of(
-    env: str,
+    experiment: Experiment,
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
-    scenario: Any = None,
-    episodes: int = 500,
-    seed: int = 0,
-    split: str = "test",
-    control: str | None = None,
     *,
     trust: bool = False,
-    drawn_episodes: int = 0,
-    backend: str = "auto",
-    threads: int = 1,
-    strict: bool = False,
-    **keywords: Any,
 ) -> list[Asked]:
-    """Return what :func:`.evaluation.summary.summaries` makes, for each competitor; arguments as of :func:`evaluate`.
+    """Return what :func:`.evaluation.summary.summaries` makes of an experiment, for each competitor.
+
+    Args:
+        experiment: as :func:`.baselines.names.experiment_on` makes it.
+        competitors: as of :func:`evaluate`.
+        trust: likewise.
 
     Raises:
         ValueError: for unknown names.
     """
-    cls = import_task(env)
-    known = baselines_of(cls.id)
-    makers = competitors_of(env, competitors, trust=trust)
-    horizon = make_task(cls.id, control, scenario, **keywords).horizon
-    return [
-        Asked(
-            importable_name(cls),
-            name,
-            maker,
-            scenario,
-            episodes,
-            seed,
-            split,
-            control,
-            drawn_episodes,
-            known.score_paper,
-            known.score_reference,
-            backend,
-            threads,
-            keywords,
-            known.metrics,
-            strict,
-            horizon,
-        )
-        for name, maker in makers.items()
-    ]
+    makers = competitors_of(experiment.environment, competitors, trust=trust)
+    task = make_task(experiment.environment, experiment.control, experiment.scenario, **experiment.keywords)
+    metrics = baselines_of(task.id).metrics
+    return [Asked(experiment, name, maker, metrics, task.horizon) for name, maker in makers.items()]
 
 
 def make_policy(

@@ -266,7 +266,7 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     def interrupted(asked, tick):
         if len(ran) == 3 and not resumed:
             raise KeyboardInterrupt
-        ran.append((asked.scenario, asked.name))
+        ran.append((asked.experiment.scenario, asked.name))
         return original(asked, tick)
 
     resumed = False

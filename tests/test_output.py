@@ -46,7 +46,7 @@ def dataset():
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.commands.measure.evaluate", lambda *_, **__: dataset)
+    monkeypatch.setattr("filtergym.commands.measure.run_experiment", lambda *_, **__: dataset)
     monkeypatch.setattr(
         "filtergym.commands.measure.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
     )
@@ -111,7 +111,7 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
     def unexpected(*_, **__):
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("filtergym.commands.measure.evaluate", unexpected)
+    monkeypatch.setattr("filtergym.commands.measure.run_experiment", unexpected)
     monkeypatch.setattr("filtergym.commands.measure.summaries", unexpected)
     monkeypatch.setattr("filtergym.reports.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)

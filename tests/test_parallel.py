@@ -11,6 +11,7 @@ import sys
 import urllib.error
 import urllib.request
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import pytest
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.names import experiment_on
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
@@ -78,7 +80,7 @@ def test_summaries_tell_what_the_evaluation_does(env):
     )
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
-    asked = asked_of(env, names, episodes=6, drawn_episodes=1, **shorter)
+    asked = asked_of(experiment_on(env, episodes=6, drawn_episodes=1, keywords=shorter), names)
     assert [one.episodes for one in asked] == [6] * len(names)
     found = dict(summaries(asked, Workers()))
     records, curves, evaluation = combine_summaries([found[i] for i in range(len(names))])
@@ -113,7 +115,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     monkeypatch.setattr(summary, "TOGETHER", 16)
-    asked = asked_of(env, names, episodes=40, **shorter)
+    asked = asked_of(experiment_on(env, episodes=40, keywords=shorter), names)
     assert len(asked[0].pieces()) == 3
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
@@ -185,12 +187,13 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
-    [asked] = asked_of(ENV, ["imm-tuned"], episodes=4)
+    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm-tuned"])
     kept = waiting.kept_in(tmp_path, asked)
     [(_, found)] = summaries([asked], Workers(), None, [kept])
     assert summary.read_summary(*kept).contender.measures == found.contender.measures
     assert waiting.kept_in(tmp_path, asked) == kept
-    for other in (asked._replace(keywords={"horizon": 50}), asked._replace(backend="numpy")):
+    for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
+        other = asked._replace(experiment=replace(asked.experiment, **changed))
         assert summary.read_summary(*waiting.kept_in(tmp_path, other)) is None
     monkeypatch.setattr(waiting, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
     assert summary.read_summary(*waiting.kept_in(tmp_path, asked)) is None
@@ -220,7 +223,7 @@ def edit(tmp_path, monkeypatch):
 )
 def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
-    [asked] = asked_of(ENV, ["imm"], episodes=4)
+    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm"])
     list(summaries([asked], Workers(), None, [waiting.kept_in(tmp_path, asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
@@ -242,7 +245,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
 def test_of_an_environment_of_ones_own_nothing_is_kept(tmp_path, monkeypatch):
     """Nobody can say whether its code is what it was."""
-    [asked] = asked_of(ENV, ["imm"], episodes=4)
+    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm"])
     monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
     assert waiting.kept_in(tmp_path, asked) is None
 

@@ -107,15 +107,15 @@ def test_a_learned_estimator_is_scored_beside_policies(folders):
 
 
 def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
-    scored, whole = [], training_seeds.evaluate
+    scored, whole = [], training_seeds.run_experiment
 
-    def evaluate(id, competitors, *arguments):
+    def run_experiment(experiment, competitors, progress):
         if len(scored) == stop:
             raise KeyboardInterrupt
         scored.append(next(iter(competitors)))
-        return whole(id, competitors, *arguments)
+        return whole(experiment, competitors, progress)
 
-    monkeypatch.setattr(training_seeds, "evaluate", evaluate)
+    monkeypatch.setattr(training_seeds, "run_experiment", run_experiment)
     asked = (load_runs(folders), ["adaptive"], "random", 10, 0, "validation")
     stop = 99
     expected = episode_means(*asked)

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.names import evaluate
+from filtergym.baselines.names import experiment_on
 from filtergym.baselines.tuning import tuned_names
-from filtergym.envs.catalogue import importable_name, make_task, task_class
+from filtergym.envs.catalogue import make_task, task_class
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
-from filtergym.evaluation.evaluate import check_sendable
+from filtergym.evaluation.evaluate import check_sendable, run_experiment
 from filtergym.evaluation.files import whole_file
 from filtergym.evaluation.metrics import reported_components, score, squared_errors
 from filtergym.evaluation.parallel import Workers, check_workers
@@ -223,7 +223,6 @@ def episode_means(
         if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     agents = {member.name: member.agent for member in runs}
-    importable = importable_name(task_class(id))
     found: dict[str, Means | None] = {}
     missing: list[tuple[str, Path | None]] = []
     work: list[Asked] = []
@@ -237,12 +236,12 @@ def episode_means(
             missing.append((name, kept))
             # An agent's name may be that of a competitor.
             known_as = "agent" if name in agents else name
-            asked = Asked(importable, known_as, maker, scenario, episodes, seed, split, control)
-            work.append(asked._replace(horizon=horizon))
+            experiment = experiment_on(id, scenario, episodes, seed, split, control)
+            work.append(Asked(experiment, known_as, maker, horizon=horizon))
     workers = check_workers(workers)
     if not workers.alone:
         for asked in work:
-            check_sendable(importable, {asked.name: asked.maker})
+            check_sendable(asked.experiment.environment, {asked.name: asked.maker})
     for i, measured in workers.run(_means_of, work, [asked.measurements for asked in work], progress):
         name, kept = missing[i]
         if kept is not None:
@@ -264,16 +263,7 @@ Means = tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]]
 
 
 def _means_of(asked: Asked, tick: Callable[[int], None]) -> Means:
-    dataset = evaluate(
-        asked.environment,
-        {asked.name: asked.maker},
-        asked.scenario,
-        asked.episodes,
-        asked.seed,
-        asked.split,
-        asked.control,
-        tick,
-    )
+    dataset = run_experiment(asked.experiment, {asked.name: asked.maker}, tick)
     data = dataset.isel(policy=0)
     first, last = windows_of(dataset)["all"]
     known = reported_components(dataset)

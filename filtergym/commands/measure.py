@@ -8,6 +8,7 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
+from ..baselines.names import experiment_on
 from ..envs.catalogue import (
     catalogue,
     check_names,
@@ -23,6 +24,7 @@ from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
+from ..evaluation.evaluate import run_experiment
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import flight_records
@@ -30,7 +32,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..evaluation.summary import combine_summaries, summaries
-from ..names import asked_of, competitor, evaluate, is_learned, tidy_records
+from ..names import asked_of, competitor, competitors_of, is_learned, tidy_records
 from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
@@ -227,21 +229,20 @@ def evaluate_policies(
     refusal = _unwritten(errors, errors, netcdf)
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
     everything = bool(task.flights) or estimates is not None or (out is not None and not refusal)
-    options: dict[str, Any] = {
-        "env": cls.id,
-        "competitors": names,
-        "scenario": flown,
-        "episodes": episodes,
-        "seed": seed,
-        "split": split,
-        "control": control,
-        "trust": trust,
-        "drawn_episodes": int(out is not None and estimates is None),
-        "backend": backend,
-        "threads": threads,
-        "strict": strict,
-        **keywords,
-    }
+    experiment = experiment_on(
+        cls.id,
+        flown,
+        episodes,
+        seed,
+        split,
+        control,
+        tracks=estimates is not None,
+        drawn_episodes=int(out is not None and estimates is None),
+        backend=backend,
+        threads=threads,
+        strict=strict,
+        keywords=keywords,
+    )
     curves, kept = None, []
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
@@ -250,9 +251,10 @@ def evaluate_policies(
             bar.update(line, advance=done)
 
         if everything:
-            dataset = evaluate(progress=tick, tracks=estimates is not None, workers=workers, **options)
+            makers = competitors_of(cls.id, names, trust=trust)
+            dataset = run_experiment(experiment, makers, tick, workers)
         else:
-            asked = asked_of(**options)
+            asked = asked_of(experiment, names, trust=trust)
             kept = [None if out is None else kept_in(out / UNFINISHED, one) for one in asked]
             found = dict(summaries(asked, workers, tick, kept))
     if everything:

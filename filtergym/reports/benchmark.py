@@ -12,6 +12,7 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.catalogue import baselines_of
+from ..baselines.names import experiment_on
 from ..baselines.tuning import tuned_names
 from ..envs.catalogue import catalogue, short_name, task_class
 from ..evaluation.dataset import groups_of, notes_of
@@ -191,9 +192,8 @@ def run_benchmark(
     asked: list[tuple[Asked, int]] = []
     found: list[dict[str, Summary]] = [{} for _ in wanted]
     for i, cell in enumerate(wanted):
-        everyone = asked_of(
+        experiment = experiment_on(
             cell.environment,
-            cell.policies,
             cell.scenario,
             cell.episodes,
             seed,
@@ -202,6 +202,7 @@ def run_benchmark(
             backend=backend,
             threads=threads,
         )
+        everyone = asked_of(experiment, cell.policies)
         asked += [(one, i) for one in everyone]
     told = 0
 
@@ -221,7 +222,9 @@ def run_benchmark(
     workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
-            key=lambda one: -one[0].measurements * baselines_of(one[0].environment).measurement_seconds
+            key=lambda one: (
+                -one[0].measurements * baselines_of(one[0].experiment.environment).measurement_seconds
+            )
         )
     kept = [kept_in(unfinished, one) for one, _ in asked]
     for k, summary in summaries([one for one, _ in asked], workers, tick, kept):

@@ -40,11 +40,14 @@ def kept_in(folder: Path, asked: Asked) -> Kept | None:
     Returns:
         None where :func:`made_by` says that nothing is kept.
     """
-    maker = made_by(asked.environment, asked.name)
+    experiment = asked.experiment
+    maker = made_by(experiment.environment, asked.name)
     if maker is None:
         return None
     plain = asked._replace(maker=None, metrics=None)
-    stem = stem_of(asked.environment, asked.scenario, asked.episodes, asked.split, asked.seed)
+    stem = stem_of(
+        experiment.environment, experiment.scenario, experiment.episodes, experiment.split, experiment.seed
+    )
     return Kept(folder / f"{stem}.{asked.name}.npz", f"{maker} {tuple(plain)}")
 
 
