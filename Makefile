@@ -26,7 +26,7 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,adapters,offline,
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: benchmark test coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
@@ -57,10 +57,13 @@ test-cluster: $(VENV)/.dev  ## tests on clusters of Ray and Dask, whose packages
 test-extras: test-cluster test-lowest  ## each extra alone does its work, and is asked for where it is missing; lowest versions
 	build/cluster/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
 	OMP_NUM_THREADS=1 build/cluster/bin/python tests/check_extras.py build/extras
+	$(PYTHON) -m venv build/lowest-extras
+	echo "import site; site.addsitedir('$$(echo $(CURDIR)/build/lowest/lib/python*/site-packages)')" \
+	  > $$(echo build/lowest-extras/lib/python*/site-packages)/beneath.pth
 	# Torch stays the tested one: older ones come with all of CUDA.
-	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest/lib/python*/site-packages/
-	build/lowest/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
-	OMP_NUM_THREADS=1 build/lowest/bin/python tests/check_extras.py build/extras-lowest --present
+	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest-extras/lib/python*/site-packages/
+	build/lowest-extras/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
+	OMP_NUM_THREADS=1 build/lowest-extras/bin/python tests/check_extras.py --present build/extras-lowest
 
 test-pythons:  ## core tests with every newer Python that is found
 	@for version in 3.12 3.13 3.14; do \
@@ -68,6 +71,9 @@ test-pythons:  ## core tests with every newer Python that is found
 	    $(MAKE) core-tests PYTHON=python$$version ENVIRONMENT=python$$version VERSIONS=constraints.txt || exit 1; \
 	  else echo "Python $$version is not here: its core tests are skipped."; fi; \
 	done
+
+test-processors: $(VENV)/.dev  ## parity, gradients and stored trajectories as other processors compute them
+	OMP_NUM_THREADS=1 $(BIN)/python tests/check_processors.py -n 2 --dist worksteal
 
 distributions: $(VENV)/.dev  ## build what would be published; try the wheel, and the tests of the unpacked source
 	rm -rf $(DISTRIBUTIONS)

@@ -2,10 +2,13 @@
 
     python benchmarks/throughput.py [--environment ID] [--size N] [--seconds S] [--json FILE]
 
-**What is timed.** The public ``step``, of the environment that ``gymnasium.make`` makes (wrappers included) and
-of the vector environments of ``gymnasium.make_vec``: action check, filters, reward, observation. Every step is one
-measurement (``decision_interval`` 1) and carries its share of a reset: that of all environments, over the length of
-an episode. One thread. Actions are random and drawn beforehand, in float32 as the space has them.
+**What is timed.** First what users get: the public ``step`` of ``gymnasium.make_vec(ID, num_envs=N)``, with nothing
+but its defaults (a step is one action: ten measurements in TightlyCoupledNavigation). Then the kernel, with every
+control and backend: the ``step`` of the environment that ``gymnasium.make`` makes (wrappers included) and of the vector
+environments of ``gymnasium.make_vec``: action check, filters, reward ``cost``, observation. Every step of it is one
+measurement (``decision_interval`` 1) of the environment's first scenario, the paper's, where no scan is missed. A step
+carries its share of a reset: that of all environments, over the length of an episode. One thread. Actions are random
+and drawn beforehand, in float32 as the space has them.
 
 A row is the median over rounds of a reset and 128 steps (fewer where episodes are shorter), repeated until the row's
 share of ``--seconds`` is spent. What is dear is found out by three steps: where a single round would take more than
@@ -66,6 +69,11 @@ except ImportError:
 STEPS = 128
 """Steps of a round, at most: whole blocks of noise of the long episodes."""
 SIZES = (1, 256, 4096)
+DEFAULT_SIZES = (1, 16, 256, 4096)
+KERNEL: dict[str, Any] = {"decision_interval": 1, "reward": "cost"}
+"""With the first scenario: neither missed scans nor the steps of the paper's filter beside those of the agent, which
+the default scenario and reward of an environment may add.
+"""
 DEAR = 6.0
 """Shares of the time that one round may take."""
 
@@ -226,9 +234,14 @@ class Episodes(NamedTuple):
     """Steps of an episode, the one that resets included."""
 
 
+def paper_scenario(id: str) -> str:
+    """Return the name of the first scenario of an environment."""
+    return next(iter(catalogue()[id].scenarios))
+
+
 def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
     """Episodes of ``gymnasium.make``."""
-    env: Any = gymnasium.make(id, control=control, decision_interval=1, reward="cost", **backend)
+    env: Any = gymnasium.make(id, control=control, scenario=paper_scenario(id), **KERNEL, **backend)
     env.action_space.seed(0)
     action = env.action_space.sample()
 
@@ -241,11 +254,12 @@ def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
 
 
 def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episodes:
-    """Return the same of ``gymnasium.make_vec``."""
-    env: Any = gymnasium.make_vec(id, num_envs=size, control=control, decision_interval=1, **backend)
+    """Return the same of ``gymnasium.make_vec``; without a control, with nothing but its defaults."""
+    keywords = {"control": control, "scenario": paper_scenario(id), **KERNEL, **backend} if control else {}
+    env: Any = gymnasium.make_vec(id, num_envs=size, **keywords)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(8)]
-    if backend["backend"] == "torch":
+    if backend.get("backend") == "torch":
         actions = [torch.as_tensor(action, device=backend["device"]) for action in actions]
 
     def steps(count: int) -> None:
@@ -304,6 +318,37 @@ def _show(row: Row) -> None:
         "-" if row.floor is None else f"{row.processor_rate / row.floor:.0%}",
         "-" if row.times_peer is None else f"{row.times_peer:.0f}",
     )
+
+
+def defaults(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[Row]:
+    """Measure ``gymnasium.make_vec`` with nothing but its defaults; the fastest of three alternated medians counts.
+
+    A cell of which one round takes longer than its share is measured once.
+    """
+    cells = [(id, size) for id in ids for size in sorted(sizes or DEFAULT_SIZES)]
+    share = total / (3 * len(cells))
+    taken: dict[tuple[str, int], list[tuple[float, float]]] = {cell: [] for cell in cells}
+    dear = set()
+    for id, size in 3 * cells:
+        if (id, size) not in dear:
+            rounds, expected = measure(vector(id, "", size, {}), share, float("inf"))
+            wall, processor = (statistics.median(times) for times in zip(*rounds, strict=True))
+            taken[id, size].append((wall, processor))
+            dear |= {(id, size)} if expected > share else set()
+    for (id, size), times in taken.items():
+        wall, processor = (min(kind) for kind in zip(*times, strict=True))
+        yield Row(id, "", "defaults", size, len(times), wall, size / wall, size / processor, None, None)
+
+
+def markdown_of_defaults(rows: list[Row]) -> Iterator[str]:
+    """Table of a page: what users get."""
+    mine = [row for row in rows if not row.control]
+    sizes = sorted({row.size for row in mine})
+    yield f"| environment | {' | '.join(f'N = {size}' for size in sizes)} |"
+    yield "|" + "---|" * (len(sizes) + 1)
+    for id in dict.fromkeys(row.environment for row in mine):
+        rates = (f"{row.processor_rate / 1e6:.3g}" for row in mine if row.environment == id)
+        yield f"| {id.removeprefix('filtergym/')} | {' | '.join(rates)} |"
 
 
 def measured(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[Row]:
@@ -399,6 +444,7 @@ def main() -> None:
     parser.add_argument(
         "--seconds", type=float, default=120.0, help="time for all rounds together (default 120)"
     )
+    parser.add_argument("--defaults", action="store_true", help="only what users get, not the kernel")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows to this file")
     parser.add_argument("--markdown", action="store_true", help="end with a table of rates for a page")
     arguments = parser.parse_args()
@@ -425,17 +471,22 @@ def main() -> None:
         "share",
         "× peer",
     )
-    for row in measured(ids, arguments.size, arguments.seconds):
+    share = arguments.seconds / (1 if arguments.defaults else 4)
+    found = defaults(ids, arguments.size, share)
+    kernel = iter(()) if arguments.defaults else measured(ids, arguments.size, arguments.seconds - share)
+    for row in itertools.chain(found, kernel):
         _show(row)
         rows.append(row)
     print(f"Measured in {time.perf_counter() - begin:.0f} s.")
     if arguments.markdown:
-        print(*markdown(rows), sep="\n")
+        print(*markdown_of_defaults(rows), "", sep="\n")
+        if not arguments.defaults:
+            print(*markdown([row for row in rows if row.control]), sep="\n")
     if arguments.json:
         versions = {"python": platform.python_version(), "numpy": numpy.__version__}
         versions |= {} if torch is None else {"torch": torch.__version__}
-        found = {"versions": versions, "rows": [row._asdict() for row in rows]}
-        arguments.json.write_text(json.dumps(found, indent=1) + "\n")
+        document = {"versions": versions, "rows": [row._asdict() for row in rows]}
+        arguments.json.write_text(json.dumps(document, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import os
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any
@@ -29,10 +30,29 @@ def llvm() -> ModuleType:
     return binding
 
 
-@functools.cache
+PROCESSOR = "FILTERGYM_COMPILER_PROCESSOR"
+"""Environment variable: an older processor whose instructions to keep to, as ``NAME,+FEATURE,...``; see
+:func:`processor`."""
+
+
 def processor() -> tuple[str, str]:
-    """Name and features of this processor, as LLVM calls them."""
-    return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
+    """Name and features of the processor that code is made for, as LLVM calls them: this one, or what
+    ``FILTERGYM_COMPILER_PROCESSOR`` names, such as ``haswell,+avx2`` or ``x86-64``.
+
+    LLVM knows the features of a processor that it has a name for; those that are written here too decide which vector
+    functions are called (:func:`~.library.fastest`).
+
+    Raises:
+        ValueError: for a feature that is neither switched on nor off.
+    """
+    chosen = os.environ.get(PROCESSOR)
+    if not chosen:
+        return llvm().get_host_cpu_name(), llvm().get_host_cpu_features().flatten()
+    name, *features = chosen.split(",")
+    for feature in features:
+        if feature[:1] not in ("+", "-"):
+            raise ValueError(f"{PROCESSOR}={chosen!r}: expected +FEATURE or -FEATURE, got {feature!r}")
+    return name, ",".join(features)
 
 
 def _target() -> Any:

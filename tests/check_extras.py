@@ -1,6 +1,6 @@
 """Each extra alone: with it its command runs, without it the command refuses in one sentence. See `make test-extras`.
 
-    python tests/check_extras.py FOLDER [--present] [EXTRA ...]
+    python tests/check_extras.py [--present] FOLDER [EXTRA ...]
 
 An environment in FOLDER holds links to what this Python has of filtergym, of an extra, and of what these need, and
 nothing else: what only some other extra would bring is found to be missing.
@@ -120,11 +120,19 @@ def environment(folder: Path, extras: tuple[str, ...]) -> Path:
     (packages,) = folder.glob("lib/python*/site-packages")
     for name in closure(extras):
         found = distribution(name)
-        for top in {path.parts[0] for path in found.files or ()} - {"..", "__pycache__"}:
-            if not (packages / top).exists():
-                (packages / top).symlink_to(Path(str(found.locate_file(top))).resolve())
+        files = {path for path in found.files or () if path.parts[0] not in ("..", "__pycache__")}
+        packaged = {path.parts[0] for path in files if path.name == "__init__.py" and len(path.parts) == 2}
+        for path in files:
+            # Distributions share a namespace package, such as google, which has no __init__.py.
+            shared = len(path.parts) > 1 and path.parts[0] not in packaged and "." not in path.parts[0]
+            link = packages.joinpath(*path.parts[: 1 + shared])
+            if not os.path.lexists(link):
+                link.parent.mkdir(exist_ok=True)
+                link.symlink_to(Path(str(found.locate_file(link.relative_to(packages)))).resolve())
     program = folder / "bin" / "filtergym"
-    program.write_text(f"#!{program.with_name('python')}\nfrom filtergym.__main__ import main\n\nmain()\n")
+    # Guarded, as pip writes it: workers of a cluster import the main module again.
+    guarded = "if __name__ == '__main__':\n    main()\n"
+    program.write_text(f"#!{program.with_name('python')}\nfrom filtergym.__main__ import main\n\n{guarded}")
     program.chmod(0o755)
     return folder / "bin"
 

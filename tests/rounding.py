@@ -64,7 +64,7 @@ def move_roundings(env, repetition=0):
         env: on NumPy or torch, before its first reset; others are not touched.
         repetition: another number gives other patterns.
     """
-    lanes = env.unwrapped.lanes
+    lanes = env.unwrapped.fleet.only
     pattern = 1000 * repetition + np.arange(lanes.width)
     for task in filter(None, (lanes.task, lanes.paper)):
         for owner, names in ((task, ("observe", "charge")), *((getattr(task, p), PARTS[p]) for p in PARTS)):

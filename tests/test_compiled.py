@@ -62,6 +62,7 @@ def sampled(env, count):
     return [env.action_space.sample() for _ in range(count)]
 
 
+@pytest.mark.processors
 def test_whole_episodes_are_those_of_numpy(env_id, control):
     keywords = {"control": control, **KEYWORDS.get(env_id, {})}
     decisions = gym.make(env_id, **keywords).unwrapped.last_decision

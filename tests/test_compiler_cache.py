@@ -62,6 +62,15 @@ def test_the_next_process_need_not_compile(place, loaded):
         assert place.stat().st_mode & 0o777 == 0o700
 
 
+def test_every_processor_has_code_of_its_own(place, loaded, monkeypatch):
+    assert loaded() == 1
+    monkeypatch.setenv(native.PROCESSOR, "generic")
+    assert loaded() == 1
+    monkeypatch.setenv(native.PROCESSOR, "generic,avx2")
+    with pytest.raises(ValueError, match=r"expected \+FEATURE or -FEATURE, got 'avx2'"):
+        loaded()
+
+
 @pytest.mark.parametrize(
     "damage",
     [

@@ -56,6 +56,7 @@ def otherwise_rounded(env_id, control):
     return {"observations": np.stack(shown, axis=1), "rewards": np.stack(paid, axis=1)}
 
 
+@pytest.mark.processors
 @pytest.mark.parametrize("backend", ["numpy", "compiled"])
 def test_trajectory_is_the_stored_one(env_id, control, backend):
     if backend == "compiled":

@@ -53,6 +53,7 @@ def assert_same_gradients(function, *arrays):
         np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-15)
 
 
+@pytest.mark.processors
 @pytest.mark.parametrize("name", UNARY + BINARY)
 def test_every_operation_has_the_gradient_of_torch(name):
     rng = np.random.default_rng(0)
@@ -112,6 +113,7 @@ def random_policy(env, dtype):
     return policy
 
 
+@pytest.mark.processors
 @pytest.mark.parametrize(
     ("name", "control", "keywords"),
     [

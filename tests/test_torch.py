@@ -85,6 +85,7 @@ def test_torch_equals_numpy(id, control, scenario, device):
             assert_close(info[name], [answer[4][name] for answer in expected], name)
 
 
+@pytest.mark.processors
 @pytest.mark.parametrize("reward", ["log-likelihood", "relative"])
 @pytest.mark.parametrize("id", list(catalogue()))
 def test_other_rewards_equal_numpy(id, reward):
