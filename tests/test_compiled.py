@@ -74,6 +74,10 @@ def test_every_scenario_is_that_of_numpy(env_id, short):
         assert_same_episodes(env_id, 7, 8, scenario=scenario, **short)
 
 
+def test_a_flight_without_manoeuvres_is_that_of_numpy():
+    assert_same_episodes(MANEUVERING.id, 7, 8, maneuver_count=(0, 0))
+
+
 @pytest.mark.parametrize("reward", ["cost", "relative", "log-likelihood", "cost-and-likelihood"])
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):

@@ -372,7 +372,7 @@ def test_random_flights_keep_their_limits():
         assert low <= values.min() < low + 0.01 * (high - low)
         assert high - 0.01 * (high - low) < values.max() <= high
         assert abs(values.mean() - (low + high) / 2) < 4 * (high - low) / math.sqrt(12 * runs)
-    m = state.maneuvers
+    m = state.flight
     flown = m.first <= p.horizon
     count = flown.sum(axis=0)
     frequency = np.bincount(count, minlength=4) / runs
@@ -427,7 +427,7 @@ def begun(task, episodes, seed=0):
 @pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])
 def test_legs_are_drawn_around_the_stated_ones(scenario):
     task = make_task(ID, "gain", scenario)
-    p, legs = task.parameters, begun(task, 4000).truth.maneuvers
+    p, legs = task.parameters, begun(task, 4000).truth.flight
     stated = np.array(p.legs)
     share = np.diff(legs.time, axis=0) / stated[:, :1]
     assert (np.abs(share - 1.0) <= p.leg_spread).all()
@@ -452,8 +452,8 @@ def test_legs_are_flown_exactly(scenario):
     task = make_task(ID, "gain", scenario, leg_spread=0.0, start_spread=0.0, course_spread=0.0, mirrored=0.0)
     p = task.parameters
     interval, count = p.sampling_interval, p.horizon + 2
-    legs = begun(task, 1).truth.maneuvers
-    track = np.concatenate(task.world.on_legs(legs, np.arange(count) + 0.0 * legs.time[:1, 0]))
+    legs = begun(task, 1).truth.flight
+    track = np.concatenate(task.world.course.advance(legs, np.arange(count) + 0.0 * legs.time[:1, 0], None))
     times = interval * np.arange(count)
     ends = np.cumsum([duration for duration, _ in p.legs])
     rates = np.radians([rate for _, rate in p.legs])

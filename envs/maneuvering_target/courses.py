@@ -1,0 +1,379 @@
+"""Courses of the target of ManeuveringTarget: one class for each kind of flight.
+
+A course draws its flight, moves the target from scan to scan, says where it is between two, and tells of itself in
+the context. ``scan`` is the number of a scan, ``(N,)``; a motion is a position (m) and a velocity (m/s), ``(2, N)``
+each.
+"""
+
+import itertools
+import math
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+from ...filters import coordinated_turn
+from ...filters.ordered_sums import ordered_sum
+from ..draws import Draws
+from ..observation import Array
+from ..schedules import Steps
+from ..task import Task
+from .parameters import ManeuveringTargetParameters
+
+Motion = tuple[Array, Array]
+CIRCLE = (0.0, 2.0 * math.pi)
+
+
+class Course(ABC):
+    """How the target flies.
+
+    Args:
+        task: with the parameters of the flight.
+    """
+
+    parameters: ManeuveringTargetParameters
+
+    def __init__(self, task: Task) -> None:
+        self.task, self.parameters, self.xp = task, task.parameters, task.xp
+
+    @abstractmethod
+    def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
+        """Draw the flight of each episode: what holds for all of it, and the motion at the start.
+
+        Args:
+            draws: what fixes the scenario of each episode.
+            ones: ``(N,)``.
+        """
+
+    @abstractmethod
+    def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
+        """Motion at a scan from that at the one before, both on time."""
+
+    def between(self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+        """Motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every time.
+
+        Args:
+            flight: of :meth:`begin`.
+            scan: its number.
+            early: the share, ``(N,)``.
+            before: motion when the scan before would have come on time.
+            on_time: motion when this one would have.
+        """
+        return self.advance(flight, scan - early, before)
+
+    def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
+        """What the context tells of the flight.
+
+        Args:
+            flight: of :meth:`begin`.
+            scan: number of the current scan.
+            time: of the current scan, in scan periods since the start.
+        """
+        return {}
+
+
+def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
+    """Motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
+    state = coordinated_turn.turned(task.xp.concat([*motion, turn[None]]), time)
+    return state[:2], state[2:4]
+
+
+# --- manoeuvres
+
+
+class Maneuvers(NamedTuple):
+    """Manoeuvres of a flight: what each adds in every scan from its first to its last."""
+
+    first: Array
+    """Scan number, ``(manoeuvres, N)``."""
+    last: Array
+    """Scan number, included, ``(manoeuvres, N)``."""
+    effect: Array
+    """``(6, manoeuvres, N)``; one array, because the truth picks from all of it in every scan. Of a turn by theta what
+    velocity gains along itself, per velocity, cos(theta) - 1, and across, sin(theta), then position likewise, s; of
+    thrust the acceleration along x and y, m/s^2."""
+    turn: Array = None
+    """Angle turned in a scan, rad, ``(manoeuvres, N)``; None where no scan comes early: the effect is all then."""
+
+    @property
+    def acceleration(self) -> Array:
+        """Acceleration of thrust, m/s^2, ``(2, manoeuvres, N)``."""
+        return self.effect[4:]
+
+
+class Maneuvered(Course):
+    """A straight flight with manoeuvres that do not overlap."""
+
+    turns: bool
+    """Whether one may be a coordinated turn; otherwise all are thrust."""
+
+    def advance(self, flight: Maneuvers, scan: Array, motion: Motion) -> Motion:
+        """Go straight, and add what the manoeuvre adds that is flown in the scan period."""
+        T, (position, before) = self.parameters.sampling_interval, motion
+        effect = self._picked(flight, flight.effect, scan)
+        acceleration = effect[4:]
+        position = (position + T * before) + (0.5 * T**2) * acceleration
+        velocity = before + T * acceleration
+        if self.turns:
+            across = self.xp.stack([-before[1], before[0]])
+            position = position + (effect[2] * before + effect[3] * across)
+            velocity = velocity + (effect[0] * before + effect[1] * across)
+        return position, velocity
+
+    def between(
+        self, flight: Maneuvers, scan: Array, early: Array, before: Motion, on_time: Motion
+    ) -> Motion:
+        """Thrust is constant within a period, and so is the turn rate."""
+        T = self.parameters.sampling_interval
+        time = T * (1.0 - early)
+        turn, acceleration = (
+            self._picked(flight, flight.turn, scan) / T,
+            self._picked(flight, flight.acceleration, scan),
+        )
+        position, velocity = after(time, turn, before, self.task)
+        return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
+
+    def _picked(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
+        """Values ``(..., manoeuvres, N)`` of the manoeuvre that is flown in the scan period that ends with a scan."""
+        active = self.xp.astype((scan >= flight.first) & (scan <= flight.last), values.dtype)
+        # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
+        values = active * values
+        return ordered_sum(values[..., slot, :] for slot in range(values.shape[-2]))
+
+    def context(self, flight: Maneuvers, scan: Array, time: Array) -> dict[str, Array]:
+        """First and last scan, thrust (m/s^2) and turn in a scan (rad) of each manoeuvre; whether one is flown now."""
+        xp = self.xp
+        # A manoeuvre that is not flown lies beyond the end.
+        flown = flight.first <= self.parameters.horizon + 1
+        active = (scan >= flight.first) & (scan <= flight.last)
+        turn = xp.atan2(flight.effect[1], 1.0 + flight.effect[0])
+        return {
+            "maneuver_first": xp.where(flown, flight.first, -1.0),
+            "maneuver_last": xp.where(flown, flight.last, -1.0),
+            "maneuver_acceleration": xp.where(flown, flight.acceleration, 0.0),
+            "maneuver_turn": xp.where(flown, turn, 0.0),
+            "maneuvering": xp.any(active, axis=0),
+        }
+
+
+class StatedManeuver(Maneuvered):
+    """One stretch of thrust at stated scans (paper)."""
+
+    turns = False
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
+        """Nothing is drawn: the flight is always the same."""
+        p, constant, once = self.parameters, self.task.constant, ones[None]
+        first, last = p.maneuver_steps
+        effect = constant((0.0, 0.0, 0.0, 0.0, *p.acceleration))[:, None, None] * once
+        flight = Maneuvers(first * once, last * once, effect, None if p.regular else 0.0 * once)
+        position, velocity = (constant(v)[:, None] * ones for v in (p.initial_position, p.initial_velocity))
+        return flight, (position, velocity)
+
+
+def _drawn_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
+    """Draw where a random flight begins, and with which velocity."""
+    xp = draws.xp
+    start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
+    speed, course = draws.uniform("speed", p.speed), draws.uniform("course", CIRCLE)
+    position = start_range * xp.stack([xp.cos(azimuth), xp.sin(azimuth)])
+    return position, speed * xp.stack([xp.cos(course), xp.sin(course)])
+
+
+class RandomManeuvers(Maneuvered):
+    """Any start, speed and course, and manoeuvres, each of them thrust or a coordinated turn."""
+
+    turns = True
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[Maneuvers, Motion]:
+        """Draw a start and manoeuvres."""
+        xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
+        slots = p.maneuver_count[1]
+        position, velocity = _drawn_start(draws, p)
+        flown = xp.arange(slots, device=self.task.device)[:, None] < draws.integer(
+            "maneuver_count", p.maneuver_count
+        )
+        duration = xp.where(flown, draws.integer("duration", p.maneuver_duration, slots), 0.0)
+        # Sorted starts within the time that the manoeuvres leave free, each moved on by those before it.
+        order = xp.sort(xp.where(flown, draws.unit("order", slots), 2.0), axis=0)
+        acceleration = draws.uniform("acceleration", p.maneuver_acceleration, slots)
+        direction = draws.uniform("direction", CIRCLE, slots)
+        coordinated = draws.event("coordinated", 0.5, slots)
+        free = xp.clip(p.horizon - ordered_sum(duration), 1.0, None)
+        before = 0.0 * free
+        columns: list[tuple[Array, ...]] = []
+        now = velocity
+        for m in range(slots):
+            first = xp.where(flown[m], 1.0 + before + xp.floor(order[m] * free), p.horizon + 10.0)
+            before = before + duration[m]
+            pace = xp.clip(xp.sqrt(now[0] ** 2 + now[1] ** 2), 30.0, None)
+            side = xp.where(direction[m] < math.pi, 1.0, -1.0)
+            theta = xp.where(coordinated[m], side * acceleration[m] * (T / pace), 0.0)
+            turning = xp.abs(theta) > 1e-9
+            divisor = xp.where(turning, theta, 1.0)
+            thrust = xp.where(coordinated[m], 0.0, acceleration[m])
+            vector = thrust * xp.stack([xp.cos(direction[m]), xp.sin(direction[m])])
+            effect = [
+                xp.cos(theta) - 1.0,
+                xp.sin(theta),
+                xp.where(turning, T * (xp.sin(theta) / divisor - 1.0), 0.0),
+                xp.where(turning, T * (1.0 - xp.cos(theta)) / divisor, 0.0),
+                vector[0],
+                vector[1],
+            ]
+            columns.append((first, first + duration[m] - 1.0, xp.stack(effect), theta))
+            total = theta * duration[m]
+            cosine, sine = xp.cos(total), xp.sin(total)
+            turned = xp.stack([cosine * now[0] - sine * now[1], sine * now[0] + cosine * now[1]])
+            now = turned + (T * duration[m]) * vector
+        flight = Maneuvers(*(xp.stack(parts, axis=-2) for parts in zip(*columns, strict=True)))
+        return flight._replace(turn=None) if p.regular else flight, (position, velocity)
+
+
+class RandomStraight(Course):
+    """Any start, speed and course, and no manoeuvre."""
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[None, Motion]:
+        """Draw a start; the number of manoeuvres takes a number though it is zero."""
+        motion = _drawn_start(draws, self.parameters)
+        draws.unit("maneuver_count")
+        return None, motion
+
+    def advance(self, flight: None, scan: Array, motion: Motion) -> Motion:
+        """Go straight."""
+        position, velocity = motion
+        return position + self.parameters.sampling_interval * velocity, velocity
+
+    def between(self, flight: None, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+        """Go straight for a part of the scan period."""
+        position, velocity = before
+        return position + (self.parameters.sampling_interval * (1.0 - early)) * velocity, velocity
+
+
+# --- legs
+
+
+class Legs(NamedTuple):
+    """A flight of straight legs and exact turns, each with what it begins with."""
+
+    time: Array
+    """s since the start of the track, ``(legs + 1, N)``; the last one is straight and never ends."""
+    turn: Array
+    """Turn rate, rad/s, anticlockwise positive, ``(legs + 1, N)``."""
+    position: Array
+    """m, ``(legs + 1, 2, N)``."""
+    velocity: Array
+    """m/s, ``(legs + 1, 2, N)``."""
+
+
+class LegCourse(Course):
+    """Stated legs, with start, course, side and times drawn around the stated ones."""
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[Legs, Motion]:
+        """Draw start, course, side and times of a flight."""
+        xp, p = self.xp, self.parameters
+        spread, course = p.start_spread, math.radians(p.course_spread)
+        position = xp.stack(
+            [
+                start + draws.uniform(f"start_{axis}", (-spread, spread))
+                for axis, start in zip("xy", p.initial_position, strict=True)
+            ]
+        )
+        turned = draws.uniform("course", (-course, course))
+        cosine, sine = xp.cos(turned), xp.sin(turned)
+        x, y = self.task.constant(p.initial_velocity)[:, None] * ones
+        velocity = xp.stack([cosine * x - sine * y, sine * x + cosine * y])
+        start = position, velocity
+        side = xp.where(draws.event("mirrored", p.mirrored), -1.0, 1.0)
+        time = 0.0 * ones
+        found: list[tuple[Array, ...]] = []
+        for i, (duration, rate) in enumerate(p.legs):
+            turn = (math.radians(rate) * side) * ones
+            flown = duration * draws.uniform(f"leg_{i}", (1.0 - p.leg_spread, 1.0 + p.leg_spread))
+            found.append((time, turn, position, velocity))
+            position, velocity = after(flown, turn, (position, velocity), self.task)
+            time = time + flown
+        found.append((time, 0.0 * ones, position, velocity))
+        return Legs(*(xp.stack(parts) for parts in zip(*found, strict=True))), start
+
+    def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
+        """Motion at a scan, or between two: any number. The legs say where it is then, whatever was before."""
+        now = self.parameters.sampling_interval * scan
+        time, turn, position, velocity = (Steps(part, flight.time[1:]).at(now, self.xp) for part in flight)
+        return after(now - time, turn, (position, velocity), self.task)
+
+    def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
+        """Where legs begin (s), their turn rates (rad/s), and whether the target turns now."""
+        now = self.parameters.sampling_interval * time
+        turn = Steps(flight.turn, flight.time[1:]).at(now, self.xp)
+        return {"leg_time": flight.time, "leg_turn_rate": flight.turn, "maneuvering": turn != 0.0}
+
+
+# --- tables
+
+
+class Table(Course):
+    """A table of states at every scan."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.table = task.constant(self.parameters.track)
+        """Rows x, y, vx, vy, ``(4, horizon + 2)``; of several flights one after another."""
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[Any, Motion]:
+        """Nothing is drawn: the flight is always the same."""
+        return None, (self.table[:2, 0, None] * ones, self.table[2:, 0, None] * ones)
+
+    def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
+        """Look it up; beyond the end the target stays at the last state."""
+        return self._states(self.xp.clip(scan, None, float(self.table.shape[1]) - 1.0))
+
+    def between(self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+        """A table has no states between its scans: they come on time."""
+        return on_time
+
+    def _states(self, column: Array) -> Motion:
+        """States in a column of the table, a float, ``(2, N)`` each."""
+        row = self.xp.astype(column, self.xp.int64)
+        return self.table[:2, row], self.table[2:, row]
+
+
+class Tracks(NamedTuple):
+    """Which of several flights in a table is flown."""
+
+    number: Array
+    """``(N,)``, as a float; likewise the columns of its first and last state."""
+    first: Array
+    last: Array
+
+
+class TableOfSeveral(Table):
+    """A table of several flights, of which every episode flies one."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.ends = [0, *itertools.accumulate(scans + 2 for scans in self.parameters.track_scans)]
+        """Columns of the table at which flights begin, and its width."""
+
+    def begin(self, draws: Draws, ones: Array) -> tuple[Tracks, Motion]:
+        """Draw which flight is flown."""
+        constant = self.task.constant
+        number = draws.integer("flight", (0, len(self.ends) - 2))
+        row = self.xp.astype(number, self.xp.int64)
+        first, last = constant(self.ends[:-1])[row], constant(self.ends[1:])[row] - 1.0
+        return Tracks(number, first, last), self._states(first)
+
+    def advance(self, flight: Tracks, scan: Array, motion: Motion) -> Motion:
+        """Look it up; beyond the end the target stays at the last state."""
+        return self._states(self.xp.minimum(flight.first + scan, flight.last))
+
+    def context(self, flight: Tracks, scan: Array, time: Array) -> dict[str, Array]:
+        """Number of the flight."""
+        return {"flight": flight.number}
+
+
+def course_of(task: Task) -> Course:
+    """Return the course that the parameters name."""
+    p: ManeuveringTargetParameters = task.parameters
+    random = RandomManeuvers if p.maneuver_count[1] else RandomStraight
+    table = TableOfSeveral if p.track_scans else Table
+    kinds = {"maneuver": StatedManeuver, "random": random, "legs": LegCourse, "track": table}
+    return kinds[p.flight](task)
