@@ -7,6 +7,7 @@ every control of every environment. A new environment is covered without an edit
 import functools
 import gc
 import importlib
+import os
 
 import gymnasium as gym
 import hypothesis
@@ -16,6 +17,11 @@ from filtergym.envs import compiled
 from filtergym.envs.catalogue import catalogue, make_task
 
 from filtergym.__main__ import main
+from filtergym.commands.terminal import console, output_width
+
+# The process that spreads the tests has imported readline, which tells its children how wide its terminal is.
+os.environ.pop("COLUMNS", None)
+console.width = output_width()
 
 # The same examples in every run, and no stored ones: a run can be repeated anywhere.
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)

@@ -234,7 +234,7 @@ def test_an_interruption_leaves_no_half_of_a_data_set(minari, monkeypatch, tmp_p
     monkeypatch.setattr(offline, "_tell_scores", stopped)
     with pytest.raises(KeyboardInterrupt):
         offline.write_datasets(ENV, ["imm"], episodes=2, horizon=4, folder=tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
+    assert list(tmp_path.rglob("*")) == []
 
 
 def test_without_minari_one_sentence_says_what_to_install(command, monkeypatch, tmp_path):

@@ -201,7 +201,7 @@ def test_settings_reach_environment_and_algorithm():
     keywords = {"range_sigma": 60.0, "reward": "log-likelihood", "dtype": "float32"}
     env = training_environment(new_run(ID, "ppo", envs=2, keywords=keywords)).env
     assert env.task.parameters.range_sigma == 60.0
-    assert (env.reward_kind, env.dtype) == ("log-likelihood", "float32")
+    assert (env.reward_kind, env.options.dtype) == ("log-likelihood", "float32")
 
 
 def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
