@@ -21,7 +21,6 @@ SETTINGS = {
     "compiled for bare x86-64, functions of the C library one by one": BARE,
     "compiled for Haswell, four numbers a call": {"FILTERGYM_COMPILER_PROCESSOR": "haswell,+avx2,+fma"},
     "NumPy without what it chooses by processor": NUMPY,
-    "OpenBLAS for Haswell": {"OPENBLAS_CORETYPE": "Haswell"},
     "OpenBLAS for Prescott": BLAS,
     "torch without vector instructions, MKL as on any processor": TORCH,
     "C library without AVX and FMA": LIBC,

@@ -11,6 +11,8 @@ equal, and what is only handed on is moved once. Numbers that single precision h
 from operations that are exact and stay.
 """
 
+import dataclasses
+
 import numpy as np
 from filtergym.compiler.functions import mapped
 
@@ -73,6 +75,16 @@ def move_roundings(env, repetition=0):
     return env
 
 
+def moved_parameters(parameters, pattern=0):
+    """Return the parameters of a task that are real numbers, moved, as keywords for its environments."""
+    named = {field.name: getattr(parameters, field.name) for field in dataclasses.fields(parameters)}
+    return {
+        name: float(moved(np.array([value]), pattern)[0])
+        for name, value in named.items()
+        if type(value) is float
+    }
+
+
 def _that_moves(function, pattern):
     return lambda *arguments: moved(function(*arguments), pattern)
 
@@ -100,19 +112,26 @@ def tolerance(reference, repetitions, lanes=None, time=None):
     return allowed
 
 
-def assert_near(found, reference, repetitions, name="", **axes):
-    """Assert that a result is within the :func:`tolerance` of a reference; NaN stands where NaN stands."""
-    found, reference = np.asarray(found), np.asarray(reference)
-    assert found.shape == reference.shape, name
-    if reference.dtype.kind != "f":
-        np.testing.assert_array_equal(found, reference, err_msg=name)
+def assert_near(found, expected, allowed, name=""):
+    """Assert that a result differs from an expected one by what is allowed at most; NaN stands where NaN stands."""
+    found, expected = np.asarray(found), np.asarray(expected)
+    assert found.shape == expected.shape, name
+    if expected.dtype.kind != "f":
+        np.testing.assert_array_equal(found, expected, err_msg=name)
         return
-    allowed = tolerance(reference, repetitions, **axes)
-    same = (found == reference) | (np.isnan(found) & np.isnan(reference))
+    same = (found == expected) | (np.isnan(found) & np.isnan(expected))
     with np.errstate(invalid="ignore"):
-        off = np.where(same, 0.0, np.abs(found - reference) / allowed)
+        off = np.where(same, 0.0, np.abs(found - expected) / allowed)
     worst = np.unravel_index(np.argmax(off), off.shape) if off.size else ()
     assert np.all(off <= 1.0), (
-        f"{name} {found[worst]!r} at {worst} is not {reference[worst]!r}: "
+        f"{name} {found[worst]!r} at {worst} is not {expected[worst]!r}: "
         f"{off[worst]:.2g} times what rounding explains"
     )
+
+
+def assert_same(found, reference, repetitions, name="", **axes):
+    """Assert that a result is that of a reference computation within its :func:`tolerance`."""
+    allowed = 0.0
+    if np.asarray(reference).dtype.kind == "f":
+        allowed = tolerance(reference, repetitions, **axes)
+    assert_near(found, reference, allowed, name)

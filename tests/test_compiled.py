@@ -16,7 +16,7 @@ from filtergym.envs.compiled import compiled
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.maneuvering_target import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
-from rounding import REPETITIONS, assert_near, move_roundings
+from rounding import REPETITIONS, assert_same, move_roundings
 
 import filtergym
 
@@ -54,7 +54,7 @@ def assert_same_episodes(env_id, count, actions, reset=None, **keywords):
         runs.append([np.stack([first, *steps[::4]]), *(np.stack(steps[i::4]) for i in (1, 2, 3))])
     names = ("observation", "reward", "terminated", "truncated")
     for name, found, expected, *others in zip(names, *runs, strict=True):
-        assert_near(found, expected, others, name, time=0, lanes=1)
+        assert_same(found, expected, others, name, time=0, lanes=1)
 
 
 def sampled(env, count):
@@ -95,7 +95,7 @@ def test_details_are_those_of_numpy(env_id, control, short):
         for name, values in expected.items():
             assert found[name].dtype == values.dtype, name
             # Zeros of a covariance are differences of its large numbers.
-            assert_near(
+            assert_same(
                 found[name], values, [other[name] for other in others], name, lanes=tuple(range(values.ndim))
             )
 

@@ -9,7 +9,7 @@ import pytest
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.reward import charge
-from rounding import REPETITIONS, assert_near, move_roundings
+from rounding import REPETITIONS, assert_same, move_roundings
 
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
@@ -57,7 +57,7 @@ def assert_close(tensor, arrays, name=""):
     """A tensor is the first array, as near as the others say; the largest of its kind counts for all."""
     assert isinstance(tensor, torch.Tensor)
     reference, *others = arrays
-    assert_near(tensor.detach().cpu().numpy(), reference, others, name, lanes=tuple(range(reference.ndim)))
+    assert_same(tensor.detach().cpu().numpy(), reference, others, name, lanes=tuple(range(reference.ndim)))
 
 
 @pytest.mark.parametrize("device", DEVICES)
