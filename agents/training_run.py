@@ -22,8 +22,7 @@ from typing import Any, NotRequired, TypedDict
 
 import numpy
 
-from ..baselines.catalogue import baselines_of
-from ..baselines.names import own_competitor
+from ..baselines.problem import problem_of
 from ..envs.backend import task_on
 from ..envs.catalogue import (
     catalogue,
@@ -178,7 +177,7 @@ def new_run(
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     if residual_to and control is None and "control" not in own_keywords:
         # Before the file that is shipped, which knows nothing of that policy.
-        control = getattr(own_competitor(cls.id, residual_to), "control", None)
+        control = getattr(problem_of(cls.id).competitor(residual_to), "control", None)
     control = named["control"] if control is None else control
     controls = controls_of(cls, algorithm)
     if control is not None and control not in controls:
@@ -566,13 +565,12 @@ class Validation:
 
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
-        self.paper = baselines_of(run.environment).score_paper
+        problem = problem_of(run.environment)
+        self.paper = problem.baselines.score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
         self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
         # Once: neither the paper's algorithm nor the episodes change in a run.
-        self.paper_cost = (
-            self._costs(own_competitor(run.environment, self.paper), None) if self.paper else None
-        )
+        self.paper_cost = self._costs(problem.competitor(self.paper), None) if self.paper else None
 
     def _costs(self, policy: Any, control: str | None) -> numpy.ndarray:
         """Mean cost over the episodes and over every resample of them."""

@@ -45,7 +45,7 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import FILES, Bookkeeping, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
-from filtergym.baselines.names import experiment_on
+from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
@@ -113,9 +113,10 @@ def start_seconds() -> dict[str, float]:
     return {"imports": imports, "resampling": spent(lambda: Bootstrap(EPISODES, RESAMPLES))[1]}
 
 
-def long_experiment(id: str) -> Experiment:
-    """Return the experiment of the plan on an environment, of which the first episodes are measured."""
-    return experiment_on(id, None, EPISODES, drawn_episodes=1)
+def long_work(id: str, competitors: Any) -> list[Asked]:
+    """Return the work of the plan with competitors of an environment, of which the first episodes are measured."""
+    problem = problem_of(id)
+    return asked_of(problem, problem.experiment(None, EPISODES, drawn_episodes=1), competitors)
 
 
 def competitor_units(asked: Asked, two_sizes: bool) -> Units:
@@ -175,7 +176,7 @@ def competitor_units(asked: Asked, two_sizes: bool) -> Units:
 
 def told_seconds(id: str, episodes: int) -> float:
     """What the process that began it does for one more competitor of a cell of so many episodes."""
-    [asked] = asked_of(long_experiment(id), baselines_of(id).score_paper)
+    [asked] = long_work(id, baselines_of(id).score_paper)
     few = replace(asked.experiment, episodes=8 * WARM)
     whole: Any = summarise(asked._replace(experiment=few, metrics=None), lambda _: None)
     costs = numpy.resize(whole.contender.costs, episodes)
@@ -301,17 +302,17 @@ def _there(units: Units, keys: Sequence[str]) -> bool:
 def _competitor(id: str, name: str, trained: Path | None, two_sizes: bool) -> Units:
     """Unit costs of a competitor, or of the agent of a short run, which is trained if it is not there."""
     if trained is None:
-        return competitor_units(*asked_of(long_experiment(id), name), two_sizes)
+        return competitor_units(*long_work(id, name), two_sizes)
     if not trained.exists():
         training_units(id, name, trained)
     # A name of its own: the agent that is shipped has that of the algorithm.
     named = {f"trained {name}": trained}
-    return competitor_units(*asked_of(long_experiment(id), named), two_sizes)
+    return competitor_units(*long_work(id, named), two_sizes)
 
 
 def classical(id: str) -> list[str]:
     """Competitors of the full benchmark without the agents that are shipped."""
-    return [name for name in benchmark_policies(id, True) if name not in shipped_agents(id)]
+    return [name for name in benchmark_policies(problem_of(id), True) if name not in shipped_agents(id)]
 
 
 # --- the plan
@@ -416,7 +417,7 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
     for cell in cells(True):
         id = cell.environment
         T = cell.measurements // (cell.episodes * len(cell.policies))
-        [one] = asked_of(experiment_on(id, cell.scenario, episodes), cell.policies[:1])
+        [one] = asked_of(cell.problem, cell.problem.experiment(cell.scenario, episodes), cell.policies[:1])
         pieces = [piece.measurements // T for piece in one.pieces()]
         block = units["competitors"][id][baselines_of(id).score_paper]["block"]
         told = units["told"][id] * episodes / EPISODES

@@ -10,8 +10,8 @@ import xarray
 from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines import names as baselines
-from .baselines.catalogue import baselines_of
-from .envs.catalogue import import_task, imported, make_task, nearest, task_class
+from .baselines.problem import Problem, import_problem, problem_of
+from .envs.catalogue import imported, make_task, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
@@ -40,7 +40,12 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
     Raises:
         ValueError: if there is no such name, what it names is no competitor, or it takes ``trust``.
     """
-    id = import_task(env).id
+    return find_competitor(import_problem(env), name, trust)
+
+
+def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
+    """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
+    id = problem.id
     if isinstance(name, Path):
         found = learned_policy(id, str(name.absolute()), trust)
         if found is None:
@@ -50,30 +55,29 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
         return found
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return gated(inner, competitor(id, inner, trust=trust))
-    if name in baselines.own_names(id):
-        return baselines.own_competitor(id, name)
+        return gated(inner, find_competitor(problem, inner, trust))
+    if name in problem.names:
+        return problem.competitor(name)
     learned = learned_policy(id, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
-        return baselines.own_competitor(id, name)  # says why there is none
+        return problem.competitor(name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise nearest("policy", name, [*baselines.own_names(id), *shipped_agents(id)])
+        raise nearest("policy", name, [*problem.names, *shipped_agents(id)])
     holder = imported(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
     return check_competitor(name, getattr(holder, attribute))
 
 
-def is_learned(env: str, name: str) -> bool:
+def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
-    id = task_class(env).id
     inner = name.removeprefix(GATED)
-    if inner in baselines.own_names(id):
+    if inner in problem.names:
         return False
-    return inner in shipped_agents(id) or ":" not in inner
+    return inner in shipped_agents(problem.id) or ":" not in inner
 
 
 def evaluate(
@@ -116,12 +120,14 @@ def evaluate(
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
             an estimator that does not answer with mean and covariance.
     """
-    objects = competitors_of(env, competitors, trust=trust)
+    objects = competitors_of(import_problem(env), competitors, trust)
     return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
 
 
 def competitors_of(
-    env: str, competitors: str | Path | Sequence[str | Path] | Mapping[str, Any], *, trust: bool = False
+    problem: Problem,
+    competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
+    trust: bool = False,
 ) -> dict[str, Any]:
     """Return what makes each of some competitors, by their names; arguments and refusals as of :func:`evaluate`."""
     if isinstance(competitors, str | Path):
@@ -131,12 +137,13 @@ def competitors_of(
             f"competitors are a name, a sequence of names, or a mapping from names to policies, got {competitors!r}"
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
-    id = import_task(env).id
-    for name in {*baselines.own_names(id), *shipped_agents(id)} & named.keys():
-        if named[name] not in (name, competitor(id, name)):
-            raise ValueError(f"{name!r} is the name of what {id} has already: call your own something else")
+    for name in {*problem.names, *shipped_agents(problem.id)} & named.keys():
+        if named[name] not in (name, find_competitor(problem, name)):
+            raise ValueError(
+                f"{name!r} is the name of what {problem.id} has already: call your own something else"
+            )
     return {
-        name: competitor(id, entry, trust=trust)
+        name: find_competitor(problem, entry, trust)
         if isinstance(entry, str | Path)
         else with_normalisation(entry)
         for name, entry in named.items()
@@ -144,25 +151,26 @@ def competitors_of(
 
 
 def asked_of(
+    problem: Problem,
     experiment: Experiment,
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
-    *,
     trust: bool = False,
 ) -> list[Asked]:
     """Return what :func:`.evaluation.summary.summaries` makes of an experiment, for each competitor.
 
     Args:
-        experiment: as :func:`.baselines.names.experiment_on` makes it.
+        problem: whose competitors these are.
+        experiment: on it, as :meth:`.baselines.problem.Problem.experiment` makes it.
         competitors: as of :func:`evaluate`.
         trust: likewise.
 
     Raises:
         ValueError: for unknown names.
     """
-    makers = competitors_of(experiment.environment, competitors, trust=trust)
-    task = make_task(experiment.environment, experiment.control, experiment.scenario, **experiment.keywords)
-    metrics = baselines_of(task.id).metrics
-    return [Asked(experiment, name, maker, metrics, task.horizon) for name, maker in makers.items()]
+    makers = competitors_of(problem, competitors, trust)
+    task = make_task(problem.id, experiment.control, experiment.scenario, **experiment.keywords)
+    own = problem.baselines.metrics
+    return [Asked(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
 
 
 def make_policy(
@@ -192,23 +200,23 @@ def make_policy(
         ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
     """
     if isinstance(env, str):
-        cls, task = import_task(env), None
+        problem, task = import_problem(env), None
     else:
         task = _task_of(env)
-        cls = task_class(task.id)
+        problem = problem_of(task.id)
         if control is not None or scenario is not None or keywords:
             raise ValueError("control, scenario and parameters are the environment's own: leave them out")
         control = task.control
     name = str(policy) if isinstance(policy, str | Path) else type(policy).__name__
     named = isinstance(policy, str | Path)
-    maker = competitor(cls.id, policy, trust=trust) if named else with_normalisation(policy)
+    maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
     kind = kind_of(maker)
     if kind != "policy":
         raise ValueError(f"{name!r} does not act: of kind {kind}, it can be evaluated only")
-    control = control_of(maker, kind, control, cls, name)
+    control = control_of(maker, kind, control, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     if task is None:
-        task = make_task(cls.id, control, scenario, **keywords)
+        task = make_task(problem.id, control, scenario, **keywords)
     else:
         for parameter, value in keywords.items():
             own = getattr(task.parameters, parameter)
@@ -252,4 +260,4 @@ def tidy_records(dataset: xarray.Dataset) -> list[Record]:
 
     See :func:`.evaluation.metrics.tidy_records`.
     """
-    return metrics.tidy_records(dataset, baselines_of(dataset.attrs["environment"]).metrics)
+    return metrics.tidy_records(dataset, problem_of(dataset.attrs["environment"]).baselines.metrics)

@@ -18,7 +18,7 @@ import numpy
 
 from . import __version__
 from .agents.training_run import training_scenarios
-from .baselines.catalogue import baselines_of
+from .baselines.problem import import_problem
 from .baselines.tuning import best_tuned_policy
 from .envs.catalogue import check_names, find_scenario, import_task
 from .evaluation.files import whole_files
@@ -56,10 +56,10 @@ def default_policies(env: str, control: str | None = None) -> list[str]:
         env: environment id.
         control: leave out those that do not act in it.
     """
-    id = import_task(env).id
-    paper = baselines_of(id).score_paper
-    names = [paper, best_tuned_policy(id, control), RANDOM]
-    own = getattr(competitor(id, paper), "control", None) if paper else None
+    problem = import_problem(env)
+    paper = problem.baselines.score_paper
+    names = [paper, best_tuned_policy(problem.id, control), RANDOM]
+    own = getattr(problem.competitor(paper), "control", None) if paper else None
     if own is not None and control not in (None, own):
         names.remove(paper)
     return list(dict.fromkeys(name for name in names if name))

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import commands
 import pytest
+from filtergym.baselines.problem import problem_of
 from made_results import results_of
 
 from filtergym.__main__ import COMMANDS, GROUPS, main
@@ -258,7 +259,10 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
 
     from filtergym.reports import benchmark
 
-    cells = [benchmark.Cell(ENV, scenario, 20, ("imm", "known-turn")) for scenario in ("paper", "random")]
+    cells = [
+        benchmark.Cell(problem_of(ENV), scenario, 20, ("imm", "known-turn"))
+        for scenario in ("paper", "random")
+    ]
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: cells)
     ran = []
     original = summary.summarise
@@ -292,7 +296,7 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
 def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
     from filtergym.reports import benchmark
 
-    cell = benchmark.Cell(ENV, "paper", 5, ("imm",))
+    cell = benchmark.Cell(problem_of(ENV), "paper", 5, ("imm",))
     monkeypatch.setattr(benchmark, "cells", lambda full, environments, split: [cell])
     waiting = tmp_path / "unfinished"
     others = {"thesis.tex", "ManeuveringTarget-v0.paper.5.test1.json", "folder"}
@@ -406,4 +410,4 @@ def test_curves_in_a_format_that_nobody_writes_are_refused_first(make_page, tmp_
     ],
 )  # fmt: skip
 def test_what_is_learned_is_told_by_its_name(name, learned):
-    assert is_learned(ENV, name) is learned
+    assert is_learned(problem_of(ENV), name) is learned

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.residual import ResidualPolicy
-from filtergym.baselines.names import own_names
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
 
@@ -25,7 +25,7 @@ def assert_same(some, more):
 
 
 def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
-    names = [*own_names(env_id), *shipped_agents(env_id)]
+    names = [*problem_of(env_id).names, *shipped_agents(env_id)]
     everyone = evaluate(env_id, names, episodes=13, **short)
     for count in (1, 3):
         assert_same(evaluate(env_id, names, episodes=count, **short), everyone)

@@ -8,6 +8,7 @@ import shutil
 import commands
 import pytest
 from filtergym.agents.learned_policy import PRETRAINED
+from filtergym.baselines.problem import problem_of
 
 from filtergym import evaluate
 from filtergym.__main__ import main
@@ -87,7 +88,9 @@ def test_results_are_written_whatever_becomes_of_standard_output(output, code, r
 
 
 def test_work_goes_on_after_a_print_that_failed(run, tmp_path, monkeypatch):
-    cells = [benchmark.Cell("ManeuveringTarget", name, 4, ("imm",)) for name in ("paper", "random")]
+    cells = [
+        benchmark.Cell(problem_of("ManeuveringTarget"), name, 4, ("imm",)) for name in ("paper", "random")
+    ]
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
     with closed_pipe() as output:
         assert run("benchmark", "--out", "out", output=output) == (0, "")

@@ -19,7 +19,7 @@ import pytest
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.names import experiment_on
+from filtergym.baselines.problem import problem_of
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
@@ -80,7 +80,9 @@ def test_summaries_tell_what_the_evaluation_does(env):
     )
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
-    asked = asked_of(experiment_on(env, episodes=6, drawn_episodes=1, keywords=shorter), names)
+    asked = asked_of(
+        problem_of(env), problem_of(env).experiment(episodes=6, drawn_episodes=1, keywords=shorter), names
+    )
     assert [one.episodes for one in asked] == [6] * len(names)
     found = dict(summaries(asked, Workers()))
     records, curves, evaluation = combine_summaries([found[i] for i in range(len(names))])
@@ -115,7 +117,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     monkeypatch.setattr(summary, "TOGETHER", 16)
-    asked = asked_of(experiment_on(env, episodes=40, keywords=shorter), names)
+    asked = asked_of(problem_of(env), problem_of(env).experiment(episodes=40, keywords=shorter), names)
     assert len(asked[0].pieces()) == 3
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
@@ -148,7 +150,7 @@ def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch
 
 
 def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
-    cells = [benchmark.Cell(id, name, 12, ("random", *n)) for id, name, n in (
+    cells = [benchmark.Cell(problem_of(id), name, 12, ("random", *n)) for id, name, n in (
         (ENV, "paper", ("imm", "known-turn")), (RADAR, "random", ("quasi-optimal", "ppo")),
     )]  # fmt: skip
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
@@ -187,7 +189,7 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
-    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm-tuned"])
+    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm-tuned"])
     kept = waiting.kept_in(tmp_path, asked)
     [(_, found)] = summaries([asked], Workers(), None, [kept])
     assert summary.read_summary(*kept).contender.measures == found.contender.measures
@@ -223,7 +225,7 @@ def edit(tmp_path, monkeypatch):
 )
 def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
-    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm"])
+    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     list(summaries([asked], Workers(), None, [waiting.kept_in(tmp_path, asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
@@ -245,7 +247,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
 def test_of_an_environment_of_ones_own_nothing_is_kept(tmp_path, monkeypatch):
     """Nobody can say whether its code is what it was."""
-    [asked] = asked_of(experiment_on(ENV, episodes=4), ["imm"])
+    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
     assert waiting.kept_in(tmp_path, asked) is None
 

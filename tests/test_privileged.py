@@ -263,10 +263,10 @@ def test_a_policy_that_is_corrected_sees_the_observation_only():
     pytest.importorskip("torch")
     pytest.importorskip("sb3_contrib")
     from filtergym.agents import ResidualActions, to_sb3
-    from filtergym.baselines.names import own_competitor
+    from filtergym.baselines.problem import problem_of
 
     task = make_task(ID, "weights")
-    policy = own_competitor(ID, "imm")(task)
+    policy = problem_of(ID).competitor("imm")(task)
     keywords = {"control": "weights", "horizon": 4}
     paid = []
     for observation in ("measured", "asymmetric"):

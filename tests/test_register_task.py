@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.problem import import_problem
 from filtergym.baselines.table import Baselines
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, make_task, task_class
@@ -103,6 +105,13 @@ def test_a_spawned_process_finds_it(package):
     finally:
         vector.close()
     np.testing.assert_array_equal(observation[0], gymnasium.make(ID, horizon=5).reset(seed=3)[0])
+
+
+def test_a_problem_goes_to_another_process_by_its_name(package):
+    packed = pickle.dumps(import_problem(ID))
+    sys.modules.pop("turns_package")
+    forget("mine/Turns-v0")
+    assert pickle.loads(packed).id == "mine/Turns-v0"
 
 
 def test_evaluation_without_baselines(package):

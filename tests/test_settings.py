@@ -9,7 +9,7 @@ import shlex
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.baselines.names import own_competitor
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import task_class
 
 from filtergym import evaluate
@@ -330,7 +330,7 @@ def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
 
 def test_costs_of_a_mixture_are_weighted():
     run = new_run(ID, "ppo")
-    paper = own_competitor(ID, "imm")
+    paper = problem_of(ID).competitor("imm")
     run.scenario = "random:0.25,paper:0.75"
     mixed = TrainingEpisodes(run, 4).costs(paper)
     parts = []

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.names import experiment_on
+from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import tuned_names
 from filtergym.envs.catalogue import make_task, task_class
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
@@ -30,7 +30,7 @@ from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
 from scipy.special import stdtrit
 
-from filtergym.names import competitor
+from filtergym.names import find_competitor
 from filtergym.reports.tables import shown_components, with_interval
 from filtergym.reports.waiting import made_by
 
@@ -213,13 +213,14 @@ def episode_means(
         ValueError: for unknown names, and for bounds, which have no cost.
     """
     id = runs[0].run.environment
+    problem = problem_of(id)
     policies: dict[str, tuple[Any, str | None]] = {}
     for member in runs:
-        maker = competitor(id, str(member.agent), trust=trust)
+        maker = find_competitor(problem, str(member.agent), trust)
         # A learned estimator has a filter of its own, and steers nothing.
         policies[member.name] = maker, member.run.control if kind_of(maker) == "policy" else None
     for name in dict.fromkeys([paper_of(id), *opponents]):
-        policies[name] = competitor(id, name, trust=trust), None
+        policies[name] = find_competitor(problem, name, trust), None
         if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     agents = {member.name: member.agent for member in runs}
@@ -228,7 +229,7 @@ def episode_means(
     work: list[Asked] = []
     horizon = make_task(id, None, scenario).horizon
     for name, (maker, control) in policies.items():
-        code = made_by(id, paper_of(id) if name in agents else name)
+        code = made_by(problem, paper_of(id) if name in agents else name)
         key = json.dumps([code, id, scenario, episodes, seed, split, name])
         kept = None if waiting is None or code is None else _kept_file(waiting, key, agents.get(name))
         found[name] = None if kept is None else _read_means(kept)
@@ -236,7 +237,7 @@ def episode_means(
             missing.append((name, kept))
             # An agent's name may be that of a competitor.
             known_as = "agent" if name in agents else name
-            experiment = experiment_on(id, scenario, episodes, seed, split, control)
+            experiment = problem.experiment(scenario, episodes, seed, split, control)
             work.append(Asked(experiment, known_as, maker, horizon=horizon))
     workers = check_workers(workers)
     if not workers.alone:

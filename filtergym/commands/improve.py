@@ -11,9 +11,9 @@ from ..agents import training_run
 from ..agents.export import export_run
 from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
 from ..agents.training_run import TrainingRun, best_agent
-from ..baselines.catalogue import baselines_of
+from ..baselines.problem import problem_of
 from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
-from ..envs.catalogue import importable_name, nearest, task_class
+from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..reports import standing
@@ -47,16 +47,16 @@ def tune_policy(
 
     Example: filtergym tune filtergym/ManeuveringTarget-v0 --policy imm --budget 4000000
     """
-    cls = task_class(environment)
-    tunable = baselines_of(cls.id).tunable
+    problem = problem_of(environment)
+    tunable = problem.baselines.tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)
-    table = writable_file(table_path(cls.id, out))
+    table = writable_file(table_path(problem.id, out))
     read_table(table)  # a file that cannot take the values is refused before the work
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
-            cls.id,
+            problem.id,
             policy,
             tunable[policy],
             budget,
@@ -67,7 +67,7 @@ def tune_policy(
             workers=workers,
             waiting=table.with_name(f"{table.stem}.{policy}.unfinished"),
         )
-    command = f"filtergym tune {importable_name(cls)} --policy {policy} --budget {budget} --seed {seed}"
+    command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
     console.print(tuned_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
@@ -331,8 +331,9 @@ def search(
     keywords, hyperparameters = parsed_settings(set_ or [])
     if algo not in training_run.FILES:
         raise nearest("algorithm", algo, training_run.FILES)
+    problem = problem_of(environment)
     wanted = searching.Search(
-        importable_name(task_class(environment)),
+        problem.name,
         algo,
         control,
         scenario,
@@ -340,7 +341,7 @@ def search(
         tuple(whole_numbers("--seeds", seeds)),
         keywords,
         hyperparameters,
-        searching.read_space(task_class(environment).id, algo, space),
+        searching.read_space(problem.id, algo, space),
         seed,
     )
     wanted.run(wanted.seeds[0], {})  # a wrong word costs nothing

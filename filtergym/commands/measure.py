@@ -7,8 +7,7 @@ import typer
 import xarray
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.catalogue import baselines_of
-from ..baselines.names import experiment_on
+from ..baselines.problem import problem_of
 from ..envs.catalogue import (
     catalogue,
     check_names,
@@ -32,7 +31,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..evaluation.summary import combine_summaries, summaries
-from ..names import asked_of, competitor, competitors_of, is_learned, tidy_records
+from ..names import asked_of, competitors_of, find_competitor, is_learned, tidy_records
 from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
@@ -88,7 +87,7 @@ def list_environments(
     Example: filtergym list filtergym/ManeuveringTarget-v0
     """
     for id in environment or catalogue():
-        first, *lines = environment_lines(id)
+        first, *lines = environment_lines(problem_of(id))
         console.print(first, style="bold")
         for line in lines:
             console.print(line, highlight=False, soft_wrap=True)
@@ -196,7 +195,7 @@ def evaluate_policies(
         environment = flown.environment
     if environment is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
-    cls = task_class(environment)
+    problem = problem_of(environment)
     if not isinstance(flown, Recording) and scenario not in named and names_flights(scenario):
         flown = read_flights(
             scenario,
@@ -208,7 +207,7 @@ def evaluate_policies(
         )
     elif site is not None:
         raise ValueError(f"--site is for flights from files, and {scenario or recording!r} is none")
-    known = baselines_of(cls.id)
+    known = problem.baselines
     if out is not None:
         writable_folder(out)
     if json is not None:
@@ -217,20 +216,19 @@ def evaluate_policies(
         check_estimates(estimates)
         writable_file(estimates)
     names = policy or list(known.benchmark or known.names)
-    learned = [name for name in names if is_learned(cls.id, name)]
+    learned = [name for name in names if is_learned(problem, name)]
     if isinstance(flown, Recording):
         episodes = len(flown.names)
         if not policy:  # references and bounds are told what a recording does not hold
-            names = [name for name in names if kind_of(competitor(cls.id, name)) in RANKED]
-    check_names(cls, keywords)
-    task = make_task(cls.id, control, flown, **keywords)
+            names = [name for name in names if kind_of(find_competitor(problem, name)) in RANKED]
+    check_names(problem.task, keywords)
+    task = make_task(problem.id, control, flown, **keywords)
     measurements = len(set(names)) * episodes * task.horizon
     errors = measurements * len(task.components) * 8
     refusal = _unwritten(errors, errors, netcdf)
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
     everything = bool(task.flights) or estimates is not None or (out is not None and not refusal)
-    experiment = experiment_on(
-        cls.id,
+    experiment = problem.experiment(
         flown,
         episodes,
         seed,
@@ -251,10 +249,10 @@ def evaluate_policies(
             bar.update(line, advance=done)
 
         if everything:
-            makers = competitors_of(cls.id, names, trust=trust)
+            makers = competitors_of(problem, names, trust)
             dataset = run_experiment(experiment, makers, tick, workers)
         else:
-            asked = asked_of(experiment, names, trust=trust)
+            asked = asked_of(problem, experiment, names, trust)
             kept = [None if out is None else kept_in(out / UNFINISHED, one) for one in asked]
             found = dict(summaries(asked, workers, tick, kept))
     if everything:
@@ -527,10 +525,12 @@ def animate(
     """
     from ..evaluation.animation import episode_frames, write_animation
 
-    cls = task_class(environment)
+    problem = problem_of(environment)
     writable_folder(out)
     for name in policy:
-        path = writable_file(out / f"{cls.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif")
-        maker = competitor(cls.id, name, trust=trust)
-        write_animation(episode_frames(cls.id, name, maker, scenario, seed, every), path)
+        path = writable_file(
+            out / f"{problem.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
+        )
+        maker = find_competitor(problem, name, trust)
+        write_animation(episode_frames(problem.id, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 import xarray
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.catalogue import baselines_of
-from ..baselines.names import experiment_on
-from ..baselines.tuning import tuned_names
-from ..envs.catalogue import catalogue, short_name, task_class
+from ..baselines.problem import Problem, problem_of
+from ..envs.catalogue import catalogue, short_name
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file, writable_folder
 from ..evaluation.metrics import Record
@@ -47,10 +45,15 @@ as much as many."""
 class Cell(NamedTuple):
     """One environment in one scenario."""
 
-    environment: str
+    problem: Problem
     scenario: str
     episodes: int
     policies: tuple[str, ...]
+
+    @property
+    def environment(self) -> str:
+        """Gymnasium id."""
+        return self.problem.id
 
     @property
     def name(self) -> str:
@@ -60,28 +63,27 @@ class Cell(NamedTuple):
     @property
     def measurements(self) -> int:
         """Measurements of all policies together."""
-        return self.episodes * _horizon(self.environment, self.scenario) * len(self.policies)
+        return self.episodes * _horizon(self.problem.task, self.scenario) * len(self.policies)
 
 
-def _horizon(id: str, scenario: str) -> int:
-    cls: Any = task_class(id)
+def _horizon(cls: Any, scenario: str) -> int:
     return cls.Parameters(**cls.scenarios[scenario].parameters).horizon
 
 
-def benchmark_policies(id: str, full: bool, horizon: int = 0) -> tuple[str, ...]:
+def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[str, ...]:
     """Names that a cell compares, the paper's algorithm first.
 
     Quick: the telling ones, tuned where they can be and episodes are not long; shipped agents. Full: every policy and
     estimator as it is, those that were tuned, shipped agents, references, bounds.
 
     Args:
-        id: environment id.
+        problem: whose they are.
         full: everything.
         horizon: measurements of an episode.
     """
-    known = baselines_of(id)
-    tuned = tuned_names(id) if full or horizon <= LONG else []
-    learned = shipped_agents(id)
+    known = problem.baselines
+    tuned = problem.tuned if full or horizon <= LONG else []
+    learned = shipped_agents(problem.id)
     if full:
         everything = (*known.policies, *known.estimators, *tuned, *learned, *known.references, *known.bounds)
     else:
@@ -97,19 +99,20 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
     """
     wanted = []
     for id in environments or catalogue():
-        cls = task_class(id)
+        problem = problem_of(id)
+        cls = problem.task
         for name, scenario in cls.scenarios.items():
             if not (full or name.startswith("paper") or name == cls.default_scenario):
                 continue
             if split != "test" and not scenario.training:
                 continue
-            horizon = _horizon(id, name)
+            horizon = _horizon(cls, name)
             measurements, fewest = MEASUREMENTS, FEWEST_EPISODES
             if full:
-                affordable = int(FULL_SECONDS / baselines_of(id).measurement_seconds)
+                affordable = int(FULL_SECONDS / problem.baselines.measurement_seconds)
                 measurements, fewest = min(10 * MEASUREMENTS, affordable), FEWEST_EPISODES_FULL
             episodes = max(fewest, min(5000 if full else 500, measurements // horizon))
-            wanted.append(Cell(cls.id, name, episodes, benchmark_policies(id, full, horizon)))
+            wanted.append(Cell(problem, name, episodes, benchmark_policies(problem, full, horizon)))
     return wanted
 
 
@@ -125,7 +128,8 @@ def result_of(
         learned: names that stand for something learned, those of competitors among them.
     """
     id, scenario = dataset.attrs["environment"], dataset.attrs["scenario"]
-    cls, known = task_class(id), baselines_of(id)
+    problem = problem_of(id)
+    cls, known = problem.task, problem.baselines
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
     shown = shown_competitors(records, paper, reference, learned)
@@ -192,8 +196,7 @@ def run_benchmark(
     asked: list[tuple[Asked, int]] = []
     found: list[dict[str, Summary]] = [{} for _ in wanted]
     for i, cell in enumerate(wanted):
-        experiment = experiment_on(
-            cell.environment,
+        experiment = cell.problem.experiment(
             cell.scenario,
             cell.episodes,
             seed,
@@ -202,7 +205,7 @@ def run_benchmark(
             backend=backend,
             threads=threads,
         )
-        everyone = asked_of(experiment, cell.policies)
+        everyone = asked_of(cell.problem, experiment, cell.policies)
         asked += [(one, i) for one in everyone]
     told = 0
 
@@ -222,9 +225,7 @@ def run_benchmark(
     workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
-            key=lambda one: (
-                -one[0].measurements * baselines_of(one[0].experiment.environment).measurement_seconds
-            )
+            key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
     kept = [kept_in(unfinished, one) for one, _ in asked]
     for k, summary in summaries([one for one, _ in asked], workers, tick, kept):

@@ -3,12 +3,11 @@
 from collections.abc import Iterator
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.catalogue import baselines_of
-from ..baselines.tuning import tuned_names
+from ..baselines.problem import Problem
 from ..compiler.library import fastest
 from ..compiler.native import processor
 from ..envs.backend import task_on
-from ..envs.catalogue import importable_name, parameter_names, task_class
+from ..envs.catalogue import parameter_names
 
 
 def _library(backend: str) -> str:
@@ -16,11 +15,10 @@ def _library(backend: str) -> str:
     return f" (functions of {fastest(processor()[1]).name})" if backend == "compiled" else ""
 
 
-def environment_lines(id: str) -> Iterator[str]:
+def environment_lines(problem: Problem) -> Iterator[str]:
     """Describe an environment; the first line is its id."""
-    cls = task_class(id)
-    known = baselines_of(id)
-    yield importable_name(cls)
+    cls, known = problem.task, problem.baselines
+    yield problem.name
     yield f"  {(cls.__doc__ or '').strip().partition(chr(10))[0]}"
     if cls.paper_source:
         yield f"  paper:       {cls.paper_source}"
@@ -29,8 +27,8 @@ def environment_lines(id: str) -> Iterator[str]:
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
         "estimators": list(known.estimators),
-        "tuned": tuned_names(id),
-        "learned": shipped_agents(id),
+        "tuned": problem.tuned,
+        "learned": shipped_agents(cls.id),
         "parameters": parameter_names(cls),
     }
     for title, names in rows.items():

@@ -14,10 +14,8 @@ from rich.table import Table
 from ..agents import training_run
 from ..agents.named_policies import learned_policy
 from ..agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
-from ..baselines.catalogue import baselines_of
-from ..baselines.names import own_competitor
-from ..baselines.tuning import tuned_names
-from ..envs.catalogue import make_task, task_class
+from ..baselines.problem import problem_of
+from ..envs.catalogue import make_task
 from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap, Estimate
 from ..evaluation.competitors import RandomPolicy
@@ -55,8 +53,8 @@ class Opponents:
     """
 
     def __init__(self, run: TrainingRun) -> None:
-        self.id = task_class(run.environment).id
-        known = baselines_of(self.id)
+        self.problem = problem_of(run.environment)
+        known = self.problem.baselines
         self.paper = known.score_paper
         self.episodes = TrainingEpisodes(run, training_run.VALIDATION_EPISODES, validation_backend(run))
         self.found: list[Standing] = []
@@ -69,7 +67,7 @@ class Opponents:
             self._fly(known.score_reference, "reference")
 
     def _fly(self, name: str, role: str) -> None:
-        self.found.append(Standing(name, role, self.measured(own_competitor(self.id, name))))
+        self.found.append(Standing(name, role, self.measured(self.problem.competitor(name))))
 
     def measured(self, competitor: Any) -> dict[str, numpy.ndarray]:
         """Return cost and normalised estimation error of every episode, ``(episodes,)``."""
@@ -77,10 +75,10 @@ class Opponents:
 
     def _strongest(self, run: TrainingRun) -> str | None:
         """Name of the competitor with the lowest cost, of any kind, tuned or not; None where there is none."""
-        known = baselines_of(self.id)
+        known = self.problem.baselines
         makers = {
-            name: own_competitor(self.id, name)
-            for name in (*known.policies, *known.estimators, *tuned_names(self.id))
+            name: self.problem.competitor(name)
+            for name in (*known.policies, *known.estimators, *self.problem.tuned)
         }
         names = [n for n, maker in makers.items() if n != self.paper and maker is not RandomPolicy]
         if not names:
@@ -120,7 +118,8 @@ def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) 
     episodes = len(lines[0].means["cost"])
     bootstrap = Bootstrap(episodes)
     table = Table(
-        title=f"{opponents.id}, scenario {scenario} ({episodes} episodes of the validation split; 95 % intervals)",
+        title=f"{opponents.problem.id}, scenario {scenario} ({episodes} episodes of the validation split; "
+        "95 % intervals)",
         title_justify="left",
     )
     table.add_column("name", no_wrap=True)

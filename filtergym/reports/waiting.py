@@ -7,9 +7,9 @@ from pathlib import Path
 
 from ..agents.learned_policy import pretrained_path
 from ..agents.named_policies import shipped_agents
-from ..baselines.catalogue import baselines_of
-from ..baselines.tuning import stored_values, tuned_names
-from ..envs.catalogue import importable_name, short_name, task_class
+from ..baselines.problem import Problem, problem_of
+from ..baselines.tuning import stored_values
+from ..envs.catalogue import short_name
 from ..evaluation.code import code_digest
 from ..evaluation.summary import Asked, Kept
 
@@ -41,7 +41,7 @@ def kept_in(folder: Path, asked: Asked) -> Kept | None:
         None where :func:`made_by` says that nothing is kept.
     """
     experiment = asked.experiment
-    maker = made_by(experiment.environment, asked.name)
+    maker = made_by(problem_of(experiment.environment), asked.name)
     if maker is None:
         return None
     plain = asked._replace(maker=None, metrics=None)
@@ -51,27 +51,26 @@ def kept_in(folder: Path, asked: Asked) -> Kept | None:
     return Kept(folder / f"{stem}.{asked.name}.npz", f"{maker} {tuple(plain)}")
 
 
-def made_by(environment: str, name: str) -> str | None:
+def made_by(problem: Problem, name: str) -> str | None:
     """Return a digest of the code and the values that a competitor's numbers depend on.
 
     Args:
-        environment: its id.
+        problem: whose it is.
         name: of the competitor.
 
     Returns:
         None for environments, files, modules and objects of one's own: nobody can say whether they are what they were.
     """
-    cls = task_class(environment)
-    stands_for = _meaning(cls.id, name)
-    if stands_for is None or importable_name(cls) != cls.id:
+    stands_for = _meaning(problem, name)
+    if stands_for is None or problem.name != problem.id:
         return None
     return hashlib.sha256(f"{code_digest()} {stands_for}".encode()).hexdigest()
 
 
-def _meaning(id: str, name: str) -> str | None:
+def _meaning(problem: Problem, name: str) -> str | None:
     """Say what a name stands for, in words that change with it."""
-    if name in tuned_names(id):
-        return json.dumps(stored_values(id, name.removesuffix("-tuned"))[0])
-    if name in shipped_agents(id):
-        return hashlib.sha256(pretrained_path(id, name).read_bytes()).hexdigest()
-    return name if name in baselines_of(id).names else None
+    if name in problem.tuned:
+        return json.dumps(stored_values(problem.id, name.removesuffix("-tuned"))[0])
+    if name in shipped_agents(problem.id):
+        return hashlib.sha256(pretrained_path(problem.id, name).read_bytes()).hexdigest()
+    return name if name in problem.baselines.names else None

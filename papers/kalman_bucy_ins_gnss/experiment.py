@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...baselines.names import own_competitor
+from ...baselines.problem import problem_of
 from ...envs.catalogue import make_task
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.task import Episode
@@ -113,7 +113,7 @@ def first_order(runs: int) -> FirstOrder:
 
 def example_run(name: str) -> dict[str, numpy.ndarray]:
     """Fly one episode with the drift ``DRIFT``: reference, INS, measurement and estimate, m, ``(500,)``."""
-    maker = own_competitor(LooselyCoupledNavigation.id, name)
+    maker = problem_of(LooselyCoupledNavigation.id).competitor(name)
     task: Any = make_task(LooselyCoupledNavigation.id, maker.control, "paper", fixed_drift=DRIFT)
 
     def fields(episode: Episode) -> dict[str, numpy.ndarray]:
