@@ -36,6 +36,7 @@ of its own, on the same noise.
 
 import copy
 import importlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -139,6 +140,9 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
     initial_normals: int
     normals: int
     row_uniforms: int = 0
+    received_field: ClassVar[str] = ""
+    """Field of the measurement whose values are received only where its field ``available`` is above zero, of the same
+    shape or ``(N,)``; empty where everything is received."""
 
     def __init__(self, task: TaskT) -> None:
         self.task = task
@@ -175,12 +179,18 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
 
         The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
-        that overlooks the availability must not take that number for a measurement. Here everything is received.
+        that overlooks the availability must not take that number for a measurement. Here the values of
+        ``received_field`` are replaced.
 
         Args:
             measurement: of :meth:`advance`.
         """
-        return measurement
+        if not self.received_field:
+            return measurement
+        there: Any = measurement
+        values = self.xp.where(there.available > 0.0, getattr(there, self.received_field), math.nan)
+        replaced: Measurement = there._replace(**{self.received_field: values})
+        return replaced
 
     def seen(self, measurement: Measurement) -> Array | None:
         """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.

@@ -11,7 +11,7 @@ from filtergym.baselines.loosely_coupled_navigation.policies import recovery_tim
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.loosely_coupled_navigation.world import within
+from filtergym.envs.schedules import within
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.rollout import run_policy, run_reference
 from filtergym.evaluation.seeds import episode_seeds

@@ -82,6 +82,14 @@ def test_reused_figure_shows_what_a_new_one_shows(control):
     numpy.testing.assert_array_equal(reused.render(), drawn_once.render())
 
 
+def test_a_scenario_whose_measurements_take_uniform_numbers_is_drawn():
+    env = gymnasium.make(
+        "filtergym/LooselyCoupledNavigation-v0", scenario="outliers", render_mode="rgb_array", horizon=5
+    )
+    env.reset(seed=0)
+    assert env.render().ndim == 3
+
+
 def test_rendering_leaves_the_episode_alone():
     plain, drawn = TaskEnv(ID, "gain"), TaskEnv(ID, "gain", render_mode="rgb_array")
     numpy.testing.assert_array_equal(plain.reset(seed=5)[0], drawn.reset(seed=5)[0])

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy
 
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...envs.loosely_coupled_navigation.world import Measurement, Truth, within
+from ...envs.loosely_coupled_navigation.world import Measurement, Truth
 from ...envs.observation import Array
+from ...envs.schedules import within
 from ...envs.task import Initial
 from ...filters import loosely_coupled as ins_gnss
 

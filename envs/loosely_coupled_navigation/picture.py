@@ -83,7 +83,7 @@ class LooselyCoupledNavigationPicture(Picture):
             first, beyond = float(window[0, 0]), float(window[1, 0])
             if first <= p.horizon:
                 self.disturbed.append((first - 0.5, min(beyond, p.horizon + 1) - 0.5))
-        still = numpy.zeros((world.normals, truth.number.shape[-1]))
+        still = numpy.zeros((world.normals + world.row_uniforms, truth.number.shape[-1]))
         path = []
         for _ in range(p.horizon + 1):
             path.append(float(truth.reference[0, 0]))

@@ -7,7 +7,9 @@ import numpy
 
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between
+from ..faults import Outliers
 from ..observation import Array
+from ..schedules import Steps, within
 from ..task import Initial, Task, World
 from .parameters import LooselyCoupledNavigationParameters
 
@@ -81,12 +83,15 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
     """A sine motion, an inertial system with three rate errors, and a satellite receiver."""
 
     parameters: LooselyCoupledNavigationParameters
+    received_field = "fix"
 
     def __init__(self, task: Task) -> None:
         super().__init__(task)
         axes = self.parameters.axes
         self.initial_normals, self.normals = 2 * axes, 3 * axes
-        self.row_uniforms = 1 if self.parameters.outlier_probability else 0
+        p = self.parameters
+        self.outliers = Outliers(p.outlier_probability, math.sqrt(p.outlier_factor))
+        self.row_uniforms = self.outliers.row_uniforms
         self.phase = task.constant([math.pi / 2 * i for i in range(axes)])[:, None]
         self.no_covariance = task.constant(numpy.zeros((axes, axes)))[:, :, None]
 
@@ -173,16 +178,11 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         deviation, reported = truth.receiver_levels[0], truth.reported_levels[0]
         available = truth.available
         if p.noise_changes[1]:
-            changed, again = number >= truth.change[0], number >= truth.change[1]
-            deviation, reported = (
-                xp.where(again, levels[2], xp.where(changed, levels[1], levels[0]))
-                for levels in (truth.receiver_levels, truth.reported_levels)
-            )
+            levels = truth.receiver_levels, truth.reported_levels
+            deviation, reported = (Steps(level, truth.change).at(number, xp) for level in levels)
         if p.jamming_probability:
             deviation = xp.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
-        if p.outlier_probability:
-            louder = math.sqrt(p.outlier_factor) * deviation
-            deviation = xp.where(noise[3 * n] < p.outlier_probability, louder, deviation)
+        deviation = self.outliers.amplified(deviation, noise[3 * n :], xp)
         fix = reference + deviation * noise[2 * n : 3 * n]
         if p.spoofing_probability:
             pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
@@ -204,10 +204,6 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Position, ``(A, N)``."""
         return truth.reference
-
-    def received(self, measurement: Measurement) -> Measurement:
-        """Fix NaN where there is none."""
-        return measurement._replace(fix=self.xp.where(measurement.available > 0.0, measurement.fix, math.nan))
 
     def seen(self, measurement: Measurement) -> Array:
         """The receiver's position."""
@@ -256,8 +252,3 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             "receiver_deviation": truth.deviation,
             "available": truth.available,
         }
-
-
-def within(number: Array, window: Array) -> Array:
-    """Whether a measurement stands in a window, ``(N,)``."""
-    return (number >= window[0]) & (number < window[1])

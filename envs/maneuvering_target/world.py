@@ -57,6 +57,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
     """
 
     parameters: ManeuveringTargetParameters
+    received_field = "position"
     initial_normals = 4
     normals = 2
 
@@ -119,11 +120,6 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
-
-    def received(self, measurement: Measurement) -> Measurement:
-        """Position NaN where the scan missed the target."""
-        position = self.xp.where(measurement.available > 0.0, measurement.position, math.nan)
-        return measurement._replace(position=position)
 
     def seen(self, measurement: Measurement) -> Array:
         """The measured position; nothing of the velocity."""

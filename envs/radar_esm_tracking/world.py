@@ -8,6 +8,7 @@ import numpy
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between, category
+from ..faults import Outliers
 from ..observation import Array
 from ..task import World
 from .parameters import RadarEsmTrackingParameters
@@ -88,7 +89,8 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
     def __init__(self, task: "RadarEsmTracking") -> None:
         super().__init__(task)
         p, constant = self.parameters, task.constant
-        self.row_uniforms = 5 if p.glint_probability else 4
+        self.glint = Outliers(p.glint_probability, p.glint_factor)
+        self.row_uniforms = 4 + self.glint.row_uniforms
         models, start = task.design_models(p)
         # Q = L L^T; diagonal where the noise is on the acceleration only, which Cholesky cannot factor.
         root = numpy.sqrt if p.process_noise == "acceleration" else numpy.linalg.cholesky
@@ -158,7 +160,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             silence_end=silence_end,
             second_emitter=second_emitter,
         )
-        first = self._measured(truth, normals[1:], draws.unit("first_intercept", 3))
+        first = self._measured(truth, normals[1:3], normals[3:], draws.unit("first_intercept", 3))
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
 
@@ -198,31 +200,29 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if p.silence_start[1] > 0.0:
             on = xp.where(truth.radiating, noise[10] >= truth.silence_start, noise[10] < truth.silence_end)
             truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
-        measured = noise[3:7]
-        if p.glint_probability:
-            louder = xp.where(noise[11] < p.glint_probability, p.glint_factor, xp.ones_like(noise[11]))
-            measured = xp.concat([louder * noise[3:5], noise[5:7]])
-        return truth, self._measured(truth, measured, noise[7:10])
+        radar = self.glint.amplified(noise[3:5], noise[11:], xp)
+        return truth, self._measured(truth, radar, noise[5:7], noise[7:10])
 
     # --- the sensors
 
     def _looks(self, scan: Array) -> Array:
         return scan % self.parameters.esm_period == 0
 
-    def _measured(self, truth: Truth, normals: Array, uniforms: Array) -> Measurement:
+    def _measured(self, truth: Truth, errors: Array, bearings: Array, uniforms: Array) -> Measurement:
         """Measure and listen.
 
         Args:
             truth: at this scan.
-            normals: errors of the radar's range and range rate, of its bearing and of the ESM's, ``(4, N)``.
+            errors: of the radar's range and range rate, in units of their standard deviations, ``(2, N)``.
+            bearings: of the radar's bearing and of the ESM's, likewise.
             uniforms: for the type, the decision and the source, ``(3, N)``.
         """
         xp, p = self.xp, self.parameters
         radar = xp.stack(
-            [truth.motion[0] + p.range_sigma * normals[0], truth.motion[1] + p.range_rate_sigma * normals[1]]
+            [truth.motion[0] + p.range_sigma * errors[0], truth.motion[1] + p.range_rate_sigma * errors[1]]
         )
         heard_class, heard_type, heard = truth.target_class, truth.emitter_type, truth.radiating
-        esm_bearing = p.esm_bearing_sigma * normals[3]
+        esm_bearing = p.esm_bearing_sigma * bearings[1]
         if p.second_emitter_probability[1] > 0.0:
             other = uniforms[2] < truth.second_emitter
             heard_class = xp.where(other, truth.other_class, heard_class)
@@ -234,7 +234,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         looked = self._looks(truth.scan)
         heard = heard & looked
         decision = category(uniforms[1], xp.take(self.decision_thresholds, heard_type, axis=1), xp)
-        difference = class_fusion.bearing_difference(p.radar_bearing_sigma * normals[2], esm_bearing)
+        difference = class_fusion.bearing_difference(p.radar_bearing_sigma * bearings[0], esm_bearing)
         return Measurement(
             scan=truth.scan,
             radar=radar,

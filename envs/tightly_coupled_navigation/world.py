@@ -130,6 +130,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
 
     task: "TightlyCoupledNavigation"
     parameters: TightlyCoupledNavigationParameters
+    received_field = "readings"
     initial_normals = gnss_ins.SIZE
 
     def __init__(self, task: Task) -> None:
@@ -366,11 +367,6 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             range_error=error,
         )
         return truth, Measurement(step, readings, available, ins_angles, truth.cn0, position, velocity)
-
-    def received(self, measurement: Measurement) -> Measurement:
-        """Readings NaN where they are not there."""
-        readings = self.xp.where(measurement.available > 0.0, measurement.readings, math.nan)
-        return measurement._replace(readings=readings)
 
     def _during(self, window: Array, k: Array) -> Array:
         """Whether step k lies in a window, ``(N,)``."""

@@ -9,33 +9,16 @@ import numpy
 from ...filters import linear_systems
 from ..draws import Draws
 from ..observation import Array
+from ..schedules import Steps, within
 from ..task import World
 from .parameters import UavAutopilotParameters
 
 if TYPE_CHECKING:
-    from types import ModuleType
-
     from .task import UavAutopilot
 
 FARTHEST = 1e4
 """Where a coordinate of a lost loop stops, in its own unit: far beyond what any stable loop reaches, and
 small enough for squares to stay numbers."""
-
-
-class Steps(NamedTuple):
-    """A signal that is constant between its steps."""
-
-    values: Array
-    """At the start and from each step on, ``(J + 1, ..., N)``."""
-    times: Array
-    """Numbers of the measurements at which it steps, ascending, ``(J, N)``."""
-
-    def at(self, number: Array, xp: "ModuleType") -> Array:
-        """Value at a measurement, ``(..., N)``."""
-        value = self.values[0]
-        for i in range(self.times.shape[0]):
-            value = xp.where(number >= self.times[i], self.values[i + 1], value)
-        return value
 
 
 class Truth(NamedTuple):
@@ -100,6 +83,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     """An aircraft that is flown by what is fed back, its gusts, and its sensors."""
 
     parameters: UavAutopilotParameters
+    received_field = "reading"
 
     def __init__(self, task: "UavAutopilot") -> None:
         super().__init__(task)
@@ -226,7 +210,7 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         reading = self.task.readings_of(state) + self.sensor_sigmas * sensor_level * readout
         available = xp.ones_like(reading)
         for i in range(truth.dropout_starts.shape[0]):
-            out = (number >= truth.dropout_starts[i]) & (number < truth.dropout_stops[i])
+            out = within(number, (truth.dropout_starts[i], truth.dropout_stops[i]))
             available = xp.where(out, 0.0, available)
         reading = xp.where(available > 0.0, reading, truth.reading)
         command = truth.commands.at(number, xp)
@@ -243,11 +227,6 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """State of the plant, ``(n, N)``."""
         return truth.state
-
-    def received(self, measurement: Measurement) -> Measurement:
-        """Readings NaN in a dropout."""
-        reading = self.xp.where(measurement.available > 0.0, measurement.reading, math.nan)
-        return measurement._replace(reading=reading)
 
     def seen(self, measurement: Measurement) -> Array:
         """Every coordinate that has a sensor."""
