@@ -11,7 +11,8 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import make_task
+from filtergym.baselines.problem import Problem
+from filtergym.envs.catalogue import make_task, task_class
 from filtergym.envs.environment import TaskVectorEnv
 
 from filtergym import evaluate
@@ -556,8 +557,8 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
         estimators={"kalman-imm": known.estimators["kalman-imm"]},
     )
     tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
-    monkeypatch.setattr(standing, "baselines_of", lambda id: few)
-    monkeypatch.setattr(standing, "tuned_names", lambda id: tuned)
+    monkeypatch.setattr(Problem, "tuned", tuned)
+    monkeypatch.setattr(standing, "problem_of", lambda id: Problem(task_class(id), few))
     run = train(small_run("bptt", 400), tmp_path)
     opponents = standing.Opponents(run)
     names = [*few.policies, *few.estimators, *tuned, "known-turn"]
