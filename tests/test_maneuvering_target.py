@@ -440,11 +440,11 @@ def test_legs_are_drawn_around_the_stated_ones(scenario):
     np.testing.assert_allclose(
         np.abs(legs.turn[:-1]).T, np.radians(np.abs(stated[:, 1]))[None] * np.ones((4000, 1))
     )
-    away = legs.position[0] - np.array(p.initial_position)[:, None]
+    away = legs.begins[0, 2:4] - np.array(p.initial_position)[:, None]
     assert (np.abs(away) <= p.start_spread).all()
-    course = np.degrees(np.arctan2(*legs.velocity[0][::-1]) - np.arctan2(*p.initial_velocity[::-1]))
+    course = np.degrees(np.arctan2(*legs.begins[0, 4:][::-1]) - np.arctan2(*p.initial_velocity[::-1]))
     assert np.abs((course + 180.0) % 360.0 - 180.0).max() <= p.course_spread
-    np.testing.assert_allclose(np.hypot(*legs.velocity[-1]), math.hypot(*p.initial_velocity), rtol=1e-12)
+    np.testing.assert_allclose(np.hypot(*legs.begins[-1, 4:]), math.hypot(*p.initial_velocity), rtol=1e-12)
 
 
 @pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])

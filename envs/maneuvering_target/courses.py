@@ -252,16 +252,24 @@ class RandomStraight(Course):
 
 
 class Legs(NamedTuple):
-    """A flight of straight legs and exact turns, each with what it begins with."""
+    """A flight of straight legs and exact turns, each with what it begins with.
 
-    time: Array
-    """s since the start of the track, ``(legs + 1, N)``; the last one is straight and never ends."""
-    turn: Array
-    """Turn rate, rad/s, anticlockwise positive, ``(legs + 1, N)``."""
-    position: Array
-    """m, ``(legs + 1, 2, N)``."""
-    velocity: Array
-    """m/s, ``(legs + 1, 2, N)``."""
+    The last one is straight and never ends.
+    """
+
+    begins: Array
+    """``(legs + 1, 6, N)``: time since the start of the track, s; turn rate, rad/s, anticlockwise positive; position,
+    m; velocity, m/s. One array, because the truth picks all of it in every scan."""
+
+    @property
+    def time(self) -> Array:
+        """Time since the start of the track, s, ``(legs + 1, N)``."""
+        return self.begins[:, 0]
+
+    @property
+    def turn(self) -> Array:
+        """Turn rate, rad/s, ``(legs + 1, N)``."""
+        return self.begins[:, 1]
 
 
 class LegCourse(Course):
@@ -284,21 +292,21 @@ class LegCourse(Course):
         start = position, velocity
         side = xp.where(draws.event("mirrored", p.mirrored), -1.0, 1.0)
         time = 0.0 * ones
-        found: list[tuple[Array, ...]] = []
+        begins: list[Array] = []
         for i, (duration, rate) in enumerate(p.legs):
             turn = (math.radians(rate) * side) * ones
             flown = duration * draws.uniform(f"leg_{i}", (1.0 - p.leg_spread, 1.0 + p.leg_spread))
-            found.append((time, turn, position, velocity))
+            begins.append(xp.concat([xp.stack([time, turn]), position, velocity]))
             position, velocity = after(flown, turn, (position, velocity), self.task)
             time = time + flown
-        found.append((time, 0.0 * ones, position, velocity))
-        return Legs(*(xp.stack(parts) for parts in zip(*found, strict=True))), start
+        begins.append(xp.concat([xp.stack([time, 0.0 * ones]), position, velocity]))
+        return Legs(xp.stack(begins)), start
 
     def advance(self, flight: Legs, scan: Array, motion: Motion) -> Motion:
         """Motion at a scan, or between two: any number. The legs say where it is then, whatever was before."""
         now = self.parameters.sampling_interval * scan
-        time, turn, position, velocity = (Steps(part, flight.time[1:]).at(now, self.xp) for part in flight)
-        return after(now - time, turn, (position, velocity), self.task)
+        leg = Steps(flight.begins, flight.time[1:]).at(now, self.xp)
+        return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
         """Where legs begin (s), their turn rates (rad/s), and whether the target turns now."""
