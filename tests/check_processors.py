@@ -21,10 +21,14 @@ SETTINGS = {
     "compiled for bare x86-64, functions of the C library one by one": BARE,
     "compiled for Haswell, four numbers a call": {"FILTERGYM_COMPILER_PROCESSOR": "haswell,+avx2,+fma"},
     "NumPy without what it chooses by processor": NUMPY,
-    "OpenBLAS for Prescott": BLAS,
     "torch without vector instructions, MKL as on any processor": TORCH,
-    "C library without AVX and FMA": LIBC,
-    "all of them as bare as they get": {**BARE, **NUMPY, **BLAS, **TORCH, **LIBC},
+    "all of them, OpenBLAS and the C library, too, as bare as they get": {
+        **BARE,
+        **NUMPY,
+        **BLAS,
+        **TORCH,
+        **LIBC,
+    },
 }
 """Environment variables by what they do; of x86 only."""
 CHOSEN = "not TightlyCoupledNavigation or evidence or rewards"
