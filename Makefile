@@ -62,6 +62,8 @@ test-extras: test-cluster test-lowest  ## each extra alone does its work, and is
 	  > $$(echo build/lowest-extras/lib/python*/site-packages)/beneath.pth
 	# Torch stays the tested one: older ones come with all of CUDA.
 	ln -sfn $$($(BIN)/python -c "import torch; print(torch.__path__[0])")* build/lowest-extras/lib/python*/site-packages/
+	# What a new environment brings is too old to build with, and would be found first.
+	build/lowest/bin/python -m pip uninstall --quiet --yes setuptools
 	build/lowest-extras/bin/python -m pip install --quiet --constraint build/lowest.txt --editable ".[$(EXTRAS)]"
 	OMP_NUM_THREADS=1 build/lowest-extras/bin/python tests/check_extras.py --present build/extras-lowest
 
