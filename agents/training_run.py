@@ -40,7 +40,7 @@ from ..envs.parameters import check_integer
 from ..envs.reward import REWARDS
 from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap
-from ..evaluation.competitors import kind_of, made
+from ..evaluation.competitors import kind_of
 from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.rollout import run_competitor
 from ..evaluation.seeds import episode_seeds
@@ -540,7 +540,7 @@ class TrainingEpisodes:
         total: dict[str, Any] = {}
         for scenario, weight in self.weights.items():
             task = self._task(control, scenario, getattr(competitor, "task_keywords", {}))
-            series = run_competitor(task, made(competitor, task), kind, self.seeds[:episodes], report)
+            series = run_competitor(task, competitor, kind, self.seeds[:episodes], report)
             for name, values in series.items():
                 mean = numpy.ascontiguousarray(values).mean(axis=1)
                 total[name] = total.get(name, 0.0) + weight * mean

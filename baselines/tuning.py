@@ -24,7 +24,7 @@ from ..evaluation.code import code_digest
 from ..evaluation.competitors import Kind
 from ..evaluation.files import append_line, write_text
 from ..evaluation.parallel import Workers, check_workers
-from ..evaluation.rollout import Progress, run_estimator, run_policy
+from ..evaluation.rollout import Progress, rollout
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import fits, read_json
 from .catalogue import baselines_of, package_of
@@ -72,18 +72,9 @@ def _costs(candidate: _Candidate, tick: Progress) -> numpy.ndarray:
     task = task_on(
         candidate.backend, candidate.environment, candidate.tunable.control, candidate.scenario, **keywords
     )
-    kept: list[numpy.ndarray] = []
-
-    def keep(cost: numpy.ndarray) -> None:
-        kept.append(numpy.asarray(cost[: len(candidate.seeds)]))
-
-    if candidate.tunable.control:
-        run_policy(task, make(task), candidate.seeds, keep, lambda _: None, _cost)
-    else:
-        run_estimator(
-            task, make(task), candidate.seeds, lambda episode: keep(task.cost(episode)), lambda _: None
-        )
-    return numpy.stack(kept)
+    # Made already, so that no program is compiled for a candidate that is tried once.
+    run = rollout(task, make(task), candidate.seeds, _cost)
+    return numpy.stack([numpy.asarray(cost[: len(candidate.seeds)]) for cost, _ in run])
 
 
 def mean_cost(

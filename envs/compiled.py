@@ -31,6 +31,7 @@ from ..compiler.functions import (
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from .draws import Draws
+from .filter import Filter, Input
 from .observation import Array
 from .reward import OWN_PAY
 from .task import Episode, Task
@@ -52,41 +53,46 @@ Report = Callable[[Task, Episode], Any]
 
 
 # A step in four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
-# what is long, the bank, is compiled once for all of them.
+# what is long, world and filter, is compiled once for all of them.
 
 
-def _acted(task: Task, bank: Any, measurement: Any, action: Array) -> Any:
-    """Bank after the action."""
-    return task.bank.act(bank, measurement, action)
+def _updated(task: Task, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
+    """Filter after the measurement, and what it gives back to the world."""
+    after = task.filter.update(state, Input(measurement, truth, action))
+    return after, task.filter.feedback(after)
 
 
-def _advanced(task: Task, truth: Any, bank: Any, noise: Array) -> tuple[Any, Any]:
+def _advanced(task: Task, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
     """Truth at the next measurement, and the measurement."""
-    return task.world.advance(truth, noise, task.bank.feedback(bank))
+    return task.world.advance(truth, noise, feedback)
 
 
-def _predicted(task: Task, bank: Any, measurement: Any) -> tuple[Any, Array]:
-    """Bank at the measurement, and what is shown of it."""
-    predicted = task.bank.predict(bank, measurement)
-    if not task.fields:  # somebody else estimates
-        return predicted, task.xp.zeros((0, 1))
+def _predicted(task: Task, state: Any, measurement: Any) -> tuple[Any, Array]:
+    """Filter at the measurement, and what is shown of it."""
+    predicted = task.filter.predict(state, measurement)
     return predicted, task.observe(Episode(None, measurement, predicted))
 
 
 def _world_begun(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]:
-    """Truth at the start of the track, and what everyone is told of it."""
+    """Truth at the start of the track, and the initial estimate."""
     return task.world.begin(Draws(uniforms, task.xp), normals)
 
 
-def _bank_started(task: Task, initial: Any) -> Any:
-    """Bank at the start of the track."""
-    return task.bank.start(initial)
+def _filter_started(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
+    """Filter at the start of the track, and what it gives back to the world."""
+    state = task.start_filter(initial, truth)
+    return state, task.filter.feedback(state)
+
+
+def _feedback(task: Task, state: Any) -> Any:
+    """What a filter gives back to the world."""
+    return task.filter.feedback(state)
 
 
 class Parts(NamedTuple):
     """Programs of a step, and what they are made for."""
 
-    act: Specialised
+    update: Specialised
     advance: Specialised
     predict: Specialised
     episode: Episode
@@ -121,14 +127,33 @@ class Programs:
     Args:
         traced: the task on traced arrays.
         graph: where its constants were made.
+        of_world: what is traced of the same task with another filter; the world is the same.
     """
 
-    def __init__(self, traced: Task, graph: Graph) -> None:
+    def __init__(self, traced: Task, graph: Graph, of_world: "Programs | None" = None) -> None:
         self.traced = traced
         self.graph = graph
         self.refused: set[Any] = set()
         """Functions that could not be traced."""
         self._functions: dict[Any, Function] = {}
+        self._of_world = of_world or self
+        self._with_filter: dict[Any, Programs] = {}
+
+    def with_filter(self, make: Callable[[Task], Filter]) -> "Programs":
+        """Return what is traced of the task with another filter; kept for the next time.
+
+        Raises:
+            NotTraceable: if the filter is no straight line of arithmetic.
+        """
+        if make not in self._with_filter:
+            with namespace.tracing(self.graph):
+                programs = Programs(self.traced.with_filter(make), self.graph, self._of_world)
+            if not programs.traced.filter.in_python:
+                _ = programs.later
+            while len(self._with_filter) >= REMEMBERED:
+                self._with_filter.pop(next(iter(self._with_filter)))
+            self._with_filter[make] = programs
+        return self._with_filter[make]
 
     def function(self, function: Callable[..., Any], **options: Any) -> Function:
         """Compiled form of ``function(task, ...)``."""
@@ -140,33 +165,44 @@ class Programs:
         return self._functions[function]
 
     @_Once
-    def acted(self) -> Function:
-        """The action; a part of the bank that it leaves alone is not written again."""
-        return self.function(_acted, unchanged=None)
+    def updated(self) -> Function:
+        """The filter with the measurement; a part of it that stays is not written again."""
+        return self.function(_updated, unchanged=None)
 
     @_Once
     def advanced(self) -> Function:
         """The world; a part of the truth that stays is not written again."""
-        return self.function(_advanced, unchanged=len(leaves(self.begun[0].example()[0])))
+        if self._of_world is not self:
+            return self._of_world.advanced
+        return self.function(_advanced, unchanged=len(leaves(self.world_begun.example()[0])))
 
     @_Once
     def predicted(self) -> Function:
-        """The bank at the next measurement."""
+        """The filter at the next measurement."""
         return self.function(_predicted, turned=True)
 
     @_Once
-    def begun(self) -> tuple[Specialised, Specialised]:
-        """World and bank at the start of the track."""
+    def world_begun(self) -> Specialised:
+        """World at the start of the track."""
+        if self._of_world is not self:
+            return self._of_world.world_begun
         noise = self.traced.noise
         uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
-        world = self.function(_world_begun).specialised(uniforms, normals)
-        return world, self.function(_bank_started).specialised(world.example()[1])
+        return self.function(_world_begun).specialised(uniforms, normals)
+
+    @_Once
+    def begun(self) -> tuple[Specialised, Specialised]:
+        """World and filter at the start of the track."""
+        truth, initial = self.world_begun.example()
+        return self.world_begun, self.function(_filter_started).specialised(
+            initial, self.traced.known_to_filter(truth)
+        )
 
     @_Once
     def first(self) -> Parts:
         """Parts of the way from the start of the track over the first measurement."""
-        world, bank = self.begun
-        return self._parts(world.example()[0], bank.example())
+        world, started = self.begun
+        return self._parts(world.example()[0], *started.example())
 
     @_Once
     def later(self) -> Parts:
@@ -176,7 +212,7 @@ class Programs:
             NotTraceable: if one is no straight line of arithmetic.
         """
         first = self.first
-        later = self._parts(first.advance.example()[0], first.act.example())
+        later = self._parts(first.advance.example()[0], *first.update.example())
         shapes = [
             [leaf.shape for leaf in (*parts.advance.inputs, *parts.predict.inputs, *parts.predict.outputs)]
             for parts in (first, later)
@@ -190,16 +226,17 @@ class Programs:
         """Noise of a measurement."""
         return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
 
-    def _parts(self, truth: Any, bank: Any) -> Parts:
+    def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:
         space = self.traced.action_space
         discrete = isinstance(space, gymnasium.spaces.Discrete)
         action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
-        advance = self.advanced.specialised(truth, bank, self.row)
+        advance = self.advanced.specialised(truth, feedback, self.row)
         following, measurement = advance.example()
-        predict = self.predicted.specialised(bank, measurement)
+        predict = self.predicted.specialised(state, measurement)
         predicted = predict.example()[0]
-        act = self.acted.specialised(predicted, measurement, action)
-        return Parts(act, advance, predict, Episode(following, measurement, predicted))
+        known = self.traced.known_to_filter(following)
+        update = self.updated.specialised(known, predicted, measurement, action)
+        return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
     def reported(self, report: Report) -> Specialised:
         """A report on an episode.
@@ -228,10 +265,16 @@ class _Compiled(Task):
         """Return the same problem on NumPy arrays, not compiled."""
         return self.original
 
-    def estimated_outside(self) -> Task:
-        """Return this task with an outside estimate in place of its bank."""
-        programs = Programs(self.programs.traced.estimated_outside(), self.programs.graph)
-        return _wrapped(self.original.estimated_outside(), programs, self.threads)
+    def with_filter(self, make: Callable[[Task], Filter]) -> Task:
+        """Return the same problem with another filter in place of the bank.
+
+        Args:
+            make: makes the filter for a task, on NumPy's arrays and on traced ones.
+
+        Raises:
+            NotTraceable: if the filter is no straight line of arithmetic, and does not say so.
+        """
+        return _wrapped(self.original.with_filter(make), self.programs.with_filter(make), self.threads)
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
         """Call ``function(task, *parts)`` as code of the processor, or with NumPy where it cannot be traced."""
@@ -246,19 +289,25 @@ class _Compiled(Task):
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
         truth, initial = self.run(_world_begun, uniforms, normals)
-        return Episode(truth, initial, self.run(_bank_started, initial))
+        known = self.known_to_filter(truth)
+        if self.filter.in_python:
+            return Episode(truth, initial, self.start_filter(initial, known))
+        return Episode(truth, initial, self.run(_filter_started, initial, known)[0])
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
         functions, threads = self.programs, self.threads
-        truth, measurement = functions.advanced(episode.truth, episode.bank, noise, threads=threads)
-        bank, _ = functions.predicted(episode.bank, measurement, threads=threads)
-        return Episode(truth, measurement, bank)
+        feedback = self.run(_feedback, episode.filter)
+        truth, measurement = functions.advanced(episode.truth, feedback, noise, threads=threads)
+        state, _ = functions.predicted(episode.filter, measurement, threads=threads)
+        return Episode(truth, measurement, state)
 
     def act(self, episode: Episode, action: Array) -> Episode:
         """Step 4."""
-        arguments = (episode.bank, episode.measurement, action)
-        return episode._replace(bank=self.programs.acted(*arguments, threads=self.threads))
+        if self.filter.in_python:
+            return super().act(episode, action)
+        arguments = (self.known_to_filter(episode.truth), episode.filter, episode.measurement, action)
+        return episode._replace(filter=self.programs.updated(*arguments, threads=self.threads)[0])
 
 
 def _method(name: str) -> Callable[..., Any]:
@@ -336,7 +385,7 @@ def warn_of(what: str, error: BaseException) -> None:
 
 def can_step(task: Any, report: Report) -> bool:
     """Whether a task's steps are compiled, and a report on them can be."""
-    if task.backend != "compiled" or report in task.programs.refused:
+    if task.backend != "compiled" or task.filter.in_python or report in task.programs.refused:
         return False
     try:
         task.programs.reported(report)
@@ -361,9 +410,9 @@ class Stepper:
     """
 
     def __init__(self, task: Any, report: Report, width: int) -> None:
-        act, advance, predict, episode = task.programs.later
+        update, advance, predict, episode = task.programs.later
         tell = task.programs.reported(report)
-        truths, told, banks = (len(leaves(part)) for part in episode)
+        truths, measured, states = (len(leaves(part)) for part in episode)
         self.width, self._threads = width, task.threads
         count = itertools.count()
         self._template, self._kinds = mapped(lambda _: next(count), episode), _kinds(leaves(episode))
@@ -372,7 +421,7 @@ class Stepper:
         def memory(outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
             return [empty_lanes(leaf.shape, width) for leaf in outputs]
 
-        self.action = empty_lanes(act.inputs[-1].shape, width)
+        self.action = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
         self.shown = numpy.empty((width, *predict.outputs[-1].shape))
         self._reported = memory(tell.outputs)
@@ -382,39 +431,38 @@ class Stepper:
             if same is not None:
                 second[i] = first[i]
         self._copies = (first, second)
-        written = memory(act.outputs)
+        written = memory(update.outputs)
         nothing = numpy.zeros((advance.inputs[-1].rows, width))
         self._calls, self._begin = [], []
         world, start = task.programs.begun
         self._drawn = memory(world.inputs)
         initial = memory(world.outputs[truths:])
         begun = task.programs.first
+        knows = bool(task.filter.knows)
         for now, then in ((first, second), (second, first)):
-            truth, said, bank = now[:truths], now[truths : truths + told], now[truths + told :]
-            steered = [*bank, *said, self.action]
-            acted = [own if i is None else steered[i] for own, i in zip(written, act.same, strict=True)]
+            truth, measurement = now[:truths], now[truths : truths + measured]
+            given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
+            updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
+            ahead = then[: truths + measured]
+            predicted = [*then[truths + measured :], self.shown]
             self._calls.append(
                 (
-                    act.bound(steered, written),
-                    tell.bound([*truth, *said, *acted], self._reported),
-                    advance.bound([*truth, *acted, nothing], then[: truths + told]),
-                    predict.bound(
-                        [*acted, *then[truths : truths + told]], [*then[truths + told :], self.shown]
-                    ),
+                    update.bound(given, written),
+                    tell.bound([*truth, *measurement, *updated[:states]], self._reported),
+                    advance.bound([*truth, *updated[states:], nothing], ahead),
+                    predict.bound([*updated[:states], *ahead[truths:]], predicted),
                 )
             )
             self._begin.append(
                 (
                     world.bound(self._drawn, [*truth, *initial]),
-                    start.bound(initial, written),
-                    begun.advance.bound([*truth, *written, nothing], then[: truths + told]),
-                    begun.predict.bound(
-                        [*written, *then[truths : truths + told]], [*then[truths + told :], self.shown]
-                    ),
+                    start.bound([*initial, *(truth if knows else [])], written),
+                    begun.advance.bound([*truth, *written[states:], nothing], ahead),
+                    begun.predict.bound([*written[:states], *ahead[truths:]], predicted),
                 )
             )
         self._now = 0
-        self._row_entry = 1 + 2 * (truths + banks)
+        self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
 
     def load(self, episode: Episode) -> None:
         """Go on from other episodes."""

@@ -141,7 +141,7 @@ def _check_episodes(task: Task) -> None:
     uniforms, normals = random.random((noise.uniforms, WIDTH)), numpy.zeros((noise.initial_normals, WIDTH))
     episode = measure(ask("begin", task.begin, uniforms, normals))
     for block in task.bank.blocks:
-        values = ask(f"block {block.name!r}", block.value, episode.bank, episode.measurement)
+        values = ask(f"block {block.name!r}", block.value, episode.filter, episode.measurement)
         check(f"block {block.name!r}", values)
         rows, fields = values.size // WIDTH, max(1, len(block.parts))
         if rows != fields:

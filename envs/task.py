@@ -7,31 +7,31 @@ runs. A task knows nothing of Gymnasium and owns no random generator: numbers co
 It is made of two halves, and the :class:`Measurement <Episode>` is the only door between them:
 
 * the :class:`World` draws the episode, moves the truth and says what the sensors say;
-* a :class:`Bank`, one for each control, predicts, shows, is steered, and estimates. It never receives the
-  truth, nor anything else that the world keeps.
+* a :class:`~.filter.Filter` predicts and estimates. A task brings a :class:`~.filter.Bank` for each control, which
+  also shows what it has found and is steered by an action; :meth:`Task.with_filter` puts any other filter in its
+  place. No filter that competes receives the truth, nor anything else that the world keeps.
 
 The clock of every task:
 
 ====  ==============================================================  =========================
  1    the truth moves on; the sensors say where it seems to be        :meth:`World.advance`
- 2    the filters predict to that time; innovations and likelihoods   :meth:`Bank.predict`
+ 2    the filter predicts to that time; innovations and likelihoods   :meth:`Filter.predict`
  3    the agent is shown them                                         :meth:`Task.observe`
- 4    the agent's action is applied to *that same* measurement        :meth:`Bank.act`
+ 4    the filter takes *that same* measurement in, by the action      :meth:`Filter.update`
  5    the estimate is compared with the truth                         :meth:`World.cost`
 ====  ==============================================================  =========================
 
 ``begin`` makes the episode at the start of the track, as if step 4 had just happened: :meth:`World.begin`
-says what everyone is told of the start, :meth:`Bank.start` takes it. A reset is ``begin``, 1, 2, 3; an
+gives the initial estimate, :meth:`Filter.start` takes it. A reset is ``begin``, 1, 2, 3; an
 environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
 real measurement that is not acted on.
 
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
-torch). Truth, measurement and the bank's state are NamedTuples of arrays ``(..., N)`` and are never changed
+torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
 in place.
 
-A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Bank.feedback`
-returns is given to the next :meth:`World.advance`. An estimator that stands in for the bank then flies a truth
-of its own, on the same noise.
+A closed loop adds one arrow back, from the estimate to the world, and names it: what :meth:`Filter.feedback`
+returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
 """
 
 import copy
@@ -47,7 +47,8 @@ import gymnasium
 import numpy
 
 from .draws import Draws
-from .observation import Array, Block, Blocks, Field, Quantity, Reader
+from .filter import Bank, Filter, Input
+from .observation import Array, Blocks, Field, Reader
 
 
 class Component(NamedTuple):
@@ -99,19 +100,9 @@ class PaperPolicy(NamedTuple):
     action: tuple[float, ...]
 
 
-class Initial(NamedTuple):
-    """What everyone is told of the start of the track; a task may use a NamedTuple with more fields."""
-
-    mean: Array
-    """In the units of the task's components, ``(C, N)``."""
-    covariance: Array
-    """``(C, C, N)``."""
-
-
 TaskT = TypeVar("TaskT", bound="Task")
 Truth = TypeVar("Truth")
 Measurement = TypeVar("Measurement")
-State = TypeVar("State")
 
 
 class Episode(NamedTuple):
@@ -121,8 +112,8 @@ class Episode(NamedTuple):
     """What is; the world's NamedTuple."""
     measurement: Any
     """What the sensors say; between ``begin`` and the first measurement what is told of the start."""
-    bank: Any
-    """The state of what estimates."""
+    filter: Any
+    """State of the filter."""
 
 
 class World(ABC, Generic[TaskT, Truth, Measurement]):
@@ -168,7 +159,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         Args:
             truth: at the measurement before.
             noise: ``(normals + row_uniforms, N)``.
-            feedback: of a closed loop, what :meth:`Bank.feedback` returned; else None.
+            feedback: of a closed loop, what :meth:`Filter.feedback` returned; else None.
         """
 
     @abstractmethod
@@ -243,114 +234,6 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         throughout; -1 where a time is one of what does not happen.
         """
         return {}
-
-
-class Bank(ABC, Generic[TaskT, Measurement, State]):
-    """What is steered: the filters under one control.
-
-    Args:
-        task: whose bank it is, with the constants that both halves share.
-    """
-
-    def __init__(self, task: TaskT) -> None:
-        self.task = task
-        self.parameters = task.parameters
-        self.xp = task.xp
-
-    @property
-    @abstractmethod
-    def action_space(self) -> gymnasium.Space:
-        """What the action may be."""
-
-    @property
-    @abstractmethod
-    def blocks(self) -> Sequence[Block]:
-        """What the agent is shown, of this state and the measurement, in order."""
-
-    @property
-    def quantities(self) -> Sequence[Quantity]:
-        """What else a policy can read from an observation."""
-        return ()
-
-    @abstractmethod
-    def start(self, initial: Any) -> State:
-        """State at the start of the track."""
-
-    @abstractmethod
-    def predict(self, state: State, measurement: Measurement) -> State:
-        """Step 2: predict to the time of a measurement and compare with it."""
-
-    @abstractmethod
-    def act(self, state: State, measurement: Measurement, action: Array) -> State:
-        """Step 4: apply the action to the measurement.
-
-        Args:
-            state: after :meth:`predict`.
-            measurement: the same.
-            action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
-        """
-
-    @abstractmethod
-    def mean(self, state: State) -> Array:
-        """Estimate of the task's components, after :meth:`act`, ``(C, N)``."""
-
-    @abstractmethod
-    def covariance(self, state: State) -> Array:
-        """Covariance that the estimator reports for it, ``(C, C, N)``."""
-
-    def feedback(self, state: State) -> Any:
-        """Report what a closed loop gives back to the world; None in an open loop."""
-        return None
-
-    def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
-        """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
-        ``mode_probability``.
-
-        Consistency is measured by ``nis``, the normalised innovation squared, and ``nis_degrees``, its dimension.
-        """
-        return {}
-
-
-class Outside(NamedTuple):
-    """An estimate that was made elsewhere."""
-
-    mean: Array
-    """``(C, N)``."""
-    covariance: Array
-    """``(C, C, N)``."""
-    feedback: Any = None
-    """What it gives back to the world in a closed loop."""
-
-
-class OutsideBank(Bank["Task", Any, Outside]):
-    """In place of a bank, where somebody else estimates: it only hands on what they say."""
-
-    action_space = gymnasium.spaces.Discrete(1)
-    blocks = ()
-
-    def start(self, initial: Any) -> Outside:
-        """Report what everyone is told."""
-        return Outside(initial.mean, initial.covariance, self.task.feedback(initial.mean, initial))
-
-    def predict(self, state: Outside, measurement: Any) -> Outside:
-        """Nothing is predicted here."""
-        return state
-
-    def act(self, state: Outside, measurement: Any, action: Array) -> Outside:
-        """Nothing is steered here."""
-        return state
-
-    def mean(self, state: Outside) -> Array:
-        """Estimate as it was said."""
-        return state.mean
-
-    def covariance(self, state: Outside) -> Array:
-        """Covariance as it was said."""
-        return state.covariance
-
-    def feedback(self, state: Outside) -> Any:
-        """Arrow back as it follows from the estimate."""
-        return state.feedback
 
 
 class Task(ABC):
@@ -453,11 +336,14 @@ class Task(ABC):
             self.flights = recording.lengths_within(self.horizon, self.decision_interval)
             self.world = recording.world(self)
         self.bank = {**self.banks, **self.trained_banks}[control](self)
-        self._outside = OutsideBank(self)
         self.noise = self._noise_layout()
-        self._blocks = Blocks(self.bank.blocks, self.bank.quantities, xp)
+        self._take_filter(self.bank)
+
+    def _take_filter(self, filter: Filter) -> None:
+        self.filter = filter
+        self._blocks = Blocks(filter.blocks, filter.quantities, self.xp)
         self.fields = self._blocks.fields
-        self.action_space = self.bank.action_space
+        self.action_space = filter.action_space
 
     def __copy__(self) -> "Task":
         """Another with the same attributes, to change one of them."""
@@ -572,7 +458,7 @@ class Task(ABC):
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
     def feedback(self, mean: Array, measurement: Any) -> Any:
-        """Report what an estimate that was made outside the bank gives back to the world; None in an open loop.
+        """Report what an estimate of any other filter than a bank gives back to the world; None in an open loop.
 
         Args:
             mean: of the estimate, ``(C, N)``.
@@ -620,15 +506,19 @@ class Task(ABC):
         """
         return function(self, *parts)
 
-    def estimated_outside(self) -> "Task":
-        """Return this task with an :class:`OutsideBank` in place of its bank, and nothing to observe."""
+    def with_filter(self, make: Callable[["Task"], Filter]) -> "Task":
+        """Return the same problem with another filter in place of the bank.
+
+        Args:
+            make: makes the filter for a task; not made anew for each call, since what is compiled is kept by it.
+        """
         other = copy.copy(self)
-        other.bank = self._outside
-        other._blocks, other.fields = Blocks((), (), self.xp), ()
+        other._take_filter(make(self))
         return other
 
-    def _estimating(self, episode: Episode) -> Bank:
-        return self._outside if isinstance(episode.bank, Outside) else self.bank
+    def known_to_filter(self, truth: Any) -> Any:
+        """Truth as the filter is given it: None unless it ``knows`` something."""
+        return truth if self.filter.knows else None
 
     # --- what the engine calls
 
@@ -640,28 +530,33 @@ class Task(ABC):
             normals: ``(noise.initial_normals, N)``.
         """
         truth, initial = self.world.begin(Draws(uniforms, self.xp), normals)
-        return Episode(truth, initial, self.bank.start(initial))
+        return Episode(truth, initial, self.start_filter(initial, self.known_to_filter(truth)))
+
+    def start_filter(self, initial: Any, truth: Any) -> Any:
+        """State of the filter at the start of the track; a bank has no door for the truth."""
+        return self.filter.start(initial, truth) if self.filter.knows else self.filter.start(initial)
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
-        feedback = self.bank.feedback(episode.bank)
+        feedback = self.filter.feedback(episode.filter)
         truth, measurement = self.world.advance(episode.truth, noise, feedback)
-        return Episode(truth, measurement, self.bank.predict(episode.bank, measurement))
+        return Episode(truth, measurement, self.filter.predict(episode.filter, measurement))
 
     def observe(self, episode: Episode) -> Array:
         """Step 3: what the agent is shown, ``(len(fields), N)``."""
-        return self._blocks.observe(episode.bank, episode.measurement)
+        if not self.fields:  # nothing steers the filter
+            N = next(named_arrays(episode.measurement))[1].shape[-1]
+            return self.xp.zeros((0, N), dtype=self.xp.float64, device=self.device)
+        return self._blocks.observe(episode.filter, episode.measurement)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4; the action as :meth:`Bank.act` takes it."""
-        return episode._replace(bank=self.bank.act(episode.bank, episode.measurement, action))
+        """Step 4: the filter takes the measurement in, a bank with the action."""
+        given = Input(episode.measurement, self.known_to_filter(episode.truth), action)
+        return episode._replace(filter=self.filter.update(episode.filter, given))
 
     def mean(self, episode: Episode) -> Array:
-        """Estimate, ``(len(components), N)``, in the units of ``components``.
-
-        This and what follows also take an episode that somebody else estimates, see :class:`Outside`.
-        """
-        return self._estimating(episode).mean(episode.bank)
+        """Estimate, ``(len(components), N)``, in the units of ``components``."""
+        return self.filter.mean(episode.filter)
 
     def context(self, episode: Episode) -> dict[str, Array]:
         """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
@@ -670,19 +565,19 @@ class Task(ABC):
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""
-        return self.world.cost(episode.truth, self._estimating(episode).mean(episode.bank))
+        return self.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def charge(self, episode: Episode) -> Array:
         """What the reward charges for the estimate, ``(N,)``; see :meth:`World.charge`."""
-        return self.world.charge(episode.truth, self._estimating(episode).mean(episode.bank))
+        return self.world.charge(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:
         """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
-        return self._estimating(episode).mean(episode.bank) - self.world.state(episode.truth)
+        return self.filter.mean(episode.filter) - self.world.state(episode.truth)
 
     def covariance(self, episode: Episode) -> Array:
         """Covariance that the estimator reports for its error, ``(C, C, N)``."""
-        return self._estimating(episode).covariance(episode.bank)
+        return self.filter.covariance(episode.filter)
 
     def track(self, episode: Episode) -> dict[str, Array]:
         """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
@@ -704,7 +599,7 @@ class Task(ABC):
 
     def records(self, episode: Episode) -> dict[str, Array]:
         """What else an evaluation keeps of each measurement."""
-        own = self._estimating(episode).records(episode.bank, episode.measurement)
+        own = self.filter.records(episode.filter, episode.measurement)
         return {**own, **self.world.records(episode.truth)}
 
 

@@ -12,7 +12,7 @@ import numpy
 
 from ..envs.task import Array, Task
 from .competitors import Kind
-from .rollout import chosen_lanes
+from .filters import chosen_lanes
 
 
 class SingleTrackEstimator(ABC):

@@ -8,8 +8,9 @@ nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, 
 """
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Protocol, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 
 import numpy
 
@@ -219,6 +220,27 @@ class RandomPolicy(Policy):
         return actions.next(), actions
 
 
+class Likelihood(NamedTuple):
+    """How well a filter has predicted a measurement: what an estimator may return beside its estimate."""
+
+    log_likelihood: Array
+    """Log-density of the measurement as it was predicted, in nats, ``(N,)``; NaN where nothing was received."""
+    nis: Array = None
+    """Normalised innovation squared, ``(N,)``; None where it is not known."""
+    nis_degrees: Array = None
+    """Numbers of the measurement that it counts, ``(N,)``; likewise."""
+
+    @classmethod
+    def of(cls, told: Any) -> "Likelihood":
+        """Take a log-likelihood alone for one."""
+        return cls(*told) if isinstance(told, tuple) else cls(told)
+
+    def filled(self) -> "Likelihood":
+        """Put NaN in place of what is not known."""
+        none = math.nan + 0.0 * self.log_likelihood
+        return Likelihood(*(none if values is None else values for values in self))
+
+
 class Estimator(Protocol):
     """An estimator that a user brings: any object with these two methods.
 
@@ -230,13 +252,17 @@ class Estimator(Protocol):
     """
 
     kind: ClassVar[Kind] = "estimator"
+    traceable: ClassVar[bool] = False
+    """Whether it is compiled with the steps of the world: its memory is nested tuples of arrays ``(..., N)``, its
+    methods compute with the array functions of ``task.xp`` alone, no value decides what is executed, and nothing is
+    kept in the object. What is not runs as Python code."""
 
     def start(self, initial: Any, N: int) -> Any:
         """Memory at the start of the track.
 
         Args:
-            initial: what everyone is told of it: :class:`~filtergym.envs.task.Initial` or a NamedTuple with its fields,
-                ``mean`` ``(C, N)`` and ``covariance`` ``(C, C, N)``.
+            initial: the initial estimate given to every filter: :class:`~filtergym.envs.filter.Initial` or a NamedTuple
+                with its fields, ``mean`` ``(C, N)`` and ``covariance`` ``(C, C, N)``.
             N: number of episodes.
         """
 
@@ -248,7 +274,9 @@ class Estimator(Protocol):
             memory: what the last call returned.
 
         Returns:
-            Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory.
+            Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory. A
+            fourth entry may tell how well the measurement was predicted: its log-likelihood ``(N,)`` in nats, or a
+            :class:`Likelihood`. Then the estimator is judged by it too, also on recordings without truth.
         """
 
 
@@ -268,12 +296,12 @@ class Reference(Protocol):
         """Memory at the start of the track.
 
         Args:
-            initial: what everyone is told of it.
+            initial: the initial estimate given to every filter.
             truth: at that time.
         """
 
     def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Array, Array, Any]:
-        """Estimate after a measurement: mean ``(C, N)``, covariance ``(C, C, N)``, and the memory."""
+        """Estimate after a measurement; returns as of :meth:`Estimator.update`."""
 
 
 class Bound(Protocol):

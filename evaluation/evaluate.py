@@ -4,7 +4,6 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -21,10 +20,10 @@ from ..envs.reward import charge
 from ..envs.task import Episode, Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
-from .competitors import RANKED, Kind, check_competitor, kind_of, made
+from .competitors import RANKED, Kind, kind_of
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers, check_workers
-from .rollout import Progress, run_competitor, told
+from .rollout import Progress, run_competitor
 from .seeds import episode_seeds
 from .threads import one_thread
 
@@ -32,13 +31,6 @@ LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
 DRAWN = "drawn_"
 """Begins the names of what is kept of the first episodes only."""
-
-
-def _made(name: str, maker: Any, kind: Kind, task: Task) -> Any:
-    """Make a competitor for its task; what a user's estimator raises then is told like what it raises later."""
-    with told(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
-        competitor = made(maker, task)
-    return check_competitor(name, competitor, kind)
 
 
 def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name: str) -> str:
@@ -122,6 +114,11 @@ def _and_drawn(task: Task, episode: Episode) -> dict[str, Any]:
     return {**kept, **{f"{DRAWN}{name}": values for name, values in task.drawn(episode).items()}}
 
 
+def _limits(task: Task, episode: Episode) -> dict[str, Any]:
+    """What is kept of a bound."""
+    return task.filter.records(episode.filter, episode.measurement)
+
+
 def _report(task: Task, tracks: bool, drawn: bool) -> Report:
     """What is kept of every measurement of a task."""
     if drawn:
@@ -173,7 +170,7 @@ def evaluate(
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
         threads: how many share the episodes, of the compiled backend.
         workers: who runs competitors and chunks of episodes; default: this process, one after the other.
-        strict: raise where an estimator would lose an episode, see :func:`.rollout.run_estimator`.
+        strict: raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`.
         **keywords: parameters of the task.
 
     Returns:
@@ -299,10 +296,10 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     drawn = experiment.drawn_episodes - piece.first
     found: dict[str, numpy.ndarray] = run_competitor(
         task,
-        _made(piece.name, piece.maker, piece.kind, task),
+        piece.maker,
         piece.kind,
         piece.seeds,
-        _report(task, experiment.tracks, drawn > 0),
+        _limits if piece.kind == "bound" else _report(task, experiment.tracks, drawn > 0),
         tick,
         piece.name,
         piece.first,

@@ -7,14 +7,36 @@ import numpy
 
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, import_task, opened
+from ..envs.filter import Filter, Initial, Input
+from ..envs.observation import Array
 from ..envs.recording import MOST_NUMBERS, Recording, measured_once
 from ..envs.recording_files import differing
 from ..envs.task import Episode, Task, named_arrays
-from .rollout import Progress, started_lanes
+from .rollout import Progress, started_lanes, whole_episode
 from .seeds import episode_seeds
 
 CHUNK = 256
 """Episodes recorded side by side."""
+
+
+class NoFilter(Filter[Task, Any, Initial]):
+    """In place of a filter where nobody estimates: the initial estimate stands."""
+
+    def start(self, initial: Any, truth: Any = None) -> Initial:
+        """Report the initial estimate."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, state: Initial, given: Input) -> Initial:
+        """Learn nothing."""
+        return state
+
+    def mean(self, state: Initial) -> Array:
+        """That of the start."""
+        return state.mean
+
+    def covariance(self, state: Initial) -> Array:
+        """That of the start."""
+        return state.covariance
 
 
 def record(
@@ -59,7 +81,7 @@ def record(
             f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
             "that a recording may hold: record fewer"
         )
-    task = task_on(backend, cls.id, scenario=chosen, **keywords).estimated_outside()
+    task = task_on(backend, cls.id, scenario=chosen, **keywords).with_filter(NoFilter)
     chunks = [
         _recorded(task, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
     ]
@@ -118,9 +140,10 @@ def _recorded(
             series.setdefault(name, []).append(first(values))
         series.setdefault("truth", []).append(first(task.world.state(episode.truth)))
 
-    lanes = started_lanes(task, seeds, begun)
+    lanes, nothing = started_lanes(task, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
-        lanes.step(lambda state: state, lambda state, _: keep(state))
+        for episode, _ in lanes.decide(nothing, whole_episode):
+            keep(episode)
         tick(count * task.decision_interval)
     keep(lanes.state)
     uniforms = numpy.stack([numpy.random.default_rng(s).random(task.noise.uniforms) for s in seeds], axis=1)

@@ -15,7 +15,7 @@ import xarray
 
 from ..baselines.names import evaluate
 from ..evaluation.bootstrap import Bootstrap
-from ..evaluation.rollout import run_policy, run_reference
+from ..evaluation.rollout import rollout
 
 RESAMPLES = 500
 
@@ -99,12 +99,9 @@ def recorded(
     Returns:
         The same, ``(episodes, K, ...)`` with the other axes in reversed order.
     """
-    kept: list[dict[str, numpy.ndarray]] = []
-
-    def record(state: Any) -> None:
-        # Lanes beyond the seeds are padding.
-        kept.append({name: values[..., : len(seeds)].T for name, values in fields(state).items()})
-
-    run = run_policy if hasattr(actor, "predict") else run_reference
-    run(task, actor, seeds, record, lambda _: None)
+    # Lanes beyond the seeds are padding.
+    kept = [
+        {name: values[..., : len(seeds)].T for name, values in fields(state).items()}
+        for state, _ in rollout(task, actor, seeds)
+    ]
     return {name: numpy.stack([values[name] for values in kept], axis=1) for name in kept[0]}

@@ -10,7 +10,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import KalmanModel
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.task import Initial
+from filtergym.envs.filter import Initial
 from filtergym.evaluation.rollout import run_estimator
 from filtergym.filters import kalman
 

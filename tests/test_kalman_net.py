@@ -159,7 +159,7 @@ def test_the_estimator_is_the_policy_in_its_bank(id):
         mean, covariance, memory = estimator.update(measurement, memory)
         episode = Episode(None, measurement, task.bank.predict(state, measurement))
         action, hidden = policy.predict(task.observe(episode).T, hidden)
-        state = task.act(episode, action.T.astype(float)).bank
+        state = task.act(episode, action.T.astype(float)).filter
         np.testing.assert_array_equal(mean, task.bank.mean(state))
         np.testing.assert_array_equal(covariance, task.bank.covariance(state))
 

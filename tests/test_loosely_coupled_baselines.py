@@ -167,9 +167,9 @@ def test_matched_equals_a_naive_filter_told_the_truth():
                 error = error + np.outer(K, said.ins[:, lane] - said.fix[:, lane] - error[0])
                 P = P - np.outer(K, P[0])
             # Equal formulas, different rounding over 200 steps.
-            np.testing.assert_allclose(state.bank.mean[:, lane], said.ins[:, lane] - error[0], atol=1e-10)
+            np.testing.assert_allclose(state.filter.mean[:, lane], said.ins[:, lane] - error[0], atol=1e-10)
             np.testing.assert_allclose(
-                state.bank.covariance[:, :, lane], P[0, 0] * np.eye(2), rtol=1e-8, atol=1e-14
+                state.filter.covariance[:, :, lane], P[0, 0] * np.eye(2), rtol=1e-8, atol=1e-14
             )
 
 
@@ -215,9 +215,9 @@ def test_innovation_adaptive_equals_a_naive_filter():
                 squares += rate * (nu**2 - squares)
                 gain = v / (v + max(squares - v, 0.1 * squares))
                 x, v = x + gain * nu, v * (1 - gain)
-            np.testing.assert_allclose(state.bank.position[0, lane], x, atol=1e-10)
+            np.testing.assert_allclose(state.filter.position[0, lane], x, atol=1e-10)
     # Jammed measurements lose their weight without being announced.
-    gains = np.stack([state.bank.gain[0, :2] for state in states])
+    gains = np.stack([state.filter.gain[0, :2] for state in states])
     assert (gains[250:299] < 0.2 * gains[150:199].mean()).mean() > 0.8
 
 

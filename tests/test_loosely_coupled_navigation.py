@@ -125,7 +125,7 @@ def test_reference_table(control, action, printed, theory):
 
 def augmented_nees(state):
     """Normalised squared error of (delta, beta, eta) over its dimension."""
-    truth, bank = state.truth, state.bank
+    truth, bank = state.truth, state.filter
     a, b, c, d, e, f = bank.covariance
     P = np.array([[a, b, c], [b, d, e], [c, e, f]]).transpose(2, 0, 1)
     error = np.stack(
@@ -198,7 +198,7 @@ def test_the_bank_equals_naive_filters(seed):
             x = np.full(2, first.ins[axis, lane] - first.increment[axis, lane])
             v, error, P = np.zeros(2), np.zeros(3), START
             for k, (seen, state) in enumerate(run):
-                said, bank = seen.measurement, state.bank
+                said, bank = seen.measurement, state.filter
                 R = said.reported_deviation[lane] ** 2
                 x, v = x + said.increment[axis, lane], v + np.array([0.04, 0.36]) * 0.01
                 error, P = Phi @ error, Phi @ P @ Phi.T + Qd
@@ -251,13 +251,13 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         P = rest @ (Phi @ P @ Phi.T + Qd) @ rest
         P[:, 0, 0] += gain**2 * said.reported_deviation**2
         # What the innovations are scaled by, and what is reported: rounding over 200 steps.
-        np.testing.assert_allclose(state.bank.variance.assumed[0], v, rtol=1e-12)
+        np.testing.assert_allclose(state.filter.variance.assumed[0], v, rtol=1e-12)
         np.testing.assert_allclose(task.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
     drawn = numbers(task, lanes, steps, 2)
     for _, state in states(task, drawn, constant(task, -1.0, lanes)):
         np.testing.assert_array_equal(task.mean(state), state.measurement.ins)
     for _, state in states(make("paper"), drawn, constant(task, 1.0, lanes)):
-        np.testing.assert_array_equal(state.bank.gain, 1.0)
+        np.testing.assert_array_equal(state.filter.gain, 1.0)
         np.testing.assert_allclose(task.mean(state), state.measurement.fix, atol=1e-15)
 
 
@@ -281,11 +281,11 @@ def test_scaled_noises_are_those_of_a_textbook_filter(seed):
             Phi, Qd = linear_systems.van_loan(*before, 0.01)
             shown = Phi @ P @ Phi.T + Qd
             innovation = said.available[lane] * (said.fix[:, lane] - said.ins[:, lane] + (Phi @ error)[0])
-            np.testing.assert_allclose(seen.bank.seen.innovation[:, lane], innovation, atol=1e-11)
-            np.testing.assert_allclose(seen.bank.deviation[lane] ** 2, shown[0, 0], rtol=1e-9)
+            np.testing.assert_allclose(seen.filter.seen.innovation[:, lane], innovation, atol=1e-11)
+            np.testing.assert_allclose(seen.filter.deviation[lane] ** 2, shown[0, 0], rtol=1e-9)
             if said.available[lane]:
                 np.testing.assert_allclose(
-                    seen.bank.seen.normalised[:, lane], innovation / math.sqrt(shown[0, 0] + R), atol=1e-11
+                    seen.filter.seen.normalised[:, lane], innovation / math.sqrt(shown[0, 0] + R), atol=1e-11
                 )
             Phi, Qd = linear_systems.van_loan(*scaled, 0.01)
             error, P, before = Phi @ error, Phi @ P @ Phi.T + Qd, scaled
@@ -295,7 +295,7 @@ def test_scaled_noises_are_those_of_a_textbook_filter(seed):
                 error = error - np.outer(K, innovation)
                 rest = np.eye(3) - np.outer(K, [1, 0, 0])
                 P = rest @ P @ rest.T + R * np.outer(K, K)
-            bank = state.bank
+            bank = state.filter
             # Rounding over 200 steps of different but equal formulas.
             np.testing.assert_allclose(task.mean(state)[:, lane], said.ins[:, lane] - error[0], atol=1e-11)
             np.testing.assert_allclose([bank.drift[:, lane], bank.coloured[:, lane]], error[1:], atol=1e-11)
@@ -315,9 +315,9 @@ def test_no_change_of_the_noises_is_the_paper_s_augmented_filter():
         for found, expected in (
             (task.mean(state), schemes.mean(scheme)),
             (task.covariance(state), schemes.covariance(scheme)),
-            (seen.bank.seen.normalised, also_seen.bank.seen.normalised[2]),
-            (state.bank.drift, scheme.bank.drift),
-            (state.bank.coloured, scheme.bank.coloured),
+            (seen.filter.seen.normalised, also_seen.filter.seen.normalised[2]),
+            (state.filter.drift, scheme.filter.drift),
+            (state.filter.coloured, scheme.filter.coloured),
         ):
             np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-13)
 
@@ -353,7 +353,7 @@ def test_averages_are_those_of_the_definition():
     weight = 1 - math.exp(-0.01 / 0.25)
     mean, square, product, last = 0.0, 1.0, 0.0, 0.0
     for seen, _ in states(task, numbers(task, 1, 400, 4), constant(task, 0.4, 1)):
-        said, bank = seen.measurement, seen.bank
+        said, bank = seen.measurement, seen.filter
         if said.available[0]:
             n = bank.seen.innovation[0, 0] / math.sqrt(
                 bank.variance.assumed[0, 0] + said.reported_deviation[0] ** 2
@@ -510,13 +510,13 @@ def test_shapes_and_sizes(control, axes, scenario):
     task = make(scenario, control, axes=axes)
     actions = random_actions(task, lanes, steps, 0)
     uniforms, normals, rows = numbers(task, lanes, steps, 0)
-    shapes = [x.shape for x in arrays(task.begin(uniforms, normals).bank)]
+    shapes = [x.shape for x in arrays(task.begin(uniforms, normals).filter)]
     for seen, state in states(task, (uniforms, normals, rows), lambda k, seen: actions[k]):
         observation = task.observe(seen)
         assert observation.shape == (len(task.fields), lanes)
         assert np.isfinite(observation).all()
         assert np.abs(observation).max() < 50
-        assert [x.shape for x in arrays(state.bank)] == shapes
+        assert [x.shape for x in arrays(state.filter)] == shapes
         assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in arrays(state))
         assert task.error(state).shape == (axes, lanes) == (len(task.components), lanes)
         assert task.covariance(state).shape == (axes, axes, lanes)
@@ -553,9 +553,11 @@ def test_no_truth_at_any_distance(control):
     for k, (seen, state) in enumerate(states(task, drawn, lambda k, s: actions[k])):
         bank = task.bank.predict(bank, seen.measurement)
         false = type(seen.truth)(*(rng.normal(size=x.shape) for x in seen.truth))
-        np.testing.assert_array_equal(task.observe(seen._replace(truth=false, bank=bank)), task.observe(seen))
+        np.testing.assert_array_equal(
+            task.observe(seen._replace(truth=false, filter=bank)), task.observe(seen)
+        )
         bank = task.bank.act(bank, seen.measurement, actions[k])
-        other = state._replace(truth=false, bank=bank)
+        other = state._replace(truth=false, filter=bank)
         np.testing.assert_array_equal(task.mean(other), task.mean(state))
         np.testing.assert_array_equal(task.covariance(other), task.covariance(state))
         assert (task.error(other) != task.error(state)).any()
@@ -589,7 +591,7 @@ def test_lanes_at_different_times_do_not_disturb_each_other(control):
             fresh = task.begin(*drawn[:2])
             state = state._replace(
                 truth=chosen(restarted, fresh.truth, state.truth),
-                bank=chosen(restarted, fresh.bank, state.bank),
+                filter=chosen(restarted, fresh.filter, state.filter),
             )
         row = np.where(restarted & (k >= late), drawn[2][k - late], drawn[2][k])
         state = task.act(

@@ -177,7 +177,7 @@ def test_zero_evidence_is_the_plain_filter_bit_for_bit():
     task = make_task(ID, "evidence", "random", **REGULAR)
     rng = np.random.default_rng(0)
     state = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
-    mean, covariance, mu = state.bank.mean, state.bank.covariance, state.bank.probabilities
+    mean, covariance, mu = state.filter.mean, state.filter.covariance, state.filter.probabilities
     alpha = np.array([[0.3], [0.7]])
     beta = alpha_beta.benedict_bordner_beta(alpha)
     transition = np.array([[0.9, 0.1], [0.1, 0.9]])
@@ -196,9 +196,9 @@ def test_zero_evidence_is_the_plain_filter_bit_for_bit():
             covariance, state.measurement.variance[:, None], alpha, beta, T
         )
         state = task.act(state, np.zeros((2, 8)))
-        np.testing.assert_array_equal(state.bank.probabilities, mu)
-        np.testing.assert_array_equal(state.bank.mean, mean)
-        np.testing.assert_array_equal(state.bank.covariance, covariance)
+        np.testing.assert_array_equal(state.filter.probabilities, mu)
+        np.testing.assert_array_equal(state.filter.mean, mean)
+        np.testing.assert_array_equal(state.filter.covariance, covariance)
         np.testing.assert_allclose(
             task.error(state),
             imm.combine(mean, covariance, mu)[0]

@@ -248,7 +248,7 @@ def test_a_target_that_is_never_seen_is_predicted(control, jitter):
         expected = np.concatenate([x0[:2] + time * x0[2:], x0[2:]])
         np.testing.assert_allclose(task.mean(after), expected, rtol=1e-12, atol=1e-9)
         grown = np.stack([transition(t) @ P0[..., i] @ transition(t).T for i, t in enumerate(time)], axis=-1)
-        state = after.bank
+        state = after.filter
         if isinstance(state, AlphaBeta):
             for axis in range(2):
                 np.testing.assert_allclose(state.covariance.position[axis], grown[axis, axis], rtol=1e-12)
@@ -269,10 +269,10 @@ def test_a_target_that_is_never_seen_is_predicted(control, jitter):
 @pytest.mark.parametrize("control", CONTROLS)
 def test_averages_and_gains_hold_where_the_target_is_missed(control):
     task, said = rolled(control, [True] * 5 + [False] * 4 + [True], normals=1.0)
-    seen, missed = said[5][1].bank, said[9][1].bank
+    seen, missed = said[5][1].filter, said[9][1].filter
     for name in ("average_innovation", "average_log_squared", "alpha"):
         np.testing.assert_array_equal(getattr(missed, name), getattr(seen, name))
-    assert (said[10][1].bank.average_innovation != seen.average_innovation).all()
+    assert (said[10][1].filter.average_innovation != seen.average_innovation).all()
     read = {name: task.reader(name) for name in ("available", "elapsed")}
     shown = [task.observe(before).T for before, _ in said[1:]]
     assert [read["available"](o)[0, 0] for o in shown] == [1.0] * 5 + [0.0] * 4 + [1.0]
@@ -289,7 +289,7 @@ def test_what_is_said_of_a_missed_target_does_not_count(control):
     answers = []
     for position in (0.0, 1e9, math.nan):
         measurement = missed._replace(position=position + np.zeros((2, 8)))
-        bank = task.bank.predict(episode.bank, measurement)
+        bank = task.bank.predict(episode.filter, measurement)
         space = task.action_space
         action = np.ones(8, dtype=int) if control == "mode" else np.full((*space.shape, 8), 0.3)
         after = task.bank.act(bank, measurement, action)

@@ -109,7 +109,7 @@ def test_innovation_in_metres_is_the_measured_minus_the_predicted_position():
         episode = task.measure(episode, np.concatenate([rng.normal(size=(2, 8)), rng.random((2, 8))]))
         read = task.reader("innovation_in_metres")(task.observe(episode).T)
         seen = episode.measurement.available > 0.0
-        expected = np.where(seen, episode.measurement.position - episode.bank.predicted, 0.0).T
+        expected = np.where(seen, episode.measurement.position - episode.filter.predicted, 0.0).T
         # The share 1 - R/S that it is read from cancels digits when S is little larger than R.
         np.testing.assert_allclose(read, expected, rtol=1e-12, atol=1e-9)
         episode = task.act(episode, np.zeros((1, 8)))

@@ -177,8 +177,8 @@ def test_ideal_is_the_channel_of_the_true_class():
     for episode, mean, covariance in states:
         lane, true = numpy.arange(24), episode.truth.target_class
         # The channel's gains were computed in advance; 120 scans of rounding.
-        assert mean == pytest.approx(episode.bank.mean[:, true, lane], rel=1e-9, abs=1e-7)
-        reported = numpy.moveaxis(episode.bank.covariance[:, :, true, lane], -1, 0)
+        assert mean == pytest.approx(episode.filter.mean[:, true, lane], rel=1e-9, abs=1e-7)
+        reported = numpy.moveaxis(episode.filter.covariance[:, :, true, lane], -1, 0)
         assert numpy.moveaxis(covariance, -1, 0) == pytest.approx(reported, rel=1e-9)
 
 
@@ -259,10 +259,10 @@ def test_weights_against_bayes_written_out(cls, arguments):
     q = numpy.array([[1.0 - leak if i == j else leak / 2.0 for j in range(3)] for i in range(3)])
     radar, previous = numpy.ones((3, 16)), None
     for before, after in decided(task, policy, range(16), 60):
-        likelihood = numpy.exp(before.bank.log_likelihood - before.bank.log_likelihood.max(axis=0))
+        likelihood = numpy.exp(before.filter.log_likelihood - before.filter.log_likelihood.max(axis=0))
         radar = radar * likelihood
         for n in range(16):
-            used, refused = before.bank.used_counts[:, n], before.bank.refused_counts[:, n]
+            used, refused = before.filter.used_counts[:, n], before.filter.refused_counts[:, n]
             if cls is baselines.RadarOnly:
                 P = radar[:, n]
             elif cls is baselines.EsmOnly:
@@ -274,12 +274,12 @@ def test_weights_against_bayes_written_out(cls, arguments):
                 P = radar[:, n] * (composition @ numpy.prod(recognition**counts, axis=1))
             else:
                 decision = int(before.measurement.decision[n])
-                factor = pi[:, decision] ** esm if before.bank.used[n] else 1.0
-                last = before.bank.probabilities[:, n] if previous is None else previous[:, n]
+                factor = pi[:, decision] ** esm if before.filter.used[n] else 1.0
+                last = before.filter.probabilities[:, n] if previous is None else previous[:, n]
                 P = ((last * likelihood[:, n]) @ q) * factor
             # The observation compresses the logarithms; the last digits are lost.
-            assert after.bank.probabilities[:, n] == pytest.approx(P / P.sum(), rel=1e-9, abs=1e-13)
-        previous = after.bank.probabilities
+            assert after.filter.probabilities[:, n] == pytest.approx(P / P.sum(), rel=1e-9, abs=1e-13)
+        previous = after.filter.probabilities
 
 
 @pytest.mark.parametrize("arguments", [{}, {"change": 0.1, "refused": 0.7, "esm": 0.4}])
@@ -295,7 +295,7 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
     last, state = numpy.zeros((4, 8)), None
     lanes = started_lanes(task, range(8))
     for step in range(60):
-        bank = lanes.state.bank
+        bank = lanes.state.filter
         action, state = policy.predict(lanes.observe(), state, numpy.full(8, step == 0))
         counts = esm * (bank.used_counts + refused * bank.refused_counts)
         for n in range(8):

@@ -61,7 +61,7 @@ def monte_carlo():
             covariance = task.covariance(state)
             errors.append(task.error(state) ** 2)
             variances.append(numpy.stack([covariance[i, i] for i in range(3)]))
-            probabilities.append(state.bank.probabilities[s])
+            probabilities.append(state.filter.probabilities[s])
         results.append((numpy.stack(errors), numpy.stack(variances), numpy.stack(probabilities)))
     return results
 
@@ -113,7 +113,7 @@ def test_the_paper_filter_is_bayesian(monte_carlo):
 def test_class_probabilities_are_calibrated():
     task = make(horizon=20)
     states = [state for *_, state in roll(task, draw(task, 20000, 5))]
-    P = numpy.concatenate([states[k].bank.probabilities.ravel() for k in (4, 9)])
+    P = numpy.concatenate([states[k].filter.probabilities.ravel() for k in (4, 9)])
     true = numpy.concatenate(
         [(states[k].truth.target_class == numpy.arange(3)[:, None]).ravel() for k in (4, 9)]
     )
@@ -130,15 +130,15 @@ def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_
     *_, (_, _, state) = roll(task, draw(task, 4000, 7))
     floor = numpy.array(p.composition)
     joint = class_fusion.fixed_type_log_likelihood(
-        state.bank.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
+        state.filter.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
     )
-    repaired = imm.normalised_exponential(state.bank.accumulated + joint)
+    repaired = imm.normalised_exponential(state.filter.accumulated + joint)
     wrong = state.truth.target_class != numpy.arange(3)[:, None]
 
     def sure_and_wrong(P):
         return ((P >= 0.9) & wrong).any(axis=0).mean()
 
-    assert sure_and_wrong(state.bank.probabilities) > 0.1
+    assert sure_and_wrong(state.filter.probabilities) > 0.1
     # A posterior is wrong in at most a tenth of the runs in which it is sure at 0.9.
     assert sure_and_wrong(repaired) < 0.04
 
@@ -237,7 +237,7 @@ def test_zero_evidence_is_the_recursion(transition):
         state = task.act(state, numpy.zeros((3, 16), dtype=numpy.float32))
         assert task.mean(state) == pytest.approx(estimate, rel=1e-10, abs=1e-8)
         assert task.covariance(state) == pytest.approx(reported, rel=1e-9, abs=1e-9)
-        assert state.bank.probabilities == pytest.approx(P, rel=1e-8, abs=1e-14)
+        assert state.filter.probabilities == pytest.approx(P, rel=1e-8, abs=1e-14)
 
 
 @pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
@@ -252,11 +252,11 @@ def test_evidence_acts_on_the_weights_of_its_scan_only(transition):
         roll(task, draw(task, 8, 4), lambda _: next(chosen)), paper, actions, strict=True
     ):
         # All that is known before the action is as without the actions before, but for the weights that were reported.
-        kept = measured.bank._replace(probabilities=paper_measured.bank.probabilities)
-        for one, other in zip(leaves(kept), leaves(paper_measured.bank), strict=True):
+        kept = measured.filter._replace(probabilities=paper_measured.filter.probabilities)
+        for one, other in zip(leaves(kept), leaves(paper_measured.filter), strict=True):
             numpy.testing.assert_array_equal(one, other)
-        moved = paper_state.bank.probabilities * numpy.exp(3.0 * numpy.clip(action, -1.0, 1.0))
-        numpy.testing.assert_allclose(state.bank.probabilities, moved / moved.sum(axis=0), rtol=1e-9)
+        moved = paper_state.filter.probabilities * numpy.exp(3.0 * numpy.clip(action, -1.0, 1.0))
+        numpy.testing.assert_allclose(state.filter.probabilities, moved / moved.sum(axis=0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("control", ["mode", "weights"])
@@ -264,7 +264,7 @@ def test_weights_that_are_stated_are_the_prior_of_the_next_scan(control):
     task = make("random", control, horizon=20)
     stated = numpy.full(8, 2) if control == "mode" else numpy.tile([[0.0], [0.0], [1.0]], 8)
     for _, _, state in roll(task, draw(task, 8, 4), lambda _: stated):
-        numpy.testing.assert_array_equal(state.bank.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
+        numpy.testing.assert_array_equal(state.filter.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
 
 
 def test_everyone_is_told_the_first_measurement_and_how_good_it_is():
@@ -303,7 +303,7 @@ def test_nothing_but_the_measurement_reaches_the_bank(scenario, transition):
         episode = task.measure(episode, row)
         measurement = episode.measurement
         theirs = other.bank.predict(theirs, measurement)
-        shown = other.observe(episode._replace(truth=None, bank=theirs))
+        shown = other.observe(episode._replace(truth=None, filter=theirs))
         assert numpy.array_equal(task.observe(episode), shown)
         action = rng.uniform(-1.0, 1.0, (3, 8))
         episode, theirs = task.act(episode, action), other.bank.act(theirs, measurement, action)
@@ -330,7 +330,7 @@ def test_lanes_do_not_know_their_neighbours(scenario):
             return type(a)(*(merged(x, y) for x, y in zip(a, b, strict=True)))
         return numpy.where(first, a, b)
 
-    wide = wide._replace(truth=merged(fresh.truth, wide.truth), bank=merged(fresh.bank, wide.bank))
+    wide = wide._replace(truth=merged(fresh.truth, wide.truth), filter=merged(fresh.filter, wide.filter))
     for row in rows[9:]:
         wide, narrow = task.measure(wide, row), task.measure(narrow, row[:, :8])
         assert numpy.array_equal(task.observe(wide)[:, :8], task.observe(narrow))
@@ -380,7 +380,7 @@ def test_gradient_from_cost_to_evidence(torch):
 def test_other_emitter_is_heard_as_often_as_stated():
     task = make("crowded", radar_bearing_sigma=0.01, esm_bearing_sigma=0.01)
     *_, (_, _, state) = roll(task, draw(task, 500, 9))
-    refused = state.bank.refused_counts.sum(axis=0).mean()
+    refused = state.filter.refused_counts.sum(axis=0).mean()
     # 31 or so looks, half at least 2 degrees off a gate of 0.02, a tenth of the others refused by chance.
     looks = state.measurement.scan[0] // task.parameters.esm_period + 1
     assert refused / looks == pytest.approx(0.5 + 0.05, abs=4.0 * 0.5 / math.sqrt(500 * looks))
@@ -447,7 +447,7 @@ def test_silent_targets_radiate_in_bursts():
     task = make("silent")
     *_, (_, _, state) = roll(task, draw(task, 2000, 13))
     looks = state.measurement.scan[0] // task.parameters.esm_period + 1
-    heard = (state.bank.used_counts + state.bank.refused_counts).sum(axis=0).mean() / looks
+    heard = (state.filter.used_counts + state.filter.refused_counts).sum(axis=0).mean() / looks
     assert heard == pytest.approx(0.08 / 0.48, abs=0.015)
 
 

@@ -264,7 +264,7 @@ def test_log_likelihood_is_the_density_of_what_was_predicted(control):
     action = lanes.widened(np.full((3, *task.action_space.shape), 0.3))
     for _ in range(3):
         lanes.step(lambda state: task.act(state, action))
-    bank, said = lanes.state.bank, task.records(task.act(lanes.state, action))
+    bank, said = lanes.state.filter, task.records(task.act(lanes.state, action))
     if control == "gain":
         S = np.stack([np.diag(v) for v in bank.innovation_variance.T], axis=-1)
         expected = log_density(bank.innovation, S)[0]

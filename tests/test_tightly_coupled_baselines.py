@@ -8,7 +8,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tuning import tune
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.task import Initial
+from filtergym.envs.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.bootstrap import Bootstrap

@@ -96,7 +96,7 @@ def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
     posterior = None
     for _, measured, _, state in drive(task, 1, seed, 60):
         if posterior is None:
-            start = task.begin(*numbers(task, 1, seed, 0)[:2]).bank
+            start = task.begin(*numbers(task, 1, seed, 0)[:2]).filter
             posterior = (
                 list(start.means[..., 0].T),
                 [start.covariances[:, :, i, 0] for i in range(3)],
@@ -104,26 +104,26 @@ def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
             )
         posterior, estimate = naive_bank(task, measured, posterior)
         # The information form inverts a covariance with a condition near 1e11; the mixture amplifies it.
-        numpy.testing.assert_allclose(state.bank.mean[:, 0], estimate, rtol=1e-6, atol=1e-5)
-        numpy.testing.assert_allclose(state.bank.probabilities[:, 0], posterior[2], atol=1e-5)
+        numpy.testing.assert_allclose(state.filter.mean[:, 0], estimate, rtol=1e-6, atol=1e-5)
+        numpy.testing.assert_allclose(state.filter.probabilities[:, 0], posterior[2], atol=1e-5)
 
 
 def test_controls_that_ask_for_the_paper_get_it_bit_for_bit():
     steps = 40
     *_, (*_, evidence) = drive(make("random", "evidence"), 8, 3, steps)
     *_, (*_, gain) = drive(make("random", "gain"), 8, 3, steps)
-    assert (evidence.bank.mean == gain.bank.mean).all()
-    assert (evidence.bank.covariance == gain.bank.covariance).all()
+    assert (evidence.filter.mean == gain.filter.mean).all()
+    assert (evidence.filter.covariance == gain.filter.covariance).all()
 
 
 def test_weights_that_state_the_probabilities_follow_the_paper():
     paper = make("random")
-    probabilities = [s.bank.probabilities for *_, s in drive(paper, 8, 3, 30)]
+    probabilities = [s.filter.probabilities for *_, s in drive(paper, 8, 3, 30)]
     told = make("random", "weights")
-    by_weights = [s.bank.mean for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
+    by_weights = [s.filter.mean for *_, s in drive(told, 8, 3, 30, lambda k, o, s: probabilities[k - 1])]
     for estimate, (*_, state) in zip(by_weights, drive(paper, 8, 3, 30), strict=True):
         # Normalising weights that already sum to one moves the last digit.
-        numpy.testing.assert_allclose(estimate, state.bank.mean, rtol=1e-9, atol=1e-9)
+        numpy.testing.assert_allclose(estimate, state.filter.mean, rtol=1e-9, atol=1e-9)
 
 
 def test_truth_and_noise_do_not_depend_on_the_control():
@@ -171,7 +171,7 @@ def test_lanes_may_stand_at_different_times():
             return type(a)(*(chosen(*parts) for parts in zip(a, b, strict=True)))
         return numpy.where(mask, a, b)
 
-    mixed = Episode(chosen(ahead.truth, fresh.truth), None, chosen(ahead.bank, fresh.bank))
+    mixed = Episode(chosen(ahead.truth, fresh.truth), None, chosen(ahead.filter, fresh.filter))
     both = task.measure(mixed, rows[5])
     for lanes, alone in ((mask, task.measure(ahead, rows[5])), (~mask, task.measure(fresh, rows[5]))):
         assert (task.observe(both)[:, lanes] == task.observe(alone)[:, lanes]).all()
@@ -185,7 +185,7 @@ def test_no_truth_in_the_observation(scenario, control):
     start = task.begin(*numbers(task, 8, 7, 0)[:2]).measurement
     state = Episode(None, start, task.bank.start(start))
     for _, measured, observation, after in drive(task, 8, 7, 30):
-        bank = task.bank.predict(state.bank, measured.measurement)
+        bank = task.bank.predict(state.filter, measured.measurement)
         state = Episode(None, measured.measurement, bank)
         assert (task.observe(state) == observation).all()
         state = task.act(state, numpy.zeros((ZERO[control], 8)))
@@ -209,7 +209,7 @@ def test_what_the_sensors_hide_is_not_measured(hidden):
 def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     task = make("paper", control)
     *_, (_, _, _, state) = drive(task, 8, 7, 5)
-    expected = task.bank.feedback(state.bank)
+    expected = task.bank.feedback(state.filter)
     row = numpy.zeros((task.noise.normals, 8))
     far = expected.copy()
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
@@ -221,7 +221,7 @@ def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
         assert (said.available[:4, :4] == 1.0).all()
         assert (said.available[4:8, 4:] == 1.0).all()
         assert (said.available[8:] == 1.0).all()
-    assert make("matched", control).bank.feedback(state.bank) is None
+    assert make("matched", control).bank.feedback(state.filter) is None
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
@@ -237,7 +237,7 @@ def test_fields_match_the_observation_and_are_of_order_one(scenario):
 def test_innovations_are_read_in_their_units():
     task = make("paper")
     for _, measured, observation, _ in drive(task, 8, 8, 5):
-        innovation = measured.bank.range_innovation * measured.measurement.available[:8]
+        innovation = measured.filter.range_innovation * measured.measurement.available[:8]
         for part, name in (
             (slice(0, 4), "pseudorange_innovation_in_metres"),
             (slice(4, 8), "rate_innovation_in_metres_per_second"),
@@ -253,10 +253,10 @@ def test_other_numbers_of_satellites(slots):
     *_, (*_, observation, state) = drive(task, 8, 9, 60)
     assert observation.shape[0] == len(task.fields)
     assert numpy.isfinite(task.cost(state)).all()
-    sigma = numpy.sqrt(numpy.einsum("iin->in", state.bank.covariance)[:3]).mean()
+    sigma = numpy.sqrt(numpy.einsum("iin->in", state.filter.covariance)[:3]).mean()
     full = make("random", satellites_outage_probability=0.0)
     *_, (*_, reference) = drive(full, 8, 9, 60)
-    better = sigma < numpy.sqrt(numpy.einsum("iin->in", reference.bank.covariance)[:3]).mean()
+    better = sigma < numpy.sqrt(numpy.einsum("iin->in", reference.filter.covariance)[:3]).mean()
     assert better == (len(slots) > 4)
 
 
@@ -289,7 +289,7 @@ def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
     *_, (_, measured, _, _) = drive(task, 8, 10, 5)
     thrown = measured.measurement.readings.copy()
     thrown[4:8] += 8.0  # 80 sigma of four rates
-    bank = task.bank.predict(measured.bank, measured.measurement._replace(readings=thrown))
+    bank = task.bank.predict(measured.filter, measured.measurement._replace(readings=thrown))
     assert (bank.log_likelihood < -2800.0).any()
     probabilities = task.bank.act(bank, measured.measurement, numpy.zeros((3, 8))).probabilities
     numpy.testing.assert_allclose(probabilities.sum(axis=0), 1.0, rtol=1e-15)
@@ -478,7 +478,7 @@ def test_torch_rolls_out_as_numpy_does(torch):
         for (_, _, seen, state), (_, _, also, other) in zip(a, b, strict=True):
             # Elementary functions differ in the last place; the bank multiplies that.
             numpy.testing.assert_allclose(also.numpy(), seen, rtol=1e-6, atol=1e-6)
-            numpy.testing.assert_allclose(other.bank.mean.numpy(), state.bank.mean, rtol=1e-7, atol=1e-7)
+            numpy.testing.assert_allclose(other.filter.mean.numpy(), state.filter.mean, rtol=1e-7, atol=1e-7)
 
 
 def test_gradient_from_cost_to_action(torch):
@@ -552,7 +552,7 @@ def test_reference_table_of_the_adaptive_filter():
     assert ((first >= 1) & (first <= 3)).all()
     assert 1.5 < first.mean() < 2.5
     assert (second == 1).all()
-    P = numpy.moveaxis(state.bank.covariances, (0, 1), (-2, -1))
+    P = numpy.moveaxis(state.filter.covariances, (0, 1), (-2, -1))
     sigma = numpy.sqrt(numpy.diagonal(P, axis1=-2, axis2=-1))
     # Positive definite after 3000 steps: smallest eigenvalue of the correlations.
     assert numpy.linalg.eigvalsh(P / (sigma[..., None] * sigma[..., None, :])).min() > 0.1
@@ -593,7 +593,7 @@ def test_matched_filter_is_consistent():
         if k >= 200:
             nis.append(task.records(state)["nis"].mean() / 14)
             if k % 20 == 0:
-                error, P = task.error(state).T, numpy.moveaxis(state.bank.covariance, -1, 0)
+                error, P = task.error(state).T, numpy.moveaxis(state.filter.covariance, -1, 0)
                 nees.append((error * numpy.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 17)
     means = numpy.mean(nees, axis=0)
     assert abs(means.mean() - 1.0) < 4.0 * means.std() / numpy.sqrt(N)

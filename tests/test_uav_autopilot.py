@@ -189,11 +189,11 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         S = H @ (P + scale * Q) @ H.T + R
         shown[rows] = ((held - H @ x) / numpy.sqrt(numpy.diag(S)))[rows]
         # A covariance of five states, packed against full, over 60 steps.
-        numpy.testing.assert_allclose(state.bank.innovation[:, lane], shown, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(state.filter.innovation[:, lane], shown, rtol=0, atol=1e-9)
         if rows.any():
             nu = (held - H @ x)[rows]
             nis = nu @ numpy.linalg.solve(S[numpy.ix_(rows, rows)], nu) / rows.sum()
-            assert state.bank.nis[lane] == pytest.approx(nis, rel=1e-9)
+            assert state.filter.nis[lane] == pytest.approx(nis, rel=1e-9)
         choice = a[k][..., lane]
         if control == "gain":
             scale = 10.0 ** (p.gain_decades * numpy.clip(choice[0], -1, 1))
@@ -207,10 +207,10 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         raw = control == "mode" and MODES[choice] == "raw-sensors"
         state = task.act(state, a[k])
         estimate = H.T @ held if raw else x
-        numpy.testing.assert_allclose(state.bank.estimate[:, lane], estimate, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(state.filter.estimate[:, lane], estimate, rtol=0, atol=1e-9)
         if not raw:
             steered = control == "gain" and choice[0] != 0.0
-            told = max(1.0, state.bank.mean_nis[lane]) if steered else 1.0
+            told = max(1.0, state.filter.mean_nis[lane]) if steered else 1.0
             numpy.testing.assert_allclose(task.covariance(state)[..., lane], told * P, rtol=1e-9, atol=1e-9)
         u = d.feedforward * state.measurement.command[lane] - L @ estimate
         truth = state.truth.state[:, lane].copy()
@@ -263,12 +263,12 @@ def test_monte_carlo_of_the_reference_table(
     sums = numpy.zeros((5, N))
     n, m = task.covariance(state).shape[0], len(task.sensors)
     for k in range(burn + steps):
-        shown = state.bank.nis
+        shown = state.filter.nis
         state = task.act(state, action)
         if feedback == "true":
             true = state.truth.state
             steered = task.feedback(true, state.measurement)
-            state = state._replace(bank=state.bank._replace(estimate=true, control=steered))
+            state = state._replace(filter=state.filter._replace(estimate=true, control=steered))
         if k >= burn:
             _, nees = gaussian.log_density(task.error(state), task.covariance(state))
             record = task.records(state)
@@ -375,7 +375,7 @@ def test_observation_is_recomputed_from_the_measurements_alone(plant: str, contr
         # The readings agree to rounding, amplified by the filter for 80 steps.
         numpy.testing.assert_allclose(task.observe(one), task.observe(two), rtol=0, atol=1e-9)
         one, two = task.act(one, a[k]), task.act(two, a[k])
-        numpy.testing.assert_allclose(one.bank.estimate, two.bank.estimate, rtol=0, atol=1e-9)
+        numpy.testing.assert_allclose(one.filter.estimate, two.filter.estimate, rtol=0, atol=1e-9)
 
 
 @BOTH
@@ -441,7 +441,7 @@ def test_modes_are_gains_bit_for_bit_or_nearly() -> None:
                 by_mode.act(a, numpy.full(8, mode)),
                 by_gain.act(b, numpy.full((1, 8), gain, numpy.float32)),
             )
-            numpy.testing.assert_allclose(a.bank.estimate, b.bank.estimate, rtol=0, atol=tolerance)
+            numpy.testing.assert_allclose(a.filter.estimate, b.filter.estimate, rtol=0, atol=tolerance)
             a, b = by_mode.measure(a, noise.rows[k + 1]), by_gain.measure(b, noise.rows[k + 1])
 
 

@@ -32,6 +32,8 @@ class AugmentedMemory(NamedTuple):
     """Variance last reported, ``(N,)``, m^2."""
     noise: Any
     """Memory of the receiver's noise."""
+    variance: Array
+    """Of the receiver, with which the last fix was used, ``(N,)``, m^2."""
 
 
 class AugmentedFilter:
@@ -52,7 +54,7 @@ class AugmentedFilter:
             none: zeros, ``(A, N)``.
         """
         p, zero = self.parameters, none[0]
-        return AugmentedMemory(none, none, p.modelled_prior(zero), zero, self.noise.start(zero))
+        return AugmentedMemory(none, none, p.modelled_prior(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
         """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
@@ -79,5 +81,10 @@ class AugmentedFilter:
         K, P = ins_gnss.update_augmented(memory.covariance, R, available)
         # The innovation of the position is minus that of the INS error.
         return K.position * innovation, AugmentedMemory(
-            memory.drift - K.drift * innovation, memory.coloured - K.coloured * innovation, P, reported, noise
+            memory.drift - K.drift * innovation,
+            memory.coloured - K.coloured * innovation,
+            P,
+            reported,
+            noise,
+            R,
         )

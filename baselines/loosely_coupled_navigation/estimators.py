@@ -1,13 +1,16 @@
 """Estimators of LooselyCoupledNavigation: the augmented filter with the receiver's noise estimated."""
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.filter import Initial
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement
 from ...envs.observation import Array
-from ...envs.task import Initial
+from ...evaluation.competitors import Likelihood
+from ...filters.ordered_sums import ordered_sum
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
 from .augmented import WINDOW, AugmentedFilter, AugmentedMemory
 
@@ -20,10 +23,27 @@ class Navigator(NamedTuple):
     rates: AugmentedMemory
 
 
+def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: Any) -> Likelihood:
+    """How well a fix was predicted; NaN where there is none.
+
+    Args:
+        innovation: m, ``(A, N)``.
+        variance: of each axis of it, m^2, ``(N,)``.
+        available: one where there is a fix, ``(N,)``.
+        xp: array namespace.
+    """
+    there, axes = available > 0.0, innovation.shape[0]
+    S = xp.where(there, variance, 1.0)
+    nis = ordered_sum(innovation * innovation) / S
+    density = -0.5 * (nis + axes * xp.log(2.0 * math.pi * S))
+    return Likelihood(*(xp.where(there, v, math.nan) for v in (density, nis)), axes * available)
+
+
 class AugmentedEstimator:
     """The augmented filter, which also estimates the constant and coloured rate errors, reported as it is."""
 
     kind = "estimator"
+    traceable = True
 
     def __init__(self, task: LooselyCoupledNavigation, noise: MeasurementNoise | None = None) -> None:
         self.filter = AugmentedFilter(task.parameters, MeasurementNoise() if noise is None else noise)
@@ -34,15 +54,20 @@ class AugmentedEstimator:
         """Start where INS and reference agree."""
         return Navigator(initial.mean, self.filter.start(0.0 * initial.mean))
 
-    def update(self, measurement: Measurement, memory: Navigator) -> tuple[Array, Array, Navigator]:
+    def update(
+        self, measurement: Measurement, memory: Navigator
+    ) -> tuple[Array, Array, Navigator, Likelihood]:
         """Predict by the increment of the INS, update by the fix where there is one."""
-        displacement, rates = self.filter.predict(memory.rates)
+        displacement, predicted = self.filter.predict(memory.rates)
         position = memory.position + (measurement.increment - displacement)
         innovation = self.xp.where(measurement.available > 0.0, measurement.fix - position, 0.0)
         reported = measurement.reported_deviation * measurement.reported_deviation
-        correction, rates = self.filter.update(rates, innovation, reported, measurement.available)
+        correction, rates = self.filter.update(predicted, innovation, reported, measurement.available)
         position = position + correction
-        return position, self.eye * rates.covariance.position, Navigator(position, rates)
+        likelihood = likelihood_of_fix(
+            innovation, predicted.covariance.position + rates.variance, measurement.available, self.xp
+        )
+        return position, self.eye * rates.covariance.position, Navigator(position, rates), likelihood
 
 
 class AugmentedMehra(AugmentedEstimator):

@@ -4,12 +4,14 @@ from typing import NamedTuple
 
 import numpy
 
+from ...envs.filter import Initial
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.loosely_coupled_navigation.world import Measurement, Truth
 from ...envs.observation import Array
 from ...envs.schedules import within
-from ...envs.task import Initial
+from ...evaluation.competitors import Likelihood
 from ...filters import loosely_coupled as ins_gnss
+from .estimators import likelihood_of_fix
 
 
 class ErrorState(NamedTuple):
@@ -33,6 +35,7 @@ class Matched:
     """
 
     kind = "reference"
+    traceable = True
     knows = (
         "the true intensities of all noises, every change of the receiver's, and which samples are spoofed"
     )
@@ -48,7 +51,9 @@ class Matched:
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
         return ErrorState(still, still, still, P)
 
-    def filtered(self, measurement: Measurement, truth: Truth, memory: ErrorState) -> ErrorState:
+    def filtered(
+        self, measurement: Measurement, truth: Truth, memory: ErrorState
+    ) -> tuple[ErrorState, Likelihood]:
         """Predict with the true noise levels and update with the true variance of the measurement."""
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
@@ -56,20 +61,22 @@ class Matched:
         P = ins_gnss.predict_augmented(memory.covariance, s, truth.coloured_step**2, truth.white_step**2)
         used = xp.where(within(truth.number, truth.spoofing), 0.0, measurement.available)
         innovation = used * ((measurement.ins - measurement.fix) - delta)
+        likelihood = likelihood_of_fix(innovation, P.position + truth.deviation**2, used, xp)
         gain, P = ins_gnss.update_augmented(P, truth.deviation**2, used)
-        return ErrorState(
+        state = ErrorState(
             delta + gain.position * innovation,
             memory.drift + gain.drift * innovation,
             coloured + gain.coloured * innovation,
             P,
         )
+        return state, likelihood
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
-    ) -> tuple[Array, Array, ErrorState]:
+    ) -> tuple[Array, Array, ErrorState, Likelihood]:
         """Report the INS less its estimated error."""
-        memory = self.filtered(measurement, truth, memory)
-        return measurement.ins - memory.delta, self.eye * memory.covariance.position, memory
+        memory, likelihood = self.filtered(measurement, truth, memory)
+        return measurement.ins - memory.delta, self.eye * memory.covariance.position, memory, likelihood
 
 
 class MatchedCovariance(Matched):
@@ -81,5 +88,5 @@ class MatchedCovariance(Matched):
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[Array, ErrorState]:
         """Variance of every axis, ``(A, N)``."""
-        memory = self.filtered(measurement, truth, memory)
+        memory, _ = self.filtered(measurement, truth, memory)
         return memory.covariance.position + 0.0 * memory.delta, memory

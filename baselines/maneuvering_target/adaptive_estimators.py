@@ -5,10 +5,11 @@ A scan that missed the target says nothing of any noise: what is estimated holds
 
 from typing import NamedTuple
 
+from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
 from ...envs.observation import Array
-from ...envs.task import Initial
+from ...evaluation.competitors import Likelihood
 from ...filters import kalman, noise_adaptation, predicted_covariance
 from .estimators import KalmanModel
 
@@ -47,7 +48,7 @@ class SageHusa(KalmanModel):
 
     def update(
         self, measurement: Measurement, memory: ProcessNoiseTrack
-    ) -> tuple[Array, Array, ProcessNoiseTrack]:
+    ) -> tuple[Array, Array, ProcessNoiseTrack, Likelihood]:
         """Predict with the noise estimated so far, update, and estimate it anew."""
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(memory.mean, memory.covariance, F, 0.0 * unit)
@@ -59,7 +60,8 @@ class SageHusa(KalmanModel):
         )
         level = noise_adaptation.faded(memory.level, sample, self.forgetting, measurement.available)
         level = level._replace(value=self.xp.clip(level.value, self.least, None))
-        return result.mean, result.covariance, ProcessNoiseTrack(result.mean, result.covariance, level)
+        track = ProcessNoiseTrack(result.mean, result.covariance, level)
+        return result.mean, result.covariance, track, self.likelihood(measurement, *result[2:])
 
     def diagonal(self, covariance: Array) -> Array:
         """Variances, ``(4, N)``."""
@@ -108,7 +110,7 @@ class VariationalBayes(KalmanModel):
 
     def update(
         self, measurement: Measurement, memory: MeasurementNoiseTrack
-    ) -> tuple[Array, Array, MeasurementNoiseTrack]:
+    ) -> tuple[Array, Array, MeasurementNoiseTrack, Likelihood]:
         """Predict, and update state and noise together."""
         xp, variance, available = self.xp, measurement.variance, measurement.available
         F, unit = self.motion(measurement.interval)
@@ -126,7 +128,9 @@ class VariationalBayes(KalmanModel):
             self.iterations,
             available,
         )
-        return result.mean, result.covariance, MeasurementNoiseTrack(result.mean, result.covariance, noise)
+        track = MeasurementNoiseTrack(result.mean, result.covariance, noise)
+        # With the noise that this scan was used with, which it has a part in.
+        return result.mean, result.covariance, track, self.likelihood(measurement, *result[2:])
 
 
 class VariationalBayesPrediction(KalmanModel):
@@ -149,7 +153,7 @@ class VariationalBayesPrediction(KalmanModel):
         """Start where everyone starts."""
         return initial
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial]:
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Predict, and update state and predicted covariance together."""
         F, unit = self.motion(measurement.interval)
         predicted = Initial(*kalman.predict(memory.mean, memory.covariance, F, self.variance * unit))
@@ -162,4 +166,5 @@ class VariationalBayesPrediction(KalmanModel):
             self.iterations,
         )
         estimate = self.seen(measurement, Initial(result.mean, result.covariance), predicted)
-        return *estimate, estimate
+        nominal = self.updated(predicted, measurement)
+        return *estimate, estimate, self.likelihood(measurement, *nominal[2:])

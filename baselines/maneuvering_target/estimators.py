@@ -7,16 +7,20 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
 from ...envs.observation import Array
-from ...envs.task import Initial
+from ...evaluation.competitors import Likelihood
 from ...filters import coordinated_turn, imm, kalman, unscented
+from ...filters.ordered_sums import weighted_sum
 from ...filters.small_matrices import outer
 
 
 class KalmanModel:
     """The constant-velocity model in x and y."""
+
+    traceable = True
 
     def __init__(self, task: ManeuveringTarget) -> None:
         self.task, self.xp = task, task.xp
@@ -51,6 +55,12 @@ class KalmanModel:
         """
         result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
         return self.seen(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
+
+    def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
+        """How well a scan was predicted; NaN where it missed the target."""
+        there = measurement.available > 0.0
+        told = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
+        return Likelihood(*told, 2.0 * measurement.available)
 
 
 class KalmanBank(NamedTuple):
@@ -110,21 +120,26 @@ class KalmanInteractingMultipleModel(KalmanModel):
             self.probabilities[:, None] + 0.0 * mean[:1],
         )
 
-    def update(self, measurement: Measurement, memory: KalmanBank) -> tuple[Array, Array, KalmanBank]:
-        """One IMM cycle."""
+    def update(
+        self, measurement: Measurement, memory: KalmanBank
+    ) -> tuple[Array, Array, KalmanBank, Likelihood]:
+        """One IMM cycle. Its normalised innovation squared is the mean of the filters' by their posterior weights."""
         xp = self.xp
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mixed = imm.mix(memory.mean, memory.covariance, prediction.mixing)
         results = self.filtered(*mixed, measurement)
         log_likelihood = xp.stack([r.log_likelihood for r in results])
-        probabilities = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), log_likelihood)
+        log_predicted = imm.log_probabilities(prediction.probabilities)
+        probabilities = imm.mode_posterior(log_predicted, log_likelihood)
         bank = KalmanBank(
             xp.stack([r.mean for r in results], axis=1),
             xp.stack([r.covariance for r in results], axis=2),
             probabilities,
         )
         mean, covariance = imm.combine(*bank)
-        return mean[:4], covariance[:4, :4], bank
+        density = imm.log_mixture_density(log_predicted, log_likelihood)
+        nis = weighted_sum(probabilities, xp.stack([r.squared_distance for r in results]))
+        return mean[:4], covariance[:4, :4], bank, self.likelihood(measurement, density, nis)
 
 
 class TurnModel(KalmanModel):
@@ -222,11 +237,16 @@ class UnscentedTurn(TurnModel):
         """Start where everyone starts, with a turn rate about zero."""
         return Initial(*coordinated_turn.augmented(initial.mean, initial.covariance, self.turn_variance))
 
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial]:
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Carry the sigma points through the turn and update with the measured position."""
         T = measurement.interval
         mean, covariance = unscented.transform(
             memory.mean, memory.covariance, lambda points: coordinated_turn.turned(points, T)
         )
         result = self.updated((mean, covariance + self.noise(T)), measurement)
-        return result.mean[:4], result.covariance[:4, :4], Initial(result.mean, result.covariance)
+        return (
+            result.mean[:4],
+            result.covariance[:4, :4],
+            Initial(result.mean, result.covariance),
+            self.likelihood(measurement, *result[2:]),
+        )

@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
+from ...envs.filter import Initial
 from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...envs.observation import Array
-from ...envs.task import Initial
+from ...evaluation.competitors import Likelihood
 from ...filters import bounds, kalman, polar
 from .estimators import KalmanModel
 
@@ -33,7 +34,7 @@ class KnownTurn(KalmanModel):
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: TurnMemory
-    ) -> tuple[Array, Array, TurnMemory]:
+    ) -> tuple[Array, Array, TurnMemory, Likelihood]:
         """Predict with the noise of this scan and update with its measurement.
 
         The acceleration is the change of the velocity since the scan before, as large along x as along y.
@@ -43,7 +44,8 @@ class KnownTurn(KalmanModel):
         change = (truth.velocity - memory.velocity) / T
         variance = 0.5 * (change[0] ** 2 + change[1] ** 2)
         result = self.updated(kalman.predict(memory.mean, memory.covariance, F, variance * unit), measurement)
-        return result.mean, result.covariance, TurnMemory(result.mean, result.covariance, truth.velocity)
+        memory = TurnMemory(result.mean, result.covariance, truth.velocity)
+        return result.mean, result.covariance, memory, self.likelihood(measurement, *result[2:])
 
 
 class KnownInputBound(KalmanModel):

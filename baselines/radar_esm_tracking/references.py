@@ -5,6 +5,7 @@ from typing import NamedTuple
 from ...envs.observation import Array
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...envs.radar_esm_tracking.world import Measurement, Start, Truth
+from ...evaluation.competitors import Likelihood
 from ...filters import bounds, kalman
 
 
@@ -23,6 +24,7 @@ class _KnownClass:
     """Models that the true class chooses scan by scan."""
 
     knows = "the true class at every scan"
+    traceable = True
 
     def __init__(self, task: RadarEsmTracking) -> None:
         self.task = task
@@ -42,14 +44,18 @@ class Ideal(_KnownClass):
 
     kind = "reference"
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Array, Track]:
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: Track
+    ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the class that governed the motion, and update."""
         models, governed = self.task.models, memory.target_class
         mean, covariance = kalman.predict(
             memory.mean, memory.covariance, self.of(models.Phi, governed), self.of(models.Q, governed)
         )
         result = kalman.update(mean, covariance, measurement.radar, models.H, models.R)
-        return result.mean, result.covariance, Track(result.mean, result.covariance, truth.target_class)
+        track = Track(result.mean, result.covariance, truth.target_class)
+        degrees = float(models.H.shape[0]) + 0.0 * result.log_likelihood
+        return result.mean, result.covariance, track, Likelihood(*result[2:], degrees)
 
 
 class KnownClassBound(_KnownClass):

@@ -3,11 +3,12 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.task import Initial
 from ...envs.tightly_coupled_navigation.banks import EFFICIENT, Filters, HypothesisBank
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement
+from ...evaluation.competitors import Likelihood
 
 
 class HuberBank(HypothesisBank):
@@ -54,6 +55,7 @@ class Huber:
     """
 
     kind = "estimator"
+    traceable = True
 
     def __init__(
         self,
@@ -68,13 +70,16 @@ class Huber:
         """Start every filter where everyone starts."""
         return self.bank.start(initial)
 
-    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters]:
+    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters, Likelihood]:
         """One cycle of the bank."""
         xp, readings = self.bank.xp, measurement.readings
         readings = xp.where(xp.isnan(readings), 0.0, readings)  # the bank weighs each by its availability
-        filters = self.bank.predict(memory, measurement._replace(readings=readings))
+        measurement = measurement._replace(readings=readings)
+        filters = self.bank.predict(memory, measurement)
         filters = self.bank.weigh_by_bayes(filters, memory.last_action)
-        return filters.mean, filters.covariance, filters
+        records = self.bank.records(filters, measurement)
+        likelihood = Likelihood(*(records[name] for name in Likelihood._fields))
+        return filters.mean, filters.covariance, filters, likelihood
 
 
 class HuberStuckCheck:
@@ -91,6 +96,7 @@ class HuberStuckCheck:
     """
 
     kind = "estimator"
+    traceable = True
 
     def __init__(
         self, task: TightlyCoupledNavigation, rates: float = EFFICIENT, manoeuvre: float = 4.0
@@ -102,7 +108,7 @@ class HuberStuckCheck:
         """Start every filter where everyone starts."""
         return self.huber.start(initial, N)
 
-    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters]:
+    def update(self, measurement: Measurement, memory: Filters) -> tuple[Array, Array, Filters, Likelihood]:
         """One cycle of the bank without what repeats itself."""
         xp, forces = self.task.xp, self.task.sensors[2].readings
         available = measurement.available

@@ -4,11 +4,12 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.task import Initial
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...envs.tightly_coupled_navigation.world import Measurement, Truth
+from ...evaluation.competitors import Likelihood
 from ...filters import extended_kalman, gnss_ins
 from ...filters.ordered_sums import ordered_sum
 
@@ -22,8 +23,6 @@ class Track(NamedTuple):
     """``(17, 17, N)``."""
     mode: Array
     """True hypothesis at the last measurement, ``(N,)``."""
-    nis: Array = None
-    """Normalised innovation squared of the last measurement, ``(N,)``; None before the first."""
 
 
 def _replaced(matrix: Array, variance: float, task: TightlyCoupledNavigation, lanes: Array) -> Array:
@@ -43,6 +42,8 @@ class _KnownMode:
     that follows another one, or that the task announces by a jump, takes its new acceleration at the end of a
     step; on the course "kinematic" the first one is there from the beginning of its step.
     """
+
+    traceable = True
 
     def __init__(self, task: TightlyCoupledNavigation) -> None:
         self.task = task
@@ -134,7 +135,9 @@ class KnownMode(_KnownMode):
         noises[LINE] = true_line
         self.noises = task.xp.stack(noises, axis=-1)
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Array, Track]:
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: Track
+    ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the true hypothesis and update with the sensors that work."""
         xp, task = self.task.xp, self.task
         track = self.predicted(truth, memory, self.noises, task.parameters.singer_sigma**2)
@@ -142,11 +145,14 @@ class KnownMode(_KnownMode):
         residual = measurement.readings - expected
         ranges = task.sensors[0].readings
         residual = xp.concat([residual[ranges] - truth.range_error, residual[ranges.stop :]])
+        variance, available = self.sensors(measurement, truth)
         update = extended_kalman.update_one_by_one(
-            track.mean, track.covariance, residual, rows, *self.sensors(measurement, truth)
+            track.mean, track.covariance, residual, rows, variance, available
         )
-        nis = ordered_sum(update.squared_residuals)
-        return update.mean, update.covariance, Track(update.mean, update.covariance, truth.mode, nis)
+        likelihood = Likelihood(
+            update.log_likelihood, ordered_sum(update.squared_residuals), ordered_sum(available)
+        )
+        return update.mean, update.covariance, Track(update.mean, update.covariance, truth.mode), likelihood
 
 
 class KnownModeBound(_KnownMode):

@@ -5,21 +5,31 @@ and a noisier sensor asks for another change of the filter than stronger gusts d
 ``filters/noise_adaptation.py``, for the settled filter those of the task's paper.
 """
 
+import math
 from typing import Any, ClassVar, NamedTuple
 
+from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.task import Initial
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start
+from ...evaluation.competitors import Likelihood
 from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
+from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
+
+
+def told_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
+    """How well the readings were predicted; NaN in a dropout of all sensors."""
+    count = ordered_sum(measurement.available)
+    return Likelihood(*(xp.where(count > 0.0, v, math.nan) for v in (log_likelihood, nis)), count)
 
 
 class SteadyKalman:
     """The nominal filter with the constant gain that it settles to; a missing reading changes nothing."""
 
     kind = "estimator"
+    traceable = True
 
     def __init__(self, task: UavAutopilot) -> None:
         self.task, self.xp = task, task.xp
@@ -57,6 +67,8 @@ class Step(NamedTuple):
     filter: Filter
     log_likelihood: Array
     """Of the readings, ``(N,)``."""
+    nis: Array
+    """Their normalised innovation squared, ``(N,)``."""
     correction: Array
     """Of the mean, ``(n, N)``."""
     carried: Array
@@ -67,6 +79,7 @@ class AdaptiveKalman:
     """Kalman filter (10)-(12) of the paper with the noise of each sensor estimated."""
 
     kind = "estimator"
+    traceable = True
 
     def __init__(self, task: UavAutopilot, sensor_noise: MeasurementNoise) -> None:
         self.task, self.xp, self.sensor_noise = task, task.xp, sensor_noise
@@ -89,7 +102,7 @@ class AdaptiveKalman:
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
         mean, covariance = predicted, carried + factor * self.scaled
-        noise, log_likelihood = [], 0.0 * measurement.number
+        noise, log_likelihood, nis = [], 0.0 * measurement.number, 0.0 * measurement.number
         readings = self.xp.where(measurement.available > 0.0, measurement.reading, 0.0)
         for k, i in enumerate(self.task.measured):
             available = measurement.available[k]
@@ -100,21 +113,22 @@ class AdaptiveKalman:
                 self.task.sensor_variances[k] + 0.0 * available,
                 available,
             )
-            mean, covariance, likelihood, _ = packed_covariance.update_coordinates(
+            mean, covariance, likelihood, squared = packed_covariance.update_coordinates(
                 mean, covariance, readings[k][None], (i,), R[None], available[None]
             )
             noise.append(memory)
-            log_likelihood = log_likelihood + likelihood
-        return Step(Filter(mean, covariance, tuple(noise)), log_likelihood, mean - predicted, carried)
+            log_likelihood, nis = log_likelihood + likelihood, nis + squared
+        return Step(Filter(mean, covariance, tuple(noise)), log_likelihood, nis, mean - predicted, carried)
 
     def start(self, initial: Initial, N: int) -> Any:
         """Start where everyone starts."""
         return self.started(initial)
 
-    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any]:
+    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, gusts as designed."""
-        after = self.filtered(memory, measurement, 1.0).filter
-        return after.mean, packed_covariance.unpack(after.covariance, self.n), after
+        after, log_likelihood, nis, *_ = self.filtered(memory, measurement, 1.0)
+        likelihood = told_of(measurement, log_likelihood, nis, self.xp)
+        return after.mean, packed_covariance.unpack(after.covariance, self.n), after, likelihood
 
 
 class MehraKalman(AdaptiveKalman):
@@ -143,17 +157,18 @@ class AdaptiveGusts(AdaptiveKalman):
         one = 0.0 * initial.mean[0] + 1.0
         return self.started(initial), adaptation.Level(one, self.memory * one)
 
-    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any]:
+    def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, and the factor for the next."""
         before, level = memory
-        after, _, correction, carried = self.filtered(before, measurement, level.value)
+        after, log_likelihood, nis, correction, carried = self.filtered(before, measurement, level.value)
         last = slice(self.last, self.last + 1)
         sample = adaptation.process_noise_factor(
             correction[-1:], after.covariance[last], carried[last], self.scaled[last]
         )
         level = adaptation.faded(level, sample, self.forgetting)
         level = level._replace(value=self.xp.clip(level.value, *self.limits))
-        return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level)
+        likelihood = told_of(measurement, log_likelihood, nis, self.xp)
+        return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level), likelihood
 
 
 class SageHusaKalman(AdaptiveGusts):
@@ -203,7 +218,9 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
         return GustModels((self.started(initial),) * 3, third)
 
-    def update(self, measurement: Measurement, memory: GustModels) -> tuple[Array, Array, GustModels]:
+    def update(
+        self, measurement: Measurement, memory: GustModels
+    ) -> tuple[Array, Array, GustModels, Likelihood]:
         """One IMM cycle; each model keeps its own opinion of the sensors."""
         xp = self.xp
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
@@ -217,9 +234,13 @@ class GustInteractingMultipleModel(AdaptiveKalman):
             for j, level in enumerate(self.levels)
         ]
         likelihoods = xp.stack([step.log_likelihood for step in steps])
-        probabilities = imm.mode_posterior(imm.log_probabilities(prediction.probabilities), likelihoods)
+        log_predicted = imm.log_probabilities(prediction.probabilities)
+        probabilities = imm.mode_posterior(log_predicted, likelihoods)
         after = GustModels(tuple(step.filter for step in steps), probabilities)
-        return *imm.combine(*self.stacked(after.filters), probabilities), after
+        nis = weighted_sum(probabilities, xp.stack([step.nis for step in steps]))
+        density = imm.log_mixture_density(log_predicted, likelihoods)
+        likelihood = told_of(measurement, density, nis, xp)
+        return *imm.combine(*self.stacked(after.filters), probabilities), after, likelihood
 
     def stacked(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
         """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""

@@ -3,18 +3,21 @@
 Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
+from ...envs.filter import Initial
 from ...envs.observation import Array
-from ...envs.task import Initial
 from ...envs.uav_autopilot.plant import Model
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
+from ...evaluation.competitors import Likelihood
 from ...filters import packed_covariance
+from .estimators import told_of
 
 
 class TrueState:
     """The autopilot gets the state itself: no estimator feeds this loop better."""
 
     kind = "reference"
+    traceable = True
     knows = "the whole state"
 
     def __init__(self, task: UavAutopilot) -> None:
@@ -38,6 +41,7 @@ class _ToldTheNoise:
     """
 
     kind = "reference"
+    traceable = True
     knows: str
 
     def __init__(self, task: UavAutopilot, model: Model) -> None:
@@ -85,7 +89,9 @@ class Matched(_ToldTheNoise):
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
         return Initial(mean, self.predicted_covariance(memory.covariance, truth))
 
-    def update(self, measurement: Measurement, truth: Truth, memory: Initial) -> tuple[Array, Array, Initial]:
+    def update(
+        self, measurement: Measurement, truth: Truth, memory: Initial
+    ) -> tuple[Array, Array, Initial, Likelihood]:
         """Equations (12), (11) with the noise of this measurement."""
         updated = packed_covariance.update_coordinates(
             *self.predict(measurement, truth, memory),
@@ -95,7 +101,8 @@ class Matched(_ToldTheNoise):
             measurement.available,
         )
         covariance = packed_covariance.unpack(updated.covariance, len(self.task.components))
-        return updated.mean, covariance, Initial(updated.mean, updated.covariance)
+        likelihood = told_of(measurement, updated.log_likelihood, updated.squared_distance, self.xp)
+        return updated.mean, covariance, Initial(updated.mean, updated.covariance), likelihood
 
 
 class KnownNoiseBound(_ToldTheNoise):

@@ -18,7 +18,8 @@ from filtergym.baselines.table import Baselines
 from filtergym.envs.draws import Draws
 from filtergym.envs.observation import LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.parameters import TaskParameters, parameter
-from filtergym.envs.task import Bank, Component, Initial, PaperPolicy, Scenario, Task, World
+from filtergym.envs.filter import Bank, Initial
+from filtergym.envs.task import Component, PaperPolicy, Scenario, Task, World
 from filtergym.evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from filtergym.filters import kalman
 

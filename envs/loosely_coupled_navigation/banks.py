@@ -15,8 +15,9 @@ from ...filters import imm
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
+from ..filter import Bank, Initial
 from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Compression, Quantity
-from ..task import Bank, Initial, Task
+from ..task import Task
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .world import Measurement
 

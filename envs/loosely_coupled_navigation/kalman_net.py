@@ -19,8 +19,8 @@ import gymnasium
 import numpy
 
 from ...filters import loosely_coupled as ins_gnss
+from ..filter import Initial
 from ..observation import SIGNED_LOG, Array, Block
-from ..task import Initial
 from .banks import NOISES, Augmented, NoiseBank
 from .world import Measurement
 

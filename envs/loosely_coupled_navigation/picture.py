@@ -50,7 +50,7 @@ class LooselyCoupledNavigationPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Positions in m, innovation, and the noises of the action, gain or weights."""
-        measurement, filters = state.measurement, state.bank
+        measurement, filters = state.measurement, state.filter
         missing = measurement.available[0] < 0.5
         values = {
             "reference": state.truth.reference[0, 0],

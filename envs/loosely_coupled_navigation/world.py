@@ -8,9 +8,10 @@ import numpy
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between
 from ..faults import Outliers
+from ..filter import Initial
 from ..observation import Array
 from ..schedules import Steps, within
-from ..task import Initial, Task, World
+from ..task import Task, World
 from .parameters import LooselyCoupledNavigationParameters
 
 NEVER = 1e9

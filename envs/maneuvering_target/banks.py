@@ -16,8 +16,8 @@ from ...filters import alpha_beta, imm
 from ...filters.gaussian import log_density
 from ...filters.ordered_sums import weighted_sum
 from ..controls import bank_action_space, bank_probabilities
+from ..filter import Bank, Initial
 from ..observation import KEPT_AS_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, Quantity
-from ..task import Bank, Initial
 from .parameters import ManeuveringTargetParameters
 from .world import Measurement
 

@@ -71,7 +71,7 @@ class ManeuveringTargetPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Positions in km, innovation, gain or weights, position error with its reported sigma."""
-        task, estimator = self.task, state.bank
+        task, estimator = self.task, state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
             measured = measured + numpy.nan

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 from ...filters import polar
 from ..draws import Draws
 from ..faults import Outliers
+from ..filter import Initial
 from ..observation import Array
-from ..task import Initial, Task, World
+from ..task import Task, World
 from .courses import course_of
 from .parameters import ManeuveringTargetParameters
 from .scans import RegularScans, Reliability, UnreliableScans

@@ -14,8 +14,8 @@ import numpy
 from ...filters import class_fusion, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
+from ..filter import Bank
 from ..observation import BOUNDED_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, scaled
-from ..task import Bank
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start
 

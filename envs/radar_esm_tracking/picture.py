@@ -54,7 +54,7 @@ class RadarEsmTrackingPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Accelerations, weights, true class and type, and the decision of this scan."""
-        filters, truth, decision = state.bank, state.truth, state.measurement.decision[0]
+        filters, truth, decision = state.filter, state.truth, state.measurement.decision[0]
         decided, used = decision < self.task.types, filters.used[0]
         nothing = float("nan")
         return {

@@ -18,8 +18,9 @@ import numpy
 from ...filters import extended_kalman, gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
+from ..filter import Bank, Initial
 from ..observation import BOUNDED_LOG, SIGNED_LOG, Array, Block, Quantity
-from ..task import Bank, Initial, Task
+from ..task import Task
 from .parameters import HYPOTHESES, SensorGroup, TightlyCoupledNavigationParameters
 from .world import Measurement
 

@@ -55,7 +55,7 @@ class TightlyCoupledNavigationPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Positions in m, accelerations, weights, factors, innovations, errors."""
-        task, bank, S, lane = self.task, state.bank, self.task.satellites, 0
+        task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
         error = task.error(state)[:, lane]
         P = numpy.diagonal(task.covariance(state)[:, :, lane])
         truth, estimate = state.truth.state[:, lane], bank.mean[:, lane]

@@ -14,8 +14,9 @@ import numpy
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between
+from ..filter import Initial
 from ..observation import Array
-from ..task import Initial, Task, World
+from ..task import Task, World
 from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ import numpy
 
 from ...filters import gaussian, packed_covariance
 from ...filters.ordered_sums import ordered_sum
+from ..filter import Bank
 from ..observation import KEPT_AS_LOG, SIGNED_LOG, Array, Block, Compression, Quantity
-from ..task import Bank
 from .parameters import UavAutopilotParameters
 from .world import Measurement, Start
 
@@ -43,6 +43,8 @@ class Filter(NamedTuple):
     """Over sigma; 0 in a dropout, ``(m, N)``."""
     nis: Array
     """Normalised innovation squared per available reading, ``(N,)``."""
+    log_likelihood: Array
+    """Log-density of the available readings as predicted, ``(N,)``."""
     mean_innovation: Array
     """Short average of the innovation, ``(m, N)``."""
     mean_square: Array
@@ -190,6 +192,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             action=xp.stack([value * one for value in self.no_action]),
             innovation=zeros,
             nis=one,
+            log_likelihood=zeros[0],
             mean_innovation=zeros,
             mean_square=zeros + 1.0,
             mean_nis=one,
@@ -205,7 +208,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         S = xp.reshape(predicted, (m, m, -1)) + self.R
         # A sensor without a reading counts as one with unit variance that agrees with the prediction.
         S = S * (available[:, None] * available[None]) + self.sensor_identity * (1.0 - available[None])
-        _, squared_distance = gaussian.log_density(residual, S)
+        density, squared_distance = gaussian.log_density(residual, S)
         innovation = residual / xp.sqrt(xp.stack([S[i, i] for i in range(m)]))
         count = ordered_sum(available[i] for i in range(m))
         nis = xp.where(count > 0.0, squared_distance / xp.clip(count, 1.0, None), state.mean_nis)
@@ -215,6 +218,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             covariance=covariance,
             innovation=innovation,
             nis=nis,
+            log_likelihood=density + 0.5 * math.log(2.0 * math.pi) * (m - count),
             mean_innovation=state.mean_innovation + forget * available * (innovation - state.mean_innovation),
             mean_square=state.mean_square + forget * available * (innovation**2 - state.mean_square),
             mean_nis=state.mean_nis + forget * (nis - state.mean_nis),
@@ -269,8 +273,8 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return state.control
 
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
-        """NIS (NaN in a dropout of all sensors) with the number of its readings, and the innovation over its sigma of
-        the output's sensor (of the first where the output is not measured).
+        """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the
+        innovation over its sigma of the output's sensor (of the first where the output is not measured).
         """
         task, xp = self.task, self.xp
         count = ordered_sum(measurement.available)
@@ -278,6 +282,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return {
             "nis": xp.where(count > 0.0, state.nis * count, math.nan),
             "nis_degrees": count,
+            "log_likelihood": xp.where(count > 0.0, state.log_likelihood, math.nan),
             "innovation": state.innovation[shown],
         }
 

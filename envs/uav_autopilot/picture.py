@@ -29,7 +29,7 @@ class UavAutopilotPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Signals of the loop, NIS, and the levels of the noise."""
-        task, truth, estimator = self.task, state.truth, state.bank
+        task, truth, estimator = self.task, state.truth, state.filter
         assert isinstance(estimator, Filter)
         answered = state.measurement.available[self.shown, 0] > 0.0
         values = {

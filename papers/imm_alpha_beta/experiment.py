@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.catalogue import make_task
+from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.task import Episode, Initial
+from ...envs.task import Episode
 from ...evaluation.parallel import Workers
 from ...evaluation.rollout import started_lanes
 from ...evaluation.seeds import episode_seeds

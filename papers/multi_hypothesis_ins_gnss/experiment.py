@@ -9,10 +9,11 @@ from ...baselines.tightly_coupled_navigation.metrics import lasting, switches
 from ...baselines.tightly_coupled_navigation.policies import chain
 from ...baselines.tightly_coupled_navigation.references import KnownMode
 from ...envs.catalogue import make_task
-from ...envs.task import Episode, Outside, Task
+from ...envs.task import Episode, Task
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import Policy
+from ...evaluation.filters import Estimated
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
 from ...filters import gnss_ins, imm
@@ -149,16 +150,13 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     task: Any = make_task(TightlyCoupledNavigation.id, "weights", scenario, **keywords)
     seeds = [seed for count in filters.values() for seed in episode_seeds("test", SEED, count)]
 
-    known = _Watched(task)
-
     def fields(episode: Episode) -> dict[str, numpy.ndarray]:
         squares, records, P = task.error(episode) ** 2, task.records(episode), task.covariance(episode)
-        if isinstance(episode.bank, Outside):
+        if isinstance(episode.filter, Estimated):
             # The reference believes the truth; nothing but apertures takes a rate away here.
             available = episode.measurement.available
             records["mode_probability"] = numpy.eye(len(HYPOTHESES))[records["true_mode"]].T
             records["rate_outside_aperture"] = 1.0 - available[task.sensors[1].readings].min(axis=0)
-            records["nis"], records["nis_degrees"] = known.nis, available.sum(axis=0)
         return {
             "squares": numpy.stack([squares[part].sum(axis=0) for part in PARTS]),
             "variance": P[0, 0] + P[1, 1] + P[2, 2],
@@ -169,24 +167,12 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         }
 
     lanes = [FILTERS.get(name) for name, count in filters.items() for _ in range(count)]
-    actor = known if "known mode" in filters else _SideBySide(task, lanes)
+    actor = KnownMode(task) if "known mode" in filters else _SideBySide(task, lanes)
     run = Run(**recorded(task, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
         name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)
     }
-
-
-class _Watched(KnownMode):
-    """The reference, whose normalised innovation squared can be read from outside."""
-
-    nis: Any = None
-
-    def update(self, measurement: Any, truth: Any, memory: Any) -> tuple[Any, Any, Any]:
-        """Keep it."""
-        mean, covariance, track = super().update(measurement, truth, memory)
-        self.nis = track.nis
-        return mean, covariance, track
 
 
 class Results(NamedTuple):

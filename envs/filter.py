@@ -1,0 +1,152 @@
+"""What estimates.
+
+A **filter** starts where everyone starts, predicts to every measurement, updates with it, and reports mean and
+covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator that somebody brings,
+a learned estimator, a reference that is told more, a bound. So there is one rollout and one compilation for all.
+
+State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import gymnasium
+
+from .observation import Array, Block, Quantity
+
+TaskT = TypeVar("TaskT")
+Measurement = TypeVar("Measurement")
+State = TypeVar("State")
+
+
+class Initial(NamedTuple):
+    """The initial estimate given to every filter; a task may use a NamedTuple with more fields."""
+
+    mean: Array
+    """In the units of the task's components, ``(C, N)``."""
+    covariance: Array
+    """``(C, C, N)``."""
+
+
+class Input(NamedTuple):
+    """All that a filter may be given at a measurement."""
+
+    measurement: Any
+    truth: Any = None
+    """Of a filter that ``knows`` something: the world's NamedTuple; else None."""
+    action: Array = None
+    """Of a bank: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space."""
+
+
+class Filter(ABC, Generic[TaskT, Measurement, State]):
+    """What estimates.
+
+    Args:
+        task: the estimation problem, with the constants that world and filter share.
+    """
+
+    knows: ClassVar[str] = ""
+    """What it is given that no competitor knows, in words; empty where that is nothing."""
+    in_python: ClassVar[bool] = False
+    """Whether ``start`` and ``update`` run as Python code, whatever computes the rest: they cannot be traced."""
+
+    def __init__(self, task: TaskT) -> None:
+        self.task = task
+        self.parameters = task.parameters  # type: ignore[attr-defined]
+        self.xp = task.xp  # type: ignore[attr-defined]
+
+    @property
+    def action_space(self) -> gymnasium.Space:
+        """What the action may be; here there is none to choose."""
+        return gymnasium.spaces.Discrete(1)
+
+    @property
+    def blocks(self) -> Sequence[Block]:
+        """What an agent is shown, of this state and the measurement, in order."""
+        return ()
+
+    @property
+    def quantities(self) -> Sequence[Quantity]:
+        """What else a policy can read from an observation."""
+        return ()
+
+    @abstractmethod
+    def start(self, initial: Any, truth: Any = None) -> State:
+        """State at the start of the track.
+
+        Args:
+            initial: the task's :class:`Initial`.
+            truth: as in :class:`Input`.
+        """
+
+    def predict(self, state: State, measurement: Measurement) -> State:
+        """Predict to the time of a measurement and compare with it; a filter that does all in one call does nothing."""
+        return state
+
+    @abstractmethod
+    def update(self, state: State, given: Input) -> State:
+        """Take in the measurement that was predicted.
+
+        Args:
+            state: after :meth:`predict`.
+            given: the same measurement, and what else this filter is given.
+        """
+
+    @abstractmethod
+    def mean(self, state: State) -> Array:
+        """Estimate of the task's components, after :meth:`update`, ``(C, N)``."""
+
+    @abstractmethod
+    def covariance(self, state: State) -> Array:
+        """Covariance that is reported for it, ``(C, C, N)``."""
+
+    def feedback(self, state: State) -> Any:
+        """Report what a closed loop gives back to the world; None in an open loop."""
+        return None
+
+    def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
+        """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for
+        ``mode_probability``.
+
+        How well the measurement was predicted is told by ``log_likelihood`` (log-density of the measurement as it was
+        predicted, NaN where nothing was received), ``nis``, the normalised innovation squared, and ``nis_degrees``, its
+        dimension.
+        """
+        return {}
+
+
+class Bank(Filter[TaskT, Measurement, State]):
+    """A filter that an action steers: the filters of a task under one control."""
+
+    @property
+    @abstractmethod
+    def action_space(self) -> gymnasium.Space:
+        """What the action may be."""
+
+    @property
+    @abstractmethod
+    def blocks(self) -> Sequence[Block]:
+        """What the agent is shown, of this state and the measurement, in order."""
+
+    @abstractmethod
+    def start(self, initial: Any) -> State:  # type: ignore[override]  # no bank is given the truth
+        """State at the start of the track."""
+
+    @abstractmethod
+    def predict(self, state: State, measurement: Measurement) -> State:
+        """Step 2: predict to the time of a measurement and compare with it."""
+
+    @abstractmethod
+    def act(self, state: State, measurement: Measurement, action: Array) -> State:
+        """Step 4: apply the action to the measurement.
+
+        Args:
+            state: after :meth:`predict`.
+            measurement: the same.
+            action: ``(A, N)`` floats for a box, ``(N,)`` integers for a discrete space.
+        """
+
+    def update(self, state: State, given: Input) -> State:
+        """Apply the action that is given."""
+        return self.act(state, given.measurement, given.action)

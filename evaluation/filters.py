@@ -1,0 +1,402 @@
+"""Competitors as filters: what puts an estimator, a reference or a bound in the place of a task's bank.
+
+What says that it is ``traceable`` is compiled like a bank. The rest runs as Python code between compiled steps of the
+world, and keeps its memory to itself: it may be anything.
+"""
+
+import math
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from ..compiler.functions import mapped
+from ..compiler.namespace import NotTraceable
+from ..envs.compiled import warn_of
+from ..envs.filter import Filter, Input
+from ..envs.observation import Array
+from ..envs.task import Task, named_arrays
+from ..filters.small_matrices import cholesky
+from .competitors import Kind, Likelihood, check_competitor, made
+from .dataset import FAULTS
+
+
+@contextmanager
+def explain_errors(what: str) -> Iterator[None]:
+    """Turn whatever somebody else's code raises into one sentence with the line that raised it."""
+    try:
+        yield
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        # The last line outside installed libraries: one of their own says less.
+        own = [f for f in frames[1:] if "site-packages" not in f.filename] or frames
+        line = f"{Path(own[-1].filename).name}, line {own[-1].lineno}"
+        raise ValueError(f"{what}: {type(error).__name__}: {error} ({line})") from error
+
+
+def chosen_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
+    """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
+    entry, without that axis.
+    """
+    return mapped(lambda values: values[..., lanes], part)
+
+
+class Estimated(NamedTuple):
+    """State of an estimator or a reference in the loop."""
+
+    mean: Array
+    """Last valid answer, ``(C, N)``; before any the initial estimate."""
+    covariance: Array
+    """``(C, C, N)``."""
+    memory: Any
+    """Its own; None of what runs in Python."""
+    feedback: Any
+    """What a closed loop is given of the mean."""
+    likelihood: Likelihood
+    """Of the last measurement, NaN where it is not told."""
+    fault: Array
+    """Number of the reason among ``FAULTS`` why the episode is lost, from 1 on; 0 where it is not, ``(N,)``."""
+    missed: Array
+    """One where a measurement was not received in full so far, ``(N,)``."""
+
+
+class ReferenceFilter(Filter[Task, Any, Estimated]):
+    """A reference in the loop, see :class:`.competitors.Reference`.
+
+    Args:
+        task: the estimation problem.
+        own: the reference, made for it; None where it runs in Python, beside traced steps.
+        in_python: whether it does.
+    """
+
+    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
+        super().__init__(task)
+        self.own, self.in_python = own, in_python  # type: ignore[misc]  # of this filter, not of the class
+        self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
+
+    def start(self, initial: Any, truth: Any = None) -> Estimated:
+        """Start where everyone starts, with the truth."""
+        return self._started(initial, self.own.start(initial, truth))
+
+    def _started(self, initial: Any, memory: Any) -> Estimated:
+        zero = 0.0 * initial.mean[0]
+        feedback = self.task.feedback(initial.mean, initial)
+        nothing = Likelihood(zero + math.nan).filled()
+        return Estimated(initial.mean, initial.covariance, memory, feedback, nothing, zero, zero)
+
+    def update(self, state: Estimated, given: Input) -> Estimated:
+        """Take its answer as it is."""
+        mean, covariance, memory, *told = self.own.update(given.measurement, given.truth, state.memory)
+        feedback = self.task.feedback(mean, given.measurement)
+        likelihood = Likelihood.of(*told).filled() if told else state.likelihood
+        return state._replace(
+            mean=mean, covariance=covariance, memory=memory, feedback=feedback, likelihood=likelihood
+        )
+
+    def mean(self, state: Estimated) -> Array:
+        """Last valid answer."""
+        return state.mean
+
+    def covariance(self, state: Estimated) -> Array:
+        """Covariance of it."""
+        return state.covariance
+
+    def feedback(self, state: Estimated) -> Any:
+        """Arrow back as it follows from the mean."""
+        return state.feedback
+
+    def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
+        """How likely the measurement was."""
+        return state.likelihood._asdict()
+
+
+class EstimatorFilter(ReferenceFilter):
+    """An estimator in the loop, see :class:`.competitors.Estimator`, whose answers are checked.
+
+    An episode in which an answer is not finite, or no covariance, is lost from that measurement on: the last valid
+    answer, or else the initial estimate, is held to the end. Any estimator could give that answer itself, so that
+    nobody gains by losing an episode.
+    """
+
+    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
+        super().__init__(task, own, in_python)
+        self.knows = ""  # type: ignore[misc]  # nothing, whatever it says
+
+    def start(self, initial: Any, truth: Any = None) -> Estimated:
+        """Start where everyone starts."""
+        return self._started(initial, self.own.start(initial, initial.mean.shape[-1]))
+
+    def update(self, state: Estimated, given: Input) -> Estimated:
+        """Check its answer, and keep the last valid one."""
+        received = self.task.world.received(given.measurement)
+        mean, covariance, memory, *told = self.own.update(received, state.memory)
+        missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
+        fault = find_fault(mean, covariance, state.fault, missed, self.xp)
+        lost = fault > 0.0
+        mean = self.xp.where(lost, state.mean, mean)
+        return Estimated(
+            mean,
+            self.xp.where(lost, state.covariance, covariance),
+            memory,
+            self.task.feedback(mean, given.measurement),
+            Likelihood.of(*told).filled() if told else state.likelihood,
+            fault,
+            missed,
+        )
+
+    def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
+        """How likely the measurement was, and why the episode is lost."""
+        return {**super().records(state, measurement), "lost": state.fault}
+
+
+def is_lacking(received: Any, xp: Any) -> Array:
+    """Return whether something in a measurement is NaN, ``(N,)``."""
+    lacking: Any = False
+    for _, values in named_arrays(received):
+        axes = tuple(range(len(values.shape) - 1))
+        here = xp.isnan(values)
+        lacking = (xp.any(here, axis=axes) if axes else here) | lacking
+    return lacking
+
+
+def find_fault(mean: Array, covariance: Array, before: Array, missed: Array, xp: Any) -> Array:
+    """Return what is wrong with an estimate, or was before.
+
+    Args:
+        mean: ``(C, N)``.
+        covariance: ``(C, C, N)``.
+        before: number of the reason why the episode was lost before, ``(N,)``.
+        missed: above zero where not everything was received so far, ``(N,)``.
+        xp: array namespace.
+
+    Returns:
+        Numbers of :data:`.dataset.FAULTS` from 1 on, zero where nothing is, ``(N,)``.
+    """
+    finite = xp.all(xp.isfinite(mean), axis=0), xp.all(xp.isfinite(covariance), axis=(0, 1))
+    identity = xp.eye(len(mean), dtype=xp.float64)[:, :, None]
+    P = xp.where(finite[1], covariance, identity)
+    with numpy.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        pivots = [row[-1] for row in cholesky(P)]
+        # A root of what is negative is NaN, and so is all that follows.
+        definite = pivots[-1] > 0.0
+        for pivot in pivots[:-1]:
+            definite = definite & (pivot > 0.0)
+        size = xp.max(xp.abs(P), axis=(0, 1))
+        symmetric = xp.max(xp.abs(P - xp.moveaxis(P, 0, 1)), axis=(0, 1)) <= 1e-6 * size
+    fault = xp.where(symmetric, 0.0, 4.0)
+    fault = xp.where(definite, fault, 3.0)
+    fault = xp.where(finite[1], fault, 2.0)
+    fault = xp.where(finite[0], fault, 1.0)
+    unreceived = (missed > 0.0) & ((fault == 1.0) | (fault == 2.0))
+    fault = xp.where(unreceived, float(len(FAULTS)), fault)
+    return xp.where(before > 0.0, before, fault)
+
+
+class LimitState(NamedTuple):
+    """State of a bound in the loop."""
+
+    bank: Any
+    """Of the task's bank, which flies the loop."""
+    mean_square: Array
+    """Of the task's components, ``(C, N)``."""
+    memory: Any
+    """The bound's own; None of what runs in Python."""
+
+
+class BoundFilter(Filter[Task, Any, LimitState]):
+    """A bound in the loop, see :class:`.competitors.Bound`, beside the task's bank under the action zero.
+
+    Args:
+        task: the estimation problem.
+        own: the bound, made for it; None where it runs in Python, beside traced steps.
+        in_python: whether it does.
+    """
+
+    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
+        super().__init__(task)
+        self.own, self.bank, self.in_python = own, task.bank, in_python  # type: ignore[misc]
+        self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
+
+    def start(self, initial: Any, truth: Any = None) -> LimitState:
+        """Start where everyone starts."""
+        return LimitState(self.bank.start(initial), 0.0 * initial.mean, self.own.start(initial, truth))
+
+    def predict(self, state: LimitState, measurement: Any) -> LimitState:
+        """Predict in the bank."""
+        return state._replace(bank=self.bank.predict(state.bank, measurement))
+
+    def update(self, state: LimitState, given: Input) -> LimitState:
+        """Compute the limit at this measurement."""
+        mean_square, memory = self.own.update(given.measurement, given.truth, state.memory)
+        space, N = self.bank.action_space, mean_square.shape[-1]
+        dtype = self.xp.int64 if isinstance(space, gymnasium.spaces.Discrete) else self.xp.float64
+        neutral = self.xp.zeros((*(space.shape or ()), N), dtype=dtype)
+        return LimitState(self.bank.act(state.bank, given.measurement, neutral), mean_square, memory)
+
+    def mean(self, state: LimitState) -> Array:
+        """That of the bank."""
+        return self.bank.mean(state.bank)
+
+    def covariance(self, state: LimitState) -> Array:
+        """That of the bank."""
+        return self.bank.covariance(state.bank)
+
+    def feedback(self, state: LimitState) -> Any:
+        """That of the bank."""
+        return self.bank.feedback(state.bank)
+
+    def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
+        """The limit."""
+        return {"mean_square": state.mean_square}
+
+
+FILTERS: dict[Kind, Callable[..., Filter]] = {
+    "estimator": EstimatorFilter,
+    "reference": ReferenceFilter,
+    "bound": BoundFilter,
+}
+
+
+class _InPython:
+    """What competes, asked in Python: its memory stays here.
+
+    Args:
+        own: the estimator, reference or bound.
+    """
+
+    def __init__(self, own: Any) -> None:
+        self.own, self.memory = own, None
+        self.knows = getattr(own, "knows", "")
+
+    def start(self, initial: Any, second: Any) -> None:
+        """Keep the memory."""
+        self.memory = self.own.start(initial, second)
+
+    def update(self, *given: Any) -> Any:
+        """Answer, with nothing in place of the memory."""
+        answer = list(self.own.update(*given[:-1], self.memory))
+        place = min(2, len(answer) - 1)
+        self.memory, answer[place] = answer[place], None
+        return tuple(answer)
+
+
+class _CheckedInPython(_InPython):
+    """A user's estimator: what it returns is checked, what it raises is explained.
+
+    Args:
+        own: the estimator.
+        task: that it is made for.
+        name: in errors.
+        count: number of episodes; lanes beyond are given the last of them.
+    """
+
+    def __init__(self, own: Any, task: Task, name: str, count: int) -> None:
+        super().__init__(own)
+        self.task, self.name, self.count, self.step = task, name, count, 0
+
+    def _filled(self, part: Any) -> Any:
+        width = part[0].shape[-1]
+        return chosen_lanes(part, numpy.minimum(numpy.arange(width), self.count - 1))
+
+    def start(self, initial: Any, second: Any) -> None:
+        """Keep the memory; an array of the initial estimate may be changed in place."""
+        with explain_errors(f"estimator {self.name!r} failed at the start of the track"):
+            super().start(self._filled(initial), second)
+
+    def update(self, *given: Any) -> Any:
+        """Answer, without the memory."""
+        self.step += 1
+        width = given[0][0].shape[-1]
+        with explain_errors(f"estimator {self.name!r} failed at measurement {self.step}"):
+            answer = self.own.update(self._filled(given[0]), self.memory)
+            try:
+                mean, covariance, self.memory, *told = answer
+                likelihood = [Likelihood.of(*told)] if told else []
+            except (TypeError, ValueError):
+                raise TypeError(
+                    "update must return mean, covariance and memory, and may return the log-likelihood, not "
+                    + type(answer).__name__
+                ) from None
+        C = len(self.task.components)
+        # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
+        mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
+        covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
+        checked = [
+            Likelihood(*(v if v is None else self._numbers(n, v, (width,)) for n, v in said._asdict().items()))
+            for said in likelihood
+        ]
+        return (mean, covariance, None, *checked)
+
+    def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
+        """Return what was answered as float64, or raise ValueError if it has another shape."""
+        where = f"estimator {self.name!r}: the {word} at measurement {self.step}"
+        try:
+            given = numpy.asanyarray(values)
+            # What float64 has no room for would vanish in it: masks, imaginary parts, words.
+            if isinstance(given, numpy.ma.MaskedArray) or given.dtype.kind not in "fiub":
+                masked = "a masked array of " * isinstance(given, numpy.ma.MaskedArray)
+                raise TypeError(f"expected an array of real numbers, got {masked}{given.dtype}")
+            array = numpy.asarray(given, dtype=numpy.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{where} is no array: {error}") from None
+        if array.shape != shape:
+            components = ", ".join(c.name for c in self.task.components)
+            raise ValueError(
+                f"{where} must have shape {shape}, {len(self.task.components)} components ({components}) of "
+                f"{shape[-1]} episodes, got {array.shape}"
+            )
+        return array
+
+
+class _Maker(NamedTuple):
+    """Makes the filter of a competitor for a task; equal ones are traced once."""
+
+    kind: Kind
+    maker: Any
+    """Of a competitor that can be traced; None of one that runs in Python."""
+
+    def __call__(self, task: Task) -> Filter:
+        """Make it, on any arrays."""
+        own = None if self.maker is None else made(self.maker, task)
+        return FILTERS[self.kind](task, own, self.maker is None)
+
+
+def _can_be_traced(maker: Any, own: Any) -> bool:
+    if not (callable(maker) and getattr(own, "traceable", False)):
+        return False
+    try:
+        hash(maker)
+    except TypeError:
+        return False
+    return True
+
+
+def put_in_loop(task: Task, competitor: Any, kind: Kind, name: str, count: int) -> Task:
+    """Return a task whose filter is a competitor.
+
+    Args:
+        task: the estimation problem.
+        competitor: estimator, reference or bound, or a class or function that makes it for a task.
+        kind: what it is.
+        name: of it, in errors.
+        count: number of episodes.
+
+    Raises:
+        ValueError: if it cannot be made, or has not the methods of its kind.
+    """
+    with explain_errors(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
+        own = made(competitor, task)
+    check_competitor(name, own, kind)
+    if _can_be_traced(competitor, own):
+        try:
+            return task.with_filter(_Maker(kind, competitor))
+        except NotTraceable as error:
+            warn_of(f"{name!r} of {task.id}", error)
+    looped = task.with_filter(_Maker(kind, None))
+    asked = _CheckedInPython(own, task, name, count) if kind == "estimator" else _InPython(own)
+    looped.filter = FILTERS[kind](task, asked, True)
+    return looped
