@@ -80,7 +80,7 @@ def _world_begun(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]
 
 def _filter_started(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
-    state = task.start_filter(initial, truth)
+    state = task.filter.begin(Input(initial, truth))
     return state, task.filter.feedback(state)
 
 
@@ -291,7 +291,7 @@ class _Compiled(Task):
         truth, initial = self.run(_world_begun, uniforms, normals)
         known = self.known_to_filter(truth)
         if self.filter.in_python:
-            return Episode(truth, initial, self.start_filter(initial, known))
+            return Episode(truth, initial, self.filter.begin(Input(initial, known)))
         return Episode(truth, initial, self.run(_filter_started, initial, known)[0])
 
     def measure(self, episode: Episode, noise: Array) -> Episode:

@@ -72,21 +72,20 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
         return ()
 
     @abstractmethod
-    def start(self, initial: Any, truth: Any = None) -> State:
-        """State at the start of the track.
+    def start(self, initial: Any) -> State:
+        """State at the start of the track, of the task's :class:`Initial`."""
 
-        Args:
-            initial: the task's :class:`Initial`.
-            truth: as in :class:`Input`.
-        """
+    def begin(self, given: Input) -> State:
+        """State at the start of the track, of all that the filter is given: the initial estimate as measurement."""
+        return self.start(given.measurement)
 
     def predict(self, state: State, measurement: Measurement) -> State:
-        """Predict to the time of a measurement and compare with it; a filter that does all in one call does nothing."""
+        """Step 2: predict to the time of a measurement and compare with it; by default nothing is done ahead."""
         return state
 
     @abstractmethod
     def update(self, state: State, given: Input) -> State:
-        """Take in the measurement that was predicted.
+        """Step 4: take in the measurement that was predicted.
 
         Args:
             state: after :meth:`predict`.
@@ -128,10 +127,6 @@ class Bank(Filter[TaskT, Measurement, State]):
     @abstractmethod
     def blocks(self) -> Sequence[Block]:
         """What the agent is shown, of this state and the measurement, in order."""
-
-    @abstractmethod
-    def start(self, initial: Any) -> State:  # type: ignore[override]  # no bank is given the truth
-        """State at the start of the track."""
 
     @abstractmethod
     def predict(self, state: State, measurement: Measurement) -> State:

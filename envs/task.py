@@ -530,11 +530,7 @@ class Task(ABC):
             normals: ``(noise.initial_normals, N)``.
         """
         truth, initial = self.world.begin(Draws(uniforms, self.xp), normals)
-        return Episode(truth, initial, self.start_filter(initial, self.known_to_filter(truth)))
-
-    def start_filter(self, initial: Any, truth: Any) -> Any:
-        """State of the filter at the start of the track; a bank has no door for the truth."""
-        return self.filter.start(initial, truth) if self.filter.knows else self.filter.start(initial)
+        return Episode(truth, initial, self.filter.begin(Input(initial, self.known_to_filter(truth))))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""

@@ -8,6 +8,7 @@ import math
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -78,9 +79,13 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
         self.own, self.in_python = own, in_python  # type: ignore[misc]  # of this filter, not of the class
         self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
 
-    def start(self, initial: Any, truth: Any = None) -> Estimated:
+    def begin(self, given: Input) -> Estimated:
         """Start where everyone starts, with the truth."""
-        return self._started(initial, self.own.start(initial, truth))
+        return self._started(given.measurement, self.own.start(given.measurement, given.truth))
+
+    def start(self, initial: Any) -> Estimated:
+        """Start without the truth."""
+        return self.begin(Input(initial))
 
     def _started(self, initial: Any, memory: Any) -> Estimated:
         zero = 0.0 * initial.mean[0]
@@ -126,8 +131,9 @@ class EstimatorFilter(ReferenceFilter):
         super().__init__(task, own, in_python)
         self.knows = ""  # type: ignore[misc]  # nothing, whatever it says
 
-    def start(self, initial: Any, truth: Any = None) -> Estimated:
+    def begin(self, given: Input) -> Estimated:
         """Start where everyone starts."""
+        initial = given.measurement
         return self._started(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def update(self, state: Estimated, given: Input) -> Estimated:
@@ -228,9 +234,14 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         self.own, self.bank, self.in_python = own, task.bank, in_python  # type: ignore[misc]
         self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
 
-    def start(self, initial: Any, truth: Any = None) -> LimitState:
-        """Start where everyone starts."""
-        return LimitState(self.bank.start(initial), 0.0 * initial.mean, self.own.start(initial, truth))
+    def begin(self, given: Input) -> LimitState:
+        """Start where everyone starts, with the truth."""
+        initial = given.measurement
+        return LimitState(self.bank.start(initial), 0.0 * initial.mean, self.own.start(initial, given.truth))
+
+    def start(self, initial: Any) -> LimitState:
+        """Start without the truth."""
+        return self.begin(Input(initial))
 
     def predict(self, state: LimitState, measurement: Any) -> LimitState:
         """Predict in the bank."""
@@ -361,7 +372,8 @@ class _CheckedInPython(_InPython):
         return array
 
 
-class _Maker(NamedTuple):
+@dataclass(frozen=True)
+class _Maker:
     """Makes the filter of a competitor for a task; equal ones are traced once."""
 
     kind: Kind

@@ -22,7 +22,7 @@ CHUNK = 256
 class NoFilter(Filter[Task, Any, Initial]):
     """In place of a filter where nobody estimates: the initial estimate stands."""
 
-    def start(self, initial: Any, truth: Any = None) -> Initial:
+    def start(self, initial: Any) -> Initial:
         """Report the initial estimate."""
         return Initial(initial.mean, initial.covariance)
 

@@ -14,7 +14,7 @@ from .envs.recording import Recording
 from .envs.registration import add_task
 from .envs.task import Task
 from .envs.trajectory import Trajectory
-from .evaluation.competitors import FunctionPolicy
+from .evaluation.competitors import FunctionPolicy, Likelihood
 
 if TYPE_CHECKING:
     from .names import evaluate, make_policy, record, tidy_records
@@ -23,6 +23,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Flights",
     "FunctionPolicy",
+    "Likelihood",
     "Recording",
     "Trajectory",
     "evaluate",

@@ -36,7 +36,7 @@ def likelihood_of_fix(innovation: Array, variance: Array, available: Array, xp: 
     S = xp.where(there, variance, 1.0)
     nis = ordered_sum(innovation * innovation) / S
     density = -0.5 * (nis + axes * xp.log(2.0 * math.pi * S))
-    return Likelihood(*(xp.where(there, v, math.nan) for v in (density, nis)), axes * available)
+    return Likelihood(xp.where(there, density, math.nan), xp.where(there, nis, math.nan), axes * available)
 
 
 class AugmentedEstimator:

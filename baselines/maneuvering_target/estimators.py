@@ -59,8 +59,8 @@ class KalmanModel:
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
         """How well a scan was predicted; NaN where it missed the target."""
         there = measurement.available > 0.0
-        told = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
-        return Likelihood(*told, 2.0 * measurement.available)
+        log_likelihood, nis = (self.xp.where(there, values, math.nan) for values in (log_likelihood, nis))
+        return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
 
 
 class KalmanBank(NamedTuple):

@@ -22,7 +22,8 @@ from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBa
 def told_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
     """How well the readings were predicted; NaN in a dropout of all sensors."""
     count = ordered_sum(measurement.available)
-    return Likelihood(*(xp.where(count > 0.0, v, math.nan) for v in (log_likelihood, nis)), count)
+    there = count > 0.0
+    return Likelihood(xp.where(there, log_likelihood, math.nan), xp.where(there, nis, math.nan), count)
 
 
 class SteadyKalman:
