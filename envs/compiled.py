@@ -32,6 +32,7 @@ from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from .draws import Draws
 from .filter import Filter, Input
+from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
 from .task import Episode, Task
@@ -405,15 +406,14 @@ class Stepper:
         width: lanes, a multiple of eight.
 
     Attributes:
-        action: to be written before a step, ``(..., width)``.
-        shown: last observation, ``(width, fields)``.
+        action: applied at every step, ``(..., width)``.
     """
 
     def __init__(self, task: Any, report: Report, width: int) -> None:
         update, advance, predict, episode = task.programs.later
         tell = task.programs.reported(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
-        self.width, self._threads = width, task.threads
+        self.width, self._threads, self._task = width, task.threads, task
         count = itertools.count()
         self._template, self._kinds = mapped(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -423,7 +423,7 @@ class Stepper:
 
         self.action = empty_lanes(update.inputs[-1].shape, width)
         self.action[...] = 0.0
-        self.shown = numpy.empty((width, *predict.outputs[-1].shape))
+        self._shown, self._given = numpy.empty((width, *predict.outputs[-1].shape)), False
         self._reported = memory(tell.outputs)
         # Episodes go to and fro between two copies, which share what stays as it is.
         first, second = (memory([*advance.outputs, *predict.outputs[:-1]]) for _ in range(2))
@@ -444,7 +444,7 @@ class Stepper:
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
             updated = [own if i is None else given[i] for own, i in zip(written, update.same, strict=True)]
             ahead = then[: truths + measured]
-            predicted = [*then[truths + measured :], self.shown]
+            predicted = [*then[truths + measured :], self._shown]
             self._calls.append(
                 (
                     update.bound(given, written),
@@ -464,42 +464,49 @@ class Stepper:
         self._now = 0
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
 
-    def load(self, episode: Episode) -> None:
-        """Go on from other episodes."""
+    def load(self, episode: Episode, shown: Array = None) -> None:
+        """Go on from other episodes, which show what is given, ``(fields, width)``."""
         for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
             memory[...] = values
+        if shown is not None:
+            self._shown[...] = shown.T
 
     def replace(self, episode: Episode, lanes: numpy.ndarray) -> None:
         """Put the first episodes of others in place of those in some lanes."""
         for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
             memory[..., lanes] = values[..., : len(lanes)]
+        if self._given:
+            self._show_in(self._shown.copy())
+        self._shown[lanes] = self._task.observe(episode)[:, : len(lanes)].T
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
         return _kept(self._template, self._copies[self._now], self._kinds)
 
-    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, row: int) -> None:
+    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: NoiseRing) -> None:
         """Start new episodes everywhere and let their first measurement arrive.
 
         Args:
             uniforms: of the scenario, ``(uniforms, width)``.
             normals: of the start of the track, ``(initial_normals, width)``.
-            row: address of the measurement's noise.
+            noise: of the measurements.
         """
         for memory, values in zip(self._drawn, (uniforms, normals), strict=True):
             memory[...] = values
-        self._run(self._begin[self._now], row)
+        self._run(self._begin[self._now], noise)
 
-    def step(self, row: int) -> None:
-        """Apply the action and go on to the next measurement.
+    def take(self, action: numpy.ndarray) -> None:
+        """Apply an action from the next step on, batch first, of all lanes or of the first."""
+        self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
-        Args:
-            row: address of its noise.
-        """
-        self._run(self._calls[self._now], row)
+    def step(self, noise: NoiseRing) -> None:
+        """Apply the action and go on to the next measurement."""
+        self._run(self._calls[self._now], noise)
 
-    def _run(self, calls: tuple[Call, ...], row: int) -> None:
-        calls[2].table[self._row_entry] = row
+    def _run(self, calls: tuple[Call, ...], noise: NoiseRing) -> None:
+        if self._given:
+            self._show_in(numpy.empty_like(self._shown))
+        calls[2].table[self._row_entry] = noise.address
         self._now = 1 - self._now
         if self.width <= TILE:
             for call in calls:
@@ -517,9 +524,24 @@ class Stepper:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
         return _kept(self._report_template, self._reported, self._report_kinds)
 
-    def show_in(self, memory: numpy.ndarray) -> None:
+    def shown(self) -> numpy.ndarray:
+        """What is shown, ``(fields, width)``, until the next step."""
+        return self._shown.T
+
+    def show_means(self, fields: Sequence[int], means: numpy.ndarray) -> None:
+        """Show other values of some fields, ``(fields, width)``."""
+        self._shown[:, fields] = means.T
+
+    def observation(self, count: int) -> numpy.ndarray:
+        """Observation of the first lanes, batch first; the caller may keep it."""
+        if count < MANY:
+            return self._shown[:count].copy()
+        self._given = True
+        return self._shown[:count]
+
+    def _show_in(self, memory: numpy.ndarray) -> None:
         """Write observations into other memory, ``(width, fields)``, from now on."""
-        self.shown = memory
+        self._shown, self._given = memory, False
         for *_, predict in (*self._calls, *self._begin):
             predict.replace(len(predict.arrays) - 1, memory)
 

@@ -20,9 +20,10 @@ from .fleet import Course, Fleet, check_alike
 from .lanes import Lanes, mean_of
 from .observation import Array, Field
 from .parameters import Limits, check, frozen
-from .privileged import REPORTS, context_shapes, in_sigmas
-from .reward import REWARDS, reward
+from .privileged import context_shapes, in_sigmas
+from .reward import REWARDS
 from .specification import told
+from .step_report import step_report
 from .task import Task
 
 if TYPE_CHECKING:
@@ -368,31 +369,17 @@ class _EnvBase:
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
     ) -> tuple[Array, Array]:
         """Step lanes of one task; returns rewards, and errors in sigmas where observations are privileged."""
-        if not self.options.detailed_info and watch is None:
-            answers = lanes.decide(action, REPORTS[self.reward_kind])
-            paid = mean_of([own[0] if paper is None else own[0] - paper[0] for own, paper in answers])
-            _, error, covariance = answers[-1][0]
-            return paid[: lanes.count], in_sigmas(error, covariance, lanes.count, lanes.task.xp)
-        task = lanes.task
-        rewards: list[Array] = []
-        scaled: Array = None
-        widened = lanes.widened(action)
-
-        def record(state: Any, paper_state: Any) -> None:
-            nonlocal scaled
-            rewards.append(reward(self.reward_kind, task, state, lanes.paper, paper_state))
-            if self.privileged:
-                scaled = in_sigmas(task.error(state), task.covariance(state), lanes.count, task.xp)
-            if self.options.detailed_info:
-                judged = {"error": task.error(state), "cost": task.cost(state)} if task.has_truth else {}
-                batch_last = {**judged, **task.track(state), **task.records(state)}
-                for name, values in batch_last.items():
-                    info[name] = task.xp.moveaxis(values[..., : lanes.count], -1, 0)
-            if watch is not None:
-                watch(state)
-
-        lanes.step(lambda state: task.act(state, widened), record)
-        return mean_of(rewards)[: lanes.count], scaled
+        task, count = lanes.task, lanes.count
+        asked = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
+        answers = lanes.decide(action, asked)
+        for own, _ in answers if watch is not None else ():
+            watch(own.episode)
+        last = answers[-1][0]
+        for name, values in (last.details or {}).items():
+            info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
+        rewards = [own.reward if paper is None else own.reward - paper.reward for own, paper in answers]
+        scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
+        return mean_of(rewards)[:count], scaled
 
     def _forget_errors(self, lanes: Sequence[int]) -> None:
         """Episodes that begin have no estimate yet that could be wrong."""

@@ -4,25 +4,11 @@ A critic may be told more than the policy that it judges (asymmetric actor and c
 in training only. The environment keeps the two apart and says in its metadata that it is privileged.
 """
 
-from collections.abc import Callable
 from typing import Any
 
-from .compiled import Report
 from .draws import Draws
 from .observation import Array
-from .reward import OWN_PAY
-from .task import Episode, Task
-
-
-def _report(pay: Callable[[Task, Any], Array]) -> Report:
-    def paid_and_wrong(task: Task, episode: Episode) -> tuple[Array, Array, Array]:
-        return pay(task, episode), task.error(episode), task.covariance(episode)
-
-    return paid_and_wrong
-
-
-REPORTS = {kind: _report(pay) for kind, pay in OWN_PAY.items()}
-"""For each reward: what it pays for an estimate, the estimate's error, and its reported covariance."""
+from .task import Task
 
 
 def in_sigmas(error: Array, covariance: Array, count: int, xp: Any) -> Array:

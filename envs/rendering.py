@@ -487,11 +487,8 @@ class LatePicture:
 
     def _apply(self, action: numpy.ndarray) -> None:
         lanes, shown = self._lanes, self._lanes.observe()[0]
-        widened = lanes.widened(action[None])
-        lanes.step(
-            lambda state: lanes.task.act(state, widened),
-            lambda state, _: self._picture.keep(state, action, shown),
-        )
+        for state, _ in lanes.decide(action[None]):
+            self._picture.keep(state, action, shown)
 
     def frame(self) -> numpy.ndarray:
         """Draw and return the picture, ``(height, width, 3)`` bytes."""

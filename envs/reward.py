@@ -63,24 +63,6 @@ REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 
 
-def reward(kind: str, task: Task, state: Any, paper: Task | None, paper_state: Any) -> Array:
-    """Pay for the estimate in ``state``, ``(N,)``.
-
-    Args:
-        kind: one of ``REWARDS``.
-        task: whose state it is.
-        state: after the action.
-        paper: the same task under the control of the paper's algorithm, for "relative".
-        paper_state: its state on the same noise.
-    """
-    # As the task computes what it is asked for: compiled logarithms may round otherwise than NumPy's.
-    paid = task.run(OWN_PAY[kind], state)
-    if kind == "relative":
-        assert paper is not None
-        return paid - paper.run(OWN_PAY[kind], paper_state)
-    return paid
-
-
 def paper_task(task: Task) -> Task:
     """Return the same task under the control of the paper's algorithm."""
     return task.under(task.paper_policy.control)

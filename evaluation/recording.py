@@ -12,7 +12,7 @@ from ..envs.observation import Array
 from ..envs.recording import MOST_NUMBERS, Recording, measured_once
 from ..envs.recording_files import differing
 from ..envs.task import Episode, Task, named_arrays
-from .rollout import Progress, started_lanes, whole_episode
+from .rollout import Progress, started_lanes
 from .seeds import episode_seeds
 
 CHUNK = 256
@@ -142,7 +142,7 @@ def _recorded(
 
     lanes, nothing = started_lanes(task, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
-        for episode, _ in lanes.decide(nothing, whole_episode):
+        for episode, _ in lanes.decide(nothing):
             keep(episode)
         tick(count * task.decision_interval)
     keep(lanes.state)

@@ -7,7 +7,7 @@ import gymnasium
 import numpy
 
 from ..envs.compiled import Report
-from ..envs.lanes import Lanes
+from ..envs.lanes import Lanes, whole_episode
 from ..envs.observation import Array
 from ..envs.task import Episode, Task
 from .competitors import Kind, check_competitor, kind_of, made
@@ -32,11 +32,6 @@ def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], N
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
     return lanes
-
-
-def whole_episode(task: Task, episode: Episode) -> Episode:
-    """Report the state itself."""
-    return episode
 
 
 def rollout(

@@ -146,7 +146,7 @@ def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
         action = random_actions(plain.action_space, 1, step)[0]
         state = looked_at.fleet.only.state
         task = looked_at.task
-        expected = task.cost(task.act(state, looked_at.fleet.only.widened(np.asarray(action)[None])))
+        expected = task.cost(task.act(state, np.stack([action, *[0 * action] * 7], axis=-1)))
         looked_at.fleet.only.state = state  # through the arrays, not the stepper's memory
         one, other = plain.step(action), looked_at.step(action)
         np.testing.assert_array_equal(one[0], other[0])

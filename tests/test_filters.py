@@ -10,7 +10,7 @@ from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.evaluation.competitors import Likelihood
 from filtergym.evaluation.dataset import FAULTS
 from filtergym.evaluation.filters import find_fault, is_lacking, put_in_loop
-from filtergym.evaluation.rollout import rollout, started_lanes, whole_episode
+from filtergym.evaluation.rollout import rollout, started_lanes
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import packed_covariance
 from scipy.stats import multivariate_normal
@@ -164,7 +164,7 @@ def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_ar
             assert told[lane] == pytest.approx(
                 multivariate_normal.logpdf(innovation, cov=S), rel=1e-10, abs=1e-10
             )
-        lanes.decide(np.zeros((8, 1)), whole_episode)
+        lanes.decide(np.zeros((8, 1)))
     assert len(counts) > 1
 
 

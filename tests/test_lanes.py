@@ -2,7 +2,8 @@
 
 import numpy as np
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.lanes import BLOCK, LONGEST_BLOCK, Lanes
+from filtergym.envs.lanes import Lanes
+from filtergym.envs.noise_ring import BLOCK, LONGEST_BLOCK
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -30,9 +31,8 @@ def test_long_episodes_take_one_row_after_another(monkeypatch):
     for lane in range(2):
         lanes.seed(lane, np.random.default_rng(10 + lane))
     lanes.restart()
-    action = np.zeros((1, lanes.width))
     for _ in range(3 * BLOCK):
-        lanes.step(lambda state: task.act(state, action))
+        lanes.decide(np.zeros((2, 1)))
     for lane in range(2):
         expected = naive_rows(10 + lane, task.noise, 3 * BLOCK + 1)
         np.testing.assert_array_equal(np.array(taken)[:, :, lane], expected)

@@ -36,11 +36,8 @@ def best_schedule(scenario, episodes, iterations):
         lanes.restart()
         costs = []
         for k in range(decisions):
-            action = actions[k][:, None].expand(-1, lanes.width)
-            lanes.step(
-                lambda state, action=action: task.act(state, action),
-                lambda state, _, costs=costs: costs.append(task.cost(state).mean()),
-            )
+            for state, _ in lanes.decide(actions[k].expand(episodes, -1)):
+                costs.append(task.cost(state)[:episodes].mean())
         optimiser.zero_grad()
         # The logarithm, so that the step does not depend on the size of the cost.
         torch.stack(costs).mean().log().backward()

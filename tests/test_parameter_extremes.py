@@ -14,7 +14,8 @@ import pytest
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.parameters import declared
-from filtergym.envs.reward import REWARDS, paper_task, reward
+from filtergym.envs.reward import REWARDS, paper_task
+from filtergym.envs.step_report import step_report
 
 ENDLESS = {float: (-1e6, -1e-6, 1e-6, 1e6), int: (1, 2, 300)}
 """Where a limit leaves a number open: extreme, and still sensible in some unit."""
@@ -99,14 +100,14 @@ def finding(env_id, keywords, kind, rng):
     for lane in range(3):
         lanes.seed(lane, np.random.default_rng(lane))
     lanes.restart()
-    wrong = []
+    wrong, report = [], step_report(kind, episode=True)
 
-    def record(state, paper_state):
+    def check(state, paid):
         P = np.moveaxis(task.covariance(state), -1, 0)
         found = {
             "error": task.error(state),
             "cost": task.cost(state),
-            "reward": reward(kind, task, state, lanes.paper, paper_state),
+            "reward": paid,
             "covariance": P,
         }
         wrong.extend(name for name, values in found.items() if not np.isfinite(values).all())
@@ -122,9 +123,10 @@ def finding(env_id, keywords, kind, rng):
         wrong.extend(f"observation {task.fields[i].name}" for i in np.flatnonzero(~shown))
         if wrong:
             return f"step {step}: {', '.join(wrong)}"
-        action = lanes.widened(actions(task.action_space, rng, step))
+        action = actions(task.action_space, rng, step)
         if step < last:
-            lanes.step(lambda state, action=action: task.act(state, action), record)
+            for own, paper in lanes.decide(action, report):
+                check(own.episode, own.reward if paper is None else own.reward - paper.reward)
     return ""
 
 

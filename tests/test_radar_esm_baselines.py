@@ -158,16 +158,10 @@ def played(task, estimator, seeds, decisions):
     lanes = started_lanes(task, seeds, begun.append)
     (start,) = begun
     memory = estimator.start(start.measurement, start.truth)
-    zero = lanes.widened(numpy.zeros((len(seeds), task.classes)))
-
-    def update(episode):
-        nonlocal memory
+    for _ in range(decisions):
+        ((episode, _),) = lanes.decide(numpy.zeros((len(seeds), task.classes)))
         mean, covariance, memory, _ = estimator.update(episode.measurement, episode.truth, memory)
         states.append((episode, mean, covariance))
-        return task.act(episode, zero)
-
-    for _ in range(decisions):
-        lanes.step(update)
     return start.measurement, states
 
 
@@ -233,11 +227,8 @@ def decided(task, policy, seeds, decisions):
     for _ in range(decisions):
         before = lanes.state
         action, _ = policy.predict(lanes.observe())
-        after = []
-        lanes.step(
-            lambda state, a=action: task.act(state, a.T), lambda state, _, kept=after: kept.append(state)
-        )
-        yield before, after[0]
+        ((after, _),) = lanes.decide(action)
+        yield before, after
 
 
 @pytest.mark.parametrize(
@@ -309,7 +300,7 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
             # The observation compresses the logarithms; the last digits are lost.
             assert action[n] == pytest.approx(joint[:, :, n].sum(axis=1), rel=1e-8, abs=1e-12)
         last = counts
-        lanes.step(lambda episode, a=action: task.act(episode, a.T))
+        lanes.decide(action)
 
 
 def test_forgetting_nothing_is_the_joint_posterior():
@@ -321,7 +312,7 @@ def test_forgetting_nothing_is_the_joint_posterior():
         shown = lanes.observe()
         action, state = kept.predict(shown, state, numpy.full(8, step == 0))
         assert action == pytest.approx(joint.predict(shown)[0], rel=1e-8, abs=1e-12)
-        lanes.step(lambda episode, a=action: task.act(episode, a.T))
+        lanes.decide(action)
 
 
 def test_the_printed_rule_by_weights_is_zero_evidence():

@@ -263,9 +263,9 @@ def test_log_likelihood_is_the_density_of_what_was_predicted(control):
     for lane in range(3):
         lanes.seed(lane, np.random.default_rng(lane))
     lanes.restart()
-    action = lanes.widened(np.full((3, *task.action_space.shape), 0.3))
     for _ in range(3):
-        lanes.step(lambda state: task.act(state, action))
+        lanes.decide(np.full((3, *task.action_space.shape), 0.3))
+    action = np.full((*task.action_space.shape, 8), 0.3)
     bank, said = lanes.state.filter, task.records(task.act(lanes.state, action))
     if control == "gain":
         S = np.stack([np.diag(v) for v in bank.innovation_variance.T], axis=-1)

@@ -8,7 +8,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.reward import paper_task, reward
+from filtergym.envs.reward import paper_task
 
 import filtergym
 
@@ -19,28 +19,26 @@ def test_reward_is_the_compressed_charge(env_id):
     """By hand: with the charge x in units of the paper's, -30 log(1 + x / 30); relative adds the paper's own."""
     task = make_task(env_id)
     paper = paper_task(task)
-    lanes = Lanes(task, 8, paper)
-    for lane in range(8):
-        lanes.seed(lane, np.random.default_rng(lane))
-    lanes.restart()
+    watched, plain, relative = (Lanes(task, 8, beside) for beside in (paper, None, paper))
+    for lanes in (watched, plain, relative):
+        for lane in range(8):
+            lanes.seed(lane, np.random.default_rng(lane))
+        lanes.restart()
     # Of one sign and the other: evidence that is the same for all hypotheses would change nothing.
-    action = np.resize([0.5, -0.5], task.action_space.shape)[:, None] + np.zeros(8)
+    action = np.resize([0.5, -0.5], task.action_space.shape) + np.zeros((8, 1))
     seen = []
-
-    def record(state, paper_state):
-        ours, theirs = (
-            [-30.0 * math.log1p(x / task.reward_unit / 30.0) for x in t.charge(s)]
-            for t, s in ((task, state), (paper, paper_state))
-        )
-        np.testing.assert_allclose(reward("cost", task, state, None, None), ours, rtol=1e-12)
-        difference = np.subtract(ours, theirs)
-        np.testing.assert_allclose(
-            reward("relative", task, state, paper, paper_state), difference, rtol=1e-9, atol=1e-12
-        )
-        seen.append(max(abs(difference)))
-
     for _ in range(5):
-        lanes.step(lambda state: task.act(state, action), record)
+        ours, theirs = (
+            np.mean(
+                [[-30.0 * math.log1p(x / task.reward_unit / 30.0) for x in t.charge(s)] for s in states],
+                axis=0,
+            )
+            for t, states in zip((task, paper), zip(*watched.decide(action), strict=True), strict=True)
+        )
+        np.testing.assert_allclose(plain.pay(action, "cost"), ours, rtol=1e-12)
+        difference = np.subtract(ours, theirs)
+        np.testing.assert_allclose(relative.pay(action, "relative"), difference, rtol=1e-9, atol=1e-12)
+        seen.append(max(abs(difference)))
     assert max(seen) > 0.0
 
 

@@ -8,7 +8,6 @@ import numpy
 from ...envs.catalogue import make_task
 from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.task import Episode
 from ...evaluation.parallel import Workers
 from ...evaluation.rollout import started_lanes
 from ...evaluation.seeds import episode_seeds
@@ -108,16 +107,11 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
     lanes = started_lanes(
         task, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
     )
-    action = lanes.widened(numpy.zeros((episodes, 1)))
     kept = []
-
-    def act(episode: Episode) -> Episode:
-        said, truth = episode.measurement, task.world.state(episode.truth)
-        kept.append([values[:, :episodes] for values in (said.position, said.variance, truth)])
-        return task.act(episode, action)
-
     for _ in range(lanes.decisions_per_episode):
-        lanes.step(act)
+        for episode, _ in lanes.decide(numpy.zeros((episodes, 1))):
+            said, truth = episode.measurement, task.world.state(episode.truth)
+            kept.append([values[:, :episodes] for values in (said.position, said.variance, truth)])
     (initial,) = starts
     start_variance = numpy.stack([initial.covariance[i, i, :episodes] for i in range(2)])
     measurement, variance, truth = (numpy.stack(values) for values in zip(*kept, strict=True))
