@@ -137,16 +137,23 @@ class EstimatorFilter(ReferenceFilter):
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
         lost = fault > 0.0
-        mean = self.xp.where(lost, state.mean, mean)
+        mean = self._held(lost, state.mean, mean)
         return Estimated(
             mean,
-            self.xp.where(lost, state.covariance, covariance),
+            self._held(lost, state.covariance, covariance),
             memory,
             self.task.feedback(mean, given.measurement),
             Likelihood.of(*told).filled() if told else state.likelihood,
             fault,
             missed,
         )
+
+    def _held(self, lost: Array, last: Array, answer: Array) -> Array:
+        """The last valid answer where the episode is lost."""
+        if self.in_python:  # it is a copy, and keeps its layout, by which matrix products round
+            answer[..., lost] = last[..., lost]
+            return answer
+        return self.xp.where(lost, last, answer)
 
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was, and why the episode is lost."""
@@ -313,20 +320,22 @@ class _CheckedInPython(_InPython):
         width = given[0][0].shape[-1]
         with explain_errors(f"estimator {self.name!r} failed at measurement {self.step}"):
             answer = self.own.update(self._filled(given[0]), self.memory)
-            try:
-                mean, covariance, self.memory, *told = answer
-                likelihood = [Likelihood.of(*told)] if told else []
-            except (TypeError, ValueError):
+            if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
+                count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
                 raise TypeError(
                     "update must return mean, covariance and memory, and may return the log-likelihood, not "
-                    + type(answer).__name__
-                ) from None
+                    f"{type(answer).__name__}{count}"
+                )
+            mean, covariance, self.memory, *told = answer
+            likelihood = [Likelihood.of(*told)] if told else []
         C = len(self.task.components)
         # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
         covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         checked = [
-            Likelihood(*(v if v is None else self._numbers(n, v, (width,)) for n, v in said._asdict().items()))
+            Likelihood(
+                *(v if v is None else self._numbers(n, v, (width,)) for n, v in said._asdict().items())
+            )
             for said in likelihood
         ]
         return (mean, covariance, None, *checked)

@@ -86,7 +86,7 @@ def evaluated(environment: str, name: str, scenario: str, episodes: int, **keywo
 
 
 def recorded(
-    task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any], Mapping[str, numpy.ndarray]]
+    task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any, Any], Mapping[str, numpy.ndarray]]
 ) -> dict[str, numpy.ndarray]:
     """Run a policy or a reference estimator and keep what an evaluation does not record.
 
@@ -94,14 +94,14 @@ def recorded(
         task: under the actor's control.
         actor: policy or reference.
         seeds: one for each episode.
-        fields: values ``(..., N)`` to keep of the state after every action.
+        fields: of the task and its state after every measurement, values ``(..., N)`` to keep.
 
     Returns:
         The same, ``(episodes, K, ...)`` with the other axes in reversed order.
     """
     # Lanes beyond the seeds are padding.
     kept = [
-        {name: values[..., : len(seeds)].T for name, values in fields(state).items()}
-        for state, _ in rollout(task, actor, seeds)
+        {name: values[..., : len(seeds)].T for name, values in found.items()}
+        for found, _ in rollout(task, actor, seeds, fields)
     ]
     return {name: numpy.stack([values[name] for values in kept], axis=1) for name in kept[0]}

@@ -11,7 +11,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import KalmanModel
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.filter import Initial
-from filtergym.evaluation.rollout import run_estimator
+from filtergym.evaluation.rollout import rollout
 from filtergym.filters import kalman
 
 import filtergym
@@ -36,13 +36,9 @@ def example(name):
 
 def estimates(maker, scenario="random", episodes=8, **keywords):
     """Mean, (time, 4, episodes), and covariance over its largest entry, (time, 4, 4, episodes)."""
-    task, said = make_task(ID, scenario=scenario, **keywords), []
-
-    def record(episode):
-        said.append((task.mean(episode), task.covariance(episode)))
-
-    run_estimator(task, maker(task), range(episodes), record, lambda _: None)
-    means, covariances = map(np.stack, zip(*said, strict=True))
+    task = make_task(ID, scenario=scenario, **keywords)
+    answers = [(e.filter.mean, e.filter.covariance) for e, _ in rollout(task, maker(task), range(episodes))]
+    means, covariances = map(np.stack, zip(*answers, strict=True))
     return means, covariances / abs(covariances).max(axis=(1, 2), keepdims=True)
 
 

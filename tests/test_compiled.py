@@ -16,6 +16,7 @@ from filtergym.envs.compiled import compiled
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.maneuvering_target import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
+from filtergym.evaluation.recording import NoFilter
 from rounding import REPETITIONS, assert_same, move_roundings
 
 import filtergym
@@ -283,7 +284,7 @@ def test_the_task_is_still_what_it_was():
     assert fast.under("gain").control == "gain"
     assert fast.fields == task.fields
     assert fast.original is task
-    assert fast.estimated_outside().fields == ()
+    assert fast.with_filter(NoFilter).fields == ()
 
 
 def test_two_scenarios_share_their_code(tmp_path, monkeypatch):

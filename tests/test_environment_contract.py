@@ -12,6 +12,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task, register
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.task import Episode
+from filtergym.evaluation.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
 
 from filtergym import evaluate
@@ -76,7 +77,7 @@ def test_functions_of_a_bank_have_no_door_for_the_truth(env_id, control):
 
 def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
     """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
-    task = make_task(env_id, **short).estimated_outside()
+    task = make_task(env_id, **short).with_filter(NoFilter)
     noise = task.noise
     episode = task.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
     mean, covariance = episode.measurement.mean, episode.measurement.covariance

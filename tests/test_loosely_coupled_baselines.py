@@ -12,8 +12,7 @@ from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.tuning import stored_values
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.schedules import within
-from filtergym.evaluation.competitors import kind_of
-from filtergym.evaluation.rollout import run_policy, run_reference
+from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled
 from filtergym.filters.linear_systems import van_loan
@@ -49,10 +48,7 @@ def steered(name, scenario, seeds, **keywords):
     """States after every action of a policy or reference, one list."""
     maker = competitor(ID, name)
     task = make_task(ID, getattr(maker, "control", None), scenario, **keywords)
-    states = []
-    run = run_policy if kind_of(maker) == "policy" else run_reference
-    run(task, maker(task), seeds, states.append, lambda _: None)
-    return task, states
+    return task, [state for state, _ in rollout(task, maker, seeds)]
 
 
 # --- errors
@@ -131,7 +127,8 @@ def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
             return matched.update(measurement, truth, memory)
 
     runs = 400
-    run_reference(task, Watched(), episode_seeds("test", 2, runs), lambda _: None, lambda _: None)
+    for _ in rollout(task, Watched(), episode_seeds("test", 2, runs), kind="reference"):
+        pass
     normalised = np.stack(found, axis=1)
     nis = np.nanmean(normalised**2, axis=1)
     assert abs(nis.mean() - 1.0) < 4 * nis.std() / math.sqrt(runs)

@@ -17,7 +17,7 @@ from filtergym.baselines.maneuvering_target.estimators import (
 )
 from filtergym.baselines.tuning import mean_cost, tuned_names
 from filtergym.envs.catalogue import make_task
-from filtergym.evaluation.rollout import run_estimator
+from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
 from scipy.stats import multivariate_normal
@@ -56,12 +56,13 @@ def estimates(task, estimator, horizon=100):
             return estimator.start(initial, N)
 
         def update(self, measurement, memory):
-            *answer, memory = estimator.update(measurement, memory)
+            mean, covariance, memory, _ = estimator.update(measurement, memory)
             given.append(measurement)
-            answers.append(answer)
-            return *answer, memory
+            answers.append((mean, covariance))
+            return mean, covariance, memory
 
-    run_estimator(task, Watched(), episode_seeds("train", 3, LANES), lambda _: None, lambda _: None)
+    for _ in rollout(task, Watched(), episode_seeds("train", 3, LANES)):
+        pass
     return given[0], given[1:], *map(np.array, zip(*answers, strict=True))
 
 

@@ -7,7 +7,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.evaluation.dataset import notes_of
-from filtergym.evaluation.rollout import run_estimator
+from filtergym.evaluation.rollout import rollout
 
 from filtergym import evaluate, record
 
@@ -80,7 +80,8 @@ def test_what_is_not_received_is_nan(id, replayed):
     else:
         task = make_task(id, scenario=scenario, horizon=horizon)
     watch = Watch()
-    run_estimator(task, watch, range(4), lambda episode: None, lambda count: None)
+    for _ in rollout(task, watch, range(4)):
+        pass
     values = np.stack([getattr(m, field) for m in watch.given])
     there = np.stack([received(task, m, field) for m in watch.given])
     assert 0 < (~there).sum() < there.size

@@ -162,7 +162,7 @@ def played(task, estimator, seeds, decisions):
 
     def update(episode):
         nonlocal memory
-        mean, covariance, memory = estimator.update(episode.measurement, episode.truth, memory)
+        mean, covariance, memory, _ = estimator.update(episode.measurement, episode.truth, memory)
         states.append((episode, mean, covariance))
         return task.act(episode, zero)
 
@@ -452,7 +452,7 @@ def test_metrics_of_the_ideal_filter_and_of_a_bound(records):
     assert nees.low < 1.0 < nees.high
     of_classes = {"rmse_by_class", "calibration_ratio"}
     assert {key[1] for key in found if key[0] == "ideal"} >= of_classes
-    beliefs = {"mean_true_class_probability", "sure_and_wrong", "confidence_excess", "anis"}
+    beliefs = {"mean_true_class_probability", "sure_and_wrong", "confidence_excess"}
     assert not [key for key in found if key[0] == "ideal" and key[1] in beliefs]
     assert not [key for key in found if key[0] == "known-class-bound" and key[1] in of_classes | beliefs]
 

@@ -12,7 +12,7 @@ from filtergym.envs.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
 from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.rollout import run_bound, run_estimator, run_policy, run_reference
+from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
 from filtergym.papers.measured import Measured
@@ -69,14 +69,15 @@ def test_bound_is_the_dense_recursion():
         "manoeuvre_throughout": 0.0, "undisturbed": 0.0, "urban": False, "aperture": False,
     }  # fmt: skip
     task = make_task(ID, **keywords)
-    seen, bounds = [], []
+    seen = []
 
     class Watched(references.KnownModeBound):
         def update(self, measurement, truth, memory):
             seen.append((measurement, truth))
             return super().update(measurement, truth, memory)
 
-    run_bound(task, Watched(task), episode_seeds("test", 3, 8), bounds.append, lambda _: None)
+    run = rollout(task, Watched(task), episode_seeds("test", 3, 8))
+    bounds = [episode.filter.mean_square for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
     assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
     p, S = task.parameters, task.satellites
@@ -183,7 +184,7 @@ def test_nis_adaptive_listens_to_the_hypothesis_that_is_content():
 
 def test_stuck_check_switches_stuck_accelerometers_off():
     task = make_task(ID, "gain", rate_fault_probability=0.0, stick_probability=1.0, horizon=200)
-    states, actions = [], []
+    actions = []
 
     class Watched(policies.StuckCheck):
         def act(self, observation, state, start):
@@ -191,7 +192,7 @@ def test_stuck_check_switches_stuck_accelerometers_off():
             actions.append(action[:, 2])
             return action, state
 
-    run_policy(task, Watched(task), episode_seeds("test", 5, 8), states.append, lambda _: None)
+    states = [episode for episode, _ in rollout(task, Watched(task), episode_seeds("test", 5, 8))]
     stuck = numpy.stack([s.truth.stuck for s in states]) > 0.0
     assert stuck.any(axis=0).all()
     # A decision is told of the measurements since the last one; the first of one.
@@ -306,7 +307,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
         satellites_outage_duration=(0.5, 0.5),
     )
     estimator = estimators.HuberStuckCheck(task)
-    seen, told = [], []
+    seen = []
     predict = estimator.huber.bank.predict
 
     def watched(state, measurement):
@@ -314,7 +315,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
         return predict(state, measurement)
 
     estimator.huber.bank.predict = watched
-    run_estimator(task, estimator, episode_seeds("test", 5, 8), told.append, lambda _: None)
+    told = [episode for episode, _ in rollout(task, estimator, episode_seeds("test", 5, 8))]
     stuck = numpy.stack([episode.truth.stuck for episode in told])
     there = numpy.stack([episode.measurement.available for episode in told])
     assert (stuck.sum(axis=0) > 0).all()
@@ -392,14 +393,8 @@ def test_loss_of_track_is_found_and_timed():
 
 def test_known_mode_keeps_its_tracking_loops():
     task = make_task(ID, "evidence", "paper", leg_steps=(40, 80), horizon=120)
-    available = []
-    run_reference(
-        task,
-        references.KnownMode(task),
-        episode_seeds("test", 6, 8),
-        lambda episode: available.append(episode.measurement.available),
-        lambda _: None,
-    )
+    run = rollout(task, references.KnownMode, episode_seeds("test", 6, 8))
+    available = [episode.measurement.available for episode, _ in run]
     assert numpy.stack(available).min() == 1.0
 
 

@@ -18,7 +18,7 @@ from filtergym.envs.catalogue import make_task
 from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import Record
-from filtergym.evaluation.rollout import run_reference
+from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.statistics import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
@@ -144,7 +144,8 @@ def innovations_of_matched(
             innovation.append(there[shown] * (z[shown] - mean[i]) / numpy.sqrt(S))
             return super().update(measurement, truth, memory)
 
-    run_reference(task, Watched(task), episode_seeds("test", 0, episodes), lambda _: None, lambda _: None)
+    for _ in rollout(task, Watched(task), episode_seeds("test", 0, episodes)):
+        pass
     return numpy.stack(nis, axis=-1)[:episodes], numpy.stack(innovation, axis=-1)[:episodes]
 
 

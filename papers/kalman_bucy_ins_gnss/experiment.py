@@ -116,7 +116,7 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
     maker = problem_of(LooselyCoupledNavigation.id).competitor(name)
     task: Any = make_task(LooselyCoupledNavigation.id, maker.control, "paper", fixed_drift=DRIFT)
 
-    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
         said = episode.measurement
         shown = (episode.truth.reference, said.ins, said.fix, task.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))

@@ -150,7 +150,7 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
     task: Any = make_task(TightlyCoupledNavigation.id, "weights", scenario, **keywords)
     seeds = [seed for count in filters.values() for seed in episode_seeds("test", SEED, count)]
 
-    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
         squares, records, P = task.error(episode) ** 2, task.records(episode), task.covariance(episode)
         if isinstance(episode.filter, Estimated):
             # The reference believes the truth; nothing but apertures takes a rate away here.

@@ -76,7 +76,7 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
     task: Any = make_task("UavAutopilot", control, scenario, horizon=HORIZON, **keywords)
     shown = task.measured.index(task.output)
 
-    def fields(episode: Episode) -> dict[str, numpy.ndarray]:
+    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
         error, said = task.error(episode), task.records(episode)
         covariance = numpy.moveaxis(task.covariance(episode), -1, 0)
         whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
