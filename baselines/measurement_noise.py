@@ -3,6 +3,7 @@
 What several environments' competitors share; equation numbers are those of ``filters/noise_adaptation.py``.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 from ..filters import noise_adaptation as adaptation
@@ -61,11 +62,11 @@ class SageHusa(MeasurementNoise):
 
     Args:
         memory: measurements that count, ``1 / (1 - b)``.
-        trust: measurements that the statement counts for.
+        trust: measurements that the statement counts for; default: as many as the memory.
     """
 
-    def __init__(self, memory: float, trust: float) -> None:
-        self.forgetting, self.trust = 1.0 - 1.0 / memory, trust
+    def __init__(self, memory: float, trust: float | None = None) -> None:
+        self.forgetting, self.trust = 1.0 - 1.0 / memory, memory if trust is None else trust
 
     def start(self, stated: Array) -> adaptation.Level:
         """Level at the stated variance."""
@@ -101,6 +102,14 @@ class VariationalBayes(SageHusa):
         noise = adaptation.forget(memory, self.forgetting, available)
         noise, R = adaptation.variational_bayes(noise, update, self.iterations, available)
         return R, noise
+
+
+RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
+    "mehra": (Mehra, "by the mean square of the last innovations (Mehra 1972)"),
+    "sage-husa": (SageHusa, "by the fading mean square of the innovations (Sage and Husa 1969)"),
+    "variational-bayes": (VariationalBayes, "by variational Bayes (Särkkä and Nummenmaa 2009)"),
+}
+"""Rules by their names in tables, and how they estimate the noise."""
 
 
 def chosen(which: Array, one: Any, other: Any) -> Any:

@@ -1,10 +1,14 @@
 """What stands in an environment's table of baselines."""
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..evaluation.competitors import Policy
+import numpy
+
+from ..envs.task import Task
+from ..evaluation.competitors import ConstantPolicy, Policy
 from .alarm import Alarm
 
 if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
@@ -23,6 +27,88 @@ class Tunable:
     """The values in force without tuning."""
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]]
     """From values to keywords of the task and what makes the policy or estimator for it."""
+
+
+def tunable(
+    make: Callable[..., Any],
+    apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]] | None = None,
+    **values: tuple[float, float, float],
+) -> Tunable:
+    """Declare which keywords of a policy or an estimator are tuned.
+
+    Args:
+        make: its class, or a :class:`Variant`.
+        apply: as in :class:`Tunable`; default: every value is a keyword of ``make``. A value whose name begins with
+            ``log10_`` is the logarithm of the keyword: its size is not known beforehand.
+        **values: lower limit, value in force without tuning, upper limit.
+    """
+
+    def keywords(chosen: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+        return {}, functools.partial(make, **without_logarithms(chosen))
+
+    return Tunable(
+        getattr(make, "control", None),
+        {name: (low, high) for name, (low, _, high) in values.items()},
+        {name: start for name, (_, start, _) in values.items()},
+        apply or keywords,
+    )
+
+
+def without_logarithms(values: Mapping[str, float]) -> dict[str, float]:
+    """Return the values by their names, ``10 ** value`` for those whose names begin with ``log10_``."""
+    return {
+        name.removeprefix("log10_"): 10.0**value if name.startswith("log10_") else value
+        for name, value in values.items()
+    }
+
+
+class Variant(functools.partial[Any]):
+    """A competitor's class with some of its arguments given, and a description of its own.
+
+    It shows the attributes of the class, such as ``control`` and ``kind``.
+    """
+
+    def __new__(cls, make: Callable[..., Any], description: str = "", /, **arguments: Any) -> "Variant":
+        """Give arguments to a class.
+
+        Args:
+            make: the class.
+            description: a sentence for the page of the environment.
+            **arguments: of the class, after the task.
+        """
+        variant = super().__new__(cls, make, **arguments)
+        variant.__doc__ = description
+        return variant
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.func, name)
+
+
+class PaperAction(ConstantPolicy):
+    """The paper's algorithm as an action that never changes; subclasses name its control."""
+
+    def __init__(self, task: Task) -> None:
+        super().__init__(task)
+        self.action = task.paper_policy.action
+
+
+class ConstantMode(Policy):
+    """One of the modes, never changed.
+
+    Args:
+        task: the problem.
+        mode: its number; a negative one counts from the last.
+    """
+
+    control = "mode"
+
+    def __init__(self, task: Task, mode: int) -> None:
+        super().__init__(task)
+        self.mode = mode if mode >= 0 else len(task.modes) + mode
+
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
+        """Name the mode for every episode."""
+        return numpy.full(len(observation), self.mode), None
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,16 @@
 """Cleaning of one recorded flight: units that cannot be, positions far off the track, gaps and jumps."""
 
 import itertools
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
 from .parameters import Limits, check, frozen
 from .plausibility import check_speed, check_velocity, isolated, speeds_of
 from .trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Cleaning(NamedTuple):
@@ -40,16 +42,13 @@ COUNTED: dict[str, Any] = {
 """What is counted while a flight is cleaned, and how it is told."""
 
 
-def cleaned(
-    name: str, time: numpy.ndarray, values: Mapping[str, numpy.ndarray], limits: Cleaning
-) -> tuple[list[Trajectory], dict[str, int]]:
+def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list[Trajectory], dict[str, int]]:
     """Cut one flight into pieces.
 
     Args:
         name: of the flight.
-        time: s, ``(n,)``.
-        values: by name, ``(n,)`` each: x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
-            longitude these too; perhaps ground, whether it is on the ground.
+        rows: with the columns time (s), x, y (m) and perhaps vx, vy (m/s); where positions came as latitude and
+            longitude these too; ground, whether it is on the ground.
         limits: what it may look like.
 
     Returns:
@@ -59,40 +58,37 @@ def cleaned(
         ValueError: if it cannot be a flight, with the likely cause.
     """
     counts = dict.fromkeys(COUNTED, 0)
-    position = numpy.stack([values["x"], values["y"]], axis=1)
-    velocity = numpy.stack([values["vx"], values["vy"]], axis=1) if "vx" in values else None
 
-    repeated = numpy.zeros(len(time), dtype=bool)
-    if "latitude" in values:
+    def keep(good: Any, what: str) -> None:
+        nonlocal rows
+        counts[what] += int((~good).sum())
+        rows = rows[good]
+
+    degrees = [column for column in ("latitude", "longitude") if column in rows]
+    rates = [column for column in ("vx", "vy") if column in rows]
+    if degrees:
         # A receiver repeats the last position where it has no new one, and the altitude goes on.
-        still = [numpy.diff(values[axis], prepend=numpy.nan) == 0.0 for axis in ("latitude", "longitude")]
-        repeated = still[0] & still[1]
-
-    def keep(there: numpy.ndarray, what: str) -> None:
-        nonlocal time, position, velocity, repeated
-        counts[what] += int((~there).sum())
-        time, position, repeated = time[there], position[there], repeated[there]
-        velocity = None if velocity is None else velocity[there]
-
-    keep(~values.get("ground", numpy.zeros(len(time), dtype=bool)), "ground")
-    keep(numpy.isfinite(position).all(axis=1), "missing")
-    if velocity is not None:
-        keep(numpy.isfinite(velocity).all(axis=1), "missing")
+        rows = rows.assign(repeated=(rows[degrees].diff() == 0.0).all(axis=1))
+    keep(~rows["ground"], "ground")
+    keep(rows[["x", "y", *rates]].notna().all(axis=1), "missing")
+    time = rows["time"].to_numpy()
     steps = numpy.diff(time)
     if (steps <= 0.0).any():
         row = int((steps <= 0.0).argmax()) + 1
         raise ValueError(f"times must increase, but row {row} has {time[row]:g} s after {time[row - 1]:g} s")
-    keep(~repeated, "repeated")
-    if "latitude" in values:
-        keep(numpy.hypot(*position.T) <= limits.reach, "far")
-        if not len(time):
+    if degrees:
+        keep(~rows["repeated"], "repeated")
+        keep(numpy.hypot(rows["x"], rows["y"]) <= limits.reach, "far")
+        if rows.empty:
             raise ValueError(f"it never comes within {limits.reach / 1e3:g} km of the site")
-    if len(time) < 2:
-        raise ValueError(f"a flight needs at least two positions, got {len(time)}")
-    _check_units(time, position, velocity, limits)
+    if len(rows) < 2:
+        raise ValueError(f"a flight needs at least two positions, got {len(rows)}")
+    _check_units(*_arrays(rows), limits)
     highest = limits.speeds[1]
 
+    time, position, _ = _arrays(rows)
     keep(~isolated(time, position, lambda elapsed: highest * elapsed), "outliers")
+    time, position, velocity = _arrays(rows)
     gaps, jumps = numpy.diff(time) > limits.longest_gap, speeds_of(time, position) > highest
     counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
     ends = [0, *(numpy.flatnonzero(gaps | jumps) + 1).tolist(), len(time)]
@@ -106,6 +102,12 @@ def cleaned(
         own = name if len(parts) == 1 else f"{name} {number}/{len(long)}"
         pieces.append(Trajectory(time[part], flown, moving, own, name))
     return pieces, counts
+
+
+def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
+    """Times ``(n,)``, positions and velocities ``(n, 2)``."""
+    velocity = rows[["vx", "vy"]].to_numpy() if "vx" in rows else None
+    return rows["time"].to_numpy(), rows[["x", "y"]].to_numpy(), velocity
 
 
 FEWEST_IN_WINDOW = 5

@@ -1,4 +1,4 @@
-"""Tables of recorded flights in files, read by the names of their columns.
+"""Tables of flights and of recordings in files, read by the names of their columns.
 
 Read whole or not at all: more rows than ``MOST_ROWS`` are refused before they fill the memory.
 """
@@ -9,13 +9,11 @@ import io
 import json
 import math
 from collections.abc import Container, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy
-
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
+    import pandas
     import xarray
 
 FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz")
@@ -56,31 +54,53 @@ UNITS: Mapping[str, tuple[str, ...]] = {
 """Units that a NetCDF variable may say it has."""
 
 
-def _rows_refused(rows: int) -> ValueError:
-    return ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
+class Table(NamedTuple):
+    """What was read of a file."""
+
+    columns: "pandas.DataFrame"
+    """Those that are known, by their names in lower case; what is empty is missing."""
+    names: list[str]
+    """Of all columns that the file has."""
 
 
-def _csv(file: Path, known: Container[str]) -> dict[str, Any]:
+def _check_rows(rows: int) -> None:
+    if rows > MOST_ROWS:
+        raise ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
+
+
+def _check_names(names: list[str]) -> list[str]:
+    """Return names of columns in lower case.
+
+    Raises:
+        ValueError: if they do not tell the columns apart.
+    """
+    lower = [name.lower() for name in names]
+    twice = sorted({name for name in lower if lower.count(name) > 1})
+    if twice:
+        raise ValueError(f"it has the column {', '.join(twice)} more than once")
+    return lower
+
+
+def _csv(file: Path, known: Container[str]) -> Table:
+    import pandas
+
     with file.open(encoding="utf-8-sig", newline="") as lines:
         header = lines.readline()
         delimiter = next((d for d in ",;\t" if d in header), ",")
-        names = [name.strip().strip('"') for name in header.strip().split(delimiter)]
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(f"it has the column {', '.join(sorted(twice))} more than once")
-        wanted = [i for i, name in enumerate(names) if name.lower() in known]
-        rows: list[list[str]] = []
+        names = [name.strip() for row in csv.reader([header], delimiter=delimiter) for name in row]
+        lower = _check_names(names)
+        wanted = {name: i for i, name in enumerate(lower) if name in known}
+        rows = []
+        # Not read_csv of pandas, which fills up rows that are too short, and before its version 3.1 rounds numbers.
         for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
-            if not row:
-                continue
-            if len(row) != len(names):
+            if row and len(row) != len(names):
                 raise ValueError(f"{len(names)} column names but {len(row)} columns in row {number}")
             if number >= MOST_ROWS:
                 raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
-            rows.append([row[i] for i in wanted])
-    table: dict[str, Any] = dict.fromkeys(names)
-    table |= {names[i]: numpy.array([row[k] for row in rows], dtype=object) for k, i in enumerate(wanted)}
-    return table
+            if row:
+                rows.append([row[i] for i in wanted.values()])
+    columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
+    return Table(columns.mask(columns.eq("")), names)
 
 
 def opened_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
@@ -107,60 +127,63 @@ def opened_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
     return xarray.open_dataset(io.BytesIO(content), engine=engine, **decoding)
 
 
-def _netcdf(file: Path, known: Container[str]) -> dict[str, Any]:
+def _netcdf(file: Path, known: Container[str]) -> Table:
+    import pandas
+
     with opened_netcdf(file, decode_timedelta=False) as data:
-        table: dict[str, Any] = dict.fromkeys(map(str, data.variables))
-        for name in table:
-            if name.lower() not in known:
+        names = list(map(str, data.variables))
+        columns: dict[str, Any] = {}
+        for name, lower in zip(names, _check_names(names), strict=True):
+            if lower not in known:
                 continue
-            meant = _WANTED.get(name.lower(), "")
-            if data[name].size > MOST_ROWS:
-                raise _rows_refused(data[name].size)
-            unit = str(data[name].attrs.get("units", ""))
-            if unit and meant in UNITS and unit not in UNITS[meant]:
-                raise ValueError(f"{name} is in {unit!r}, and {UNITS[meant][0]!r} is expected")
-            table[name] = data[name].values
-    return table
+            _check_rows(data[name].size)
+            unit, meant = str(data[name].attrs.get("units", "")), UNITS.get(_WANTED.get(lower, ""))
+            if unit and meant and unit not in meant:
+                raise ValueError(f"{name} is in {unit!r}, and {meant[0]!r} is expected")
+            values = data[name].values
+            first = next(iter(columns.values()), values)
+            if values.ndim != 1 or values.shape != first.shape:
+                raise ValueError(
+                    f"{name} must be one row of numbers, as many as of time, got shape {values.shape}"
+                )
+            columns[lower] = values.astype(values.dtype.newbyteorder("="))
+    return Table(pandas.DataFrame(columns), names)
 
 
-def _parquet(file: Path, known: Container[str]) -> dict[str, Any]:
+def _parquet(file: Path, known: Container[str]) -> Table:
     try:
         from pyarrow import parquet
     except ImportError as error:
         raise ValueError("Parquet needs one more package: pip install 'filtergym[flights]'") from error
     with parquet.ParquetFile(file) as data:
-        table: dict[str, Any] = dict.fromkeys(data.schema_arrow.names)
-        if data.metadata.num_rows > MOST_ROWS:
-            raise _rows_refused(data.metadata.num_rows)
-        wanted = [name for name in table if name.lower() in known]
-        found = data.read(columns=wanted)
-    return table | {name: found.column(name).to_numpy() for name in wanted}
+        names = list(data.schema_arrow.names)
+        _check_rows(data.metadata.num_rows)
+        wanted = [name for name, lower in zip(names, _check_names(names), strict=True) if lower in known]
+        # What the file says of pandas could make an index of a column.
+        columns = data.read(columns=wanted).to_pandas(ignore_metadata=True)
+    return Table(columns.rename(columns=str.lower), names)
 
 
-def _json(file: Path, known: Container[str]) -> dict[str, Any]:
+def _json(file: Path, known: Container[str]) -> Table:
+    import pandas
+
     with gzip.open(file) if file.suffix == ".gz" else file.open("rb") as content:
         text = content.read(MOST_BYTES + 1)
     if len(text) > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     rows = json.loads(text)
-    if isinstance(rows, dict) and all(isinstance(column, dict) for column in rows.values()):
-        # By columns, each with the numbers of its rows.
-        rows = [
-            dict(zip(rows, row, strict=True))
-            for row in zip(*(c.values() for c in rows.values()), strict=True)
-        ]
-    if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
+    # A list of rows, or columns, each with the numbers of its rows.
+    parts = list(rows.values()) if isinstance(rows, dict) else rows
+    if not isinstance(rows, list | dict) or not rows or not all(isinstance(part, dict) for part in parts):
         raise ValueError("JSON of flights is a list of rows, each with the names of its columns")
-    if len(rows) > MOST_ROWS:
-        raise _rows_refused(len(rows))
-    table: dict[str, Any] = dict.fromkeys(name for row in rows for name in row)
-    for name in table:
-        if name.lower() in known:
-            table[name] = numpy.array([row.get(name) for row in rows], dtype=object)
-    return table
+    _check_rows(len(rows) if isinstance(rows, list) else max(map(len, parts)))
+    found = pandas.DataFrame(rows).reset_index(drop=True)
+    names = list(map(str, found.columns))
+    found.columns = pandas.Index(_check_names(names))
+    return Table(found[[name for name in found if name in known]], names)
 
 
-_TABLES = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
+_READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
 _WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
 
 
@@ -169,8 +192,8 @@ def suffix_of(file: Path) -> str:
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
-def read_table(file: Path, known: Container[str] | None = None) -> dict[str, Any]:
-    """Return all columns of a file by their names; those that are not known are None.
+def read_table(file: Path, known: Container[str] = _WANTED) -> Table:
+    """Read the known columns of a file.
 
     Args:
         file: of one of ``FLIGHT_SUFFIXES``.
@@ -184,70 +207,63 @@ def read_table(file: Path, known: Container[str] | None = None) -> dict[str, Any
             raise ValueError(f"files of flights end in {', '.join(FLIGHT_SUFFIXES)}")
         if file.stat().st_size > MOST_BYTES:
             raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
-        return _TABLES[suffix_of(file)](file, _WANTED if known is None else known)
+        return _READERS[suffix_of(file)](file, known)
     except UnicodeDecodeError as error:
         raise ValueError("it is no text in UTF-8") from error
     except Exception as error:  # readers raise whatever a broken file makes them stumble over
         raise ValueError(str(error) or type(error).__name__) from error
 
 
-def known_columns(table: Mapping[str, Any]) -> tuple[dict[str, numpy.ndarray], bool]:
-    """Columns by what they are, and whether altitudes are feet."""
-    lower = {name.lower(): name for name in table}
-    columns = {}
-    for known, aliases in COLUMNS.items():
-        name = next((lower[alias] for alias in aliases if alias in lower), None)
-        if name is not None:
-            columns[known] = table[name]
-    position = [("x", "y"), ("latitude", "longitude")]
+def flight_columns(table: Table) -> tuple["pandas.DataFrame", bool]:
+    """Return the columns of a flight by what they are, and whether altitudes are feet.
+
+    Raises:
+        ValueError: if one is missing.
+    """
+    found = {
+        alias: name
+        for name, aliases in COLUMNS.items()
+        for alias in [next((alias for alias in aliases if alias in table.columns), None)]
+        if alias is not None
+    }
+    columns = table.columns[list(found)].rename(columns=found)
     missing = [] if "time" in columns else ["time"]
-    if not any(set(pair) <= columns.keys() for pair in position):
-        geodetic = {"latitude", "longitude"} & columns.keys()
+    position = [("x", "y"), ("latitude", "longitude")]
+    if not any({*pair} <= {*columns} for pair in position):
+        geodetic = {"latitude", "longitude"} & {*columns}
         missing += [name for name in position[bool(geodetic)] if name not in columns]
     if missing:
         raise ValueError(
-            f"it lacks the column {', '.join(missing)}; it has {', '.join(table)} and needs time, x, y (m) and "
+            f"it lacks the column {', '.join(missing)}; it has {', '.join(table.names)} and needs time, x, y (m) and "
             "optionally vx, vy (m/s), or time, latitude, longitude (degrees)"
         )
-    return columns, "groundspeed" in lower
+    return columns, "groundspeed" in map(str.lower, table.names)
 
 
-def numbers(name: str, values: Any) -> numpy.ndarray:
-    """Column of numbers; what is empty is NaN.
+def numbers(name: str, values: "pandas.Series") -> "pandas.Series":
+    """Return a column as numbers; what is empty is NaN.
 
     Raises:
         ValueError: for words.
     """
-    array = numpy.asarray(values)
-    if array.ndim != 1:
-        raise ValueError(f"{name} must be one row of numbers, got shape {array.shape}")
-    if array.dtype.kind in "mM":
-        raise ValueError(f"{name} must be numbers, got {array.dtype}")
-    if array.dtype == object:
-        try:
-            return numpy.array([math.nan if v is None or v == "" else float(v) for v in array.tolist()])
-        except (ValueError, TypeError):
-            row = next(i for i, v in enumerate(array.tolist()) if not _is_number(v))
-            raise ValueError(f"{name} has {array[row]!r} in row {row}, which is no number") from None
-    return array.astype(float)
+    import pandas
 
-
-def _is_number(value: Any) -> bool:
+    if pandas.api.types.is_numeric_dtype(values):
+        return values.astype(float)
+    cells = values.astype(object).where(values.notna() & values.ne(""), math.nan)
     try:
-        float(value or math.nan)
+        return cells.map(float)
     except (ValueError, TypeError):
-        return False
-    return True
+        row = (pandas.to_numeric(cells, errors="coerce").isna() & cells.notna()).idxmax()
+        raise ValueError(f"{name} has {cells[row]!r} in row {row}, which is no number") from None
 
 
-def on_ground(values: Any) -> numpy.ndarray:
-    """Whether each row says that the aircraft is on the ground; what says nothing is in the air."""
-    return numpy.array(
-        [str(value).strip().lower() in ("true", "1", "1.0") for value in numpy.asarray(values).tolist()]
-    )
+def is_true(values: "pandas.Series") -> "pandas.Series":
+    """Return which rows say that something is true, in words or as a number; what says nothing does not."""
+    return values.astype(str).str.strip().str.lower().isin(["true", "1", "1.0"])
 
 
-def seconds(values: Any) -> numpy.ndarray:
+def seconds(values: "pandas.Series") -> "pandas.Series":
     """Times in seconds: numbers as they are, dates since the first of them.
 
     Numbers too large for seconds since 1970 are milli-, micro- or nanoseconds since then.
@@ -255,25 +271,32 @@ def seconds(values: Any) -> numpy.ndarray:
     Raises:
         ValueError: for what is neither.
     """
-    array = numpy.asarray(values)
-    if array.dtype == object and len(array) and isinstance(array[0], str) and not _is_number(array[0]):
-        dates = []
-        for row, text in enumerate(array.tolist()):
-            try:
-                date = datetime.fromisoformat(text.strip())
-            except (ValueError, AttributeError):
-                raise ValueError(
-                    f"time has {text!r} in row {row}, which is neither seconds nor a date such as 2026-05-01T12:00:00Z"
-                ) from None
-            dates.append(date.replace(tzinfo=UTC) if date.tzinfo is None else date)
-        return numpy.array([(date - dates[0]).total_seconds() for date in dates])
-    if array.dtype.kind in "mM" and array.ndim == 1:
-        missing = numpy.isnat(array)
-        if missing.any():
-            raise ValueError(f"time has no value in row {int(missing.argmax())}")
-        return (array - array[:1]) / numpy.timedelta64(1, "s")
-    found = numbers("time", array)
-    first = found[0] if len(found) else 0.0
+    import pandas
+
+    types, given = pandas.api.types, values.dropna()
+    if len(given) and isinstance(given.iloc[0], str) and not _is_number(given.iloc[0]):
+        dates = pandas.to_datetime(values.str.strip(), utc=True, format="ISO8601", errors="coerce")
+        if dates.isna().any():
+            row = dates.isna().idxmax()
+            raise ValueError(
+                f"time has {values[row]!r} in row {row}, which is neither seconds nor a date such as "
+                "2026-05-01T12:00:00Z"
+            )
+        values = dates
+    if types.is_datetime64_any_dtype(values) or types.is_timedelta64_dtype(values):
+        if values.isna().any():
+            raise ValueError(f"time has no value in row {values.isna().idxmax()}")
+        return (values - values.iloc[0]).dt.total_seconds() if len(values) else values.astype(float)
+    found = numbers("time", values)
+    first = found.iloc[0] if len(found) else 0.0
     # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
     unit = next((unit for unit in (1e9, 1e6, 1e3) if first > 1e8 * unit), 1.0)
     return found if unit == 1.0 else (found - first) / unit
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text or math.nan)
+    except ValueError:
+        return False
+    return True

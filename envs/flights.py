@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
@@ -25,9 +25,9 @@ from .flight_cleaning import COUNTED, Cleaning, cleaned
 from .flight_tables import (
     FLIGHT_SUFFIXES,
     FOOT,
-    known_columns,
+    flight_columns,
+    is_true,
     numbers,
-    on_ground,
     read_table,
     seconds,
     suffix_of,
@@ -35,6 +35,9 @@ from .flight_tables import (
 from .parameters import Limits, check
 from .plausibility import check_degrees
 from .trajectory import Trajectory, trajectory_of
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Source(NamedTuple):
@@ -354,53 +357,48 @@ def _read(file: Path, label: str, limits: Cleaning, at_median: bool) -> list[Sou
     except ValueError as error:
         raise ValueError(f"cannot read trajectory {file}: {error}") from error
     try:
-        columns, feet = known_columns(table)
+        columns, feet = flight_columns(table)
         return _flights_of(file, label, columns, feet, limits, at_median)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(f"trajectory {file}: {error}") from error
 
 
 def _flights_of(
-    file: Path, label: str, columns: Mapping[str, Any], feet: bool, limits: Cleaning, at_median: bool
+    file: Path, label: str, columns: "pandas.DataFrame", feet: bool, limits: Cleaning, at_median: bool
 ) -> list[Source]:
-    time = seconds(columns["time"])
     plane = "x" in columns and "y" in columns and not (limits.site and "latitude" in columns)
-    pair = ("x", "y") if plane else ("latitude", "longitude")
-    values = {name: numbers(name, columns[name]) for name in pair}
-    velocity = plane and {"vx", "vy"} <= columns.keys()
-    if velocity:
-        values |= {name: numbers(name, columns[name]) for name in ("vx", "vy")}
+    names = ["x", "y"] if plane else ["latitude", "longitude"]
+    if plane and {"vx", "vy"} <= {*columns}:
+        names += ["vx", "vy"]
     if not plane and "altitude" in columns:
-        values["altitude"] = numbers("altitude", columns["altitude"]) * (FOOT if feet else 1.0)
-    for name, array in values.items():
-        if array.shape != time.shape:
-            raise ValueError(f"{name} must have shape {time.shape} as time has, got {array.shape}")
-        if numpy.isinf(array).any():
-            raise ValueError(
-                f"{name} has a value that is not finite in row {int(numpy.isinf(array).argmax())}"
-            )
-    if not numpy.isfinite(time).all():
-        raise ValueError(
-            f"time has a value that is not finite in row {int((~numpy.isfinite(time)).argmax())}"
-        )
+        names.append("altitude")
+    rows = columns[["time", *names]].copy()
+    rows["time"] = seconds(columns["time"])
+    for name in names:
+        rows[name] = numbers(name, columns[name])
+    for name in names if feet else ():
+        rows[name] *= FOOT if name == "altitude" else 1.0
+    for name in rows:
+        wrong = rows[name].isin([numpy.inf, -numpy.inf]) | (rows[name].isna() & (name == "time"))
+        if wrong.any():
+            raise ValueError(f"{name} has a value that is not finite in row {wrong.idxmax()}")
     placed = ""
     if not plane:
         if limits.site is None and at_median:
-            limits = limits._replace(site=_median_site(values))
+            limits = limits._replace(site=_median_site(rows))
             placed = "radar at {:.2f}, {:.2f}".format(*limits.site or ())
-        _check_degrees(limits.site, values)
-    ground = on_ground(columns["ground"]) if "ground" in columns else numpy.zeros(len(time), dtype=bool)
-    groups = _groups(columns.get("flight"), time)
+        _check_degrees(limits.site, rows)
+    rows["ground"] = is_true(columns["ground"]) if "ground" in columns else False
     good: list[Trajectory] = []
     counts = dict.fromkeys(COUNTED, 0)
     bad: list[Source] = []
-    for flight, rows in groups.items():
+    groups = _by_flight(rows, columns.get("flight"))
+    for flight, own in groups.items():
         name = f"{label}:{flight}" if flight else label
         try:
-            own = {column: array[rows] for column, array in values.items()}
             if not plane and limits.site:
                 own = _around(limits.site, own)
-            pieces, found = cleaned(name, time[rows], own | {"ground": ground[rows]}, limits)
+            pieces, found = cleaned(name, own, limits)
         except ValueError as error:
             if len(groups) == 1:
                 raise
@@ -423,31 +421,27 @@ def _flights_of(
     return [Source(file.name, tuple(good), tuple(said)), *bad]
 
 
-def _median_site(values: Mapping[str, numpy.ndarray]) -> tuple[float, float]:
+def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:
     """Latitude and longitude in the middle of all positions, to a hundredth of a degree."""
-    return tuple(round(float(numpy.nanmedian(values[name])), 2) for name in ("latitude", "longitude"))  # type: ignore[return-value]
+    latitude, longitude = (round(float(rows[name].median()), 2) for name in ("latitude", "longitude"))
+    return latitude, longitude
 
 
-def _groups(flight: Any, time: numpy.ndarray) -> dict[str, Any]:
+def _by_flight(rows: "pandas.DataFrame", flight: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
     """Rows of every flight of a file, by its name, in the order of their times; one without a name, and as they stand,
     where the file names none.
     """
     if flight is None:
-        return {"": slice(None)}
-    names = numpy.array(
-        [str(value).strip() if value is not None else "" for value in numpy.asarray(flight).tolist()]
-    )
-    different, which = numpy.unique(names, return_inverse=True)
-    order = numpy.lexsort((time, which))
-    ends = numpy.cumsum(numpy.bincount(which))[:-1]
-    names_of = different.tolist() if len(different) > 1 else [""]
-    return dict(zip(names_of, numpy.split(order, ends), strict=True))
+        return {"": rows}
+    names = flight.astype(object).where(flight.notna(), "").astype(str).str.strip()
+    groups = {str(name): own for name, own in rows.sort_values("time", kind="stable").groupby(names)}
+    return groups if len(groups) > 1 else dict.fromkeys([""], *groups.values())
 
 
-def _check_degrees(site: tuple[float, float] | None, values: Mapping[str, numpy.ndarray]) -> None:
+def _check_degrees(site: tuple[float, float] | None, rows: "pandas.DataFrame") -> None:
     """Raise ValueError without a site, and for what are no degrees."""
     for name, most in (("latitude", 90.0), ("longitude", 360.0)):
-        check_degrees(name, values[name], most)
+        check_degrees(name, rows[name].to_numpy(), most)
     if site is None:
         raise ValueError(
             "it has latitude and longitude: give the radar's, --site LATITUDE,LONGITUDE, or in Python "
@@ -455,15 +449,13 @@ def _check_degrees(site: tuple[float, float] | None, values: Mapping[str, numpy.
         )
 
 
-def _around(site: tuple[float, float], values: Mapping[str, numpy.ndarray]) -> dict[str, numpy.ndarray]:
+def _around(site: tuple[float, float], rows: "pandas.DataFrame") -> "pandas.DataFrame":
     """Add metres east and north of a site to the degrees of one flight."""
-    latitude, longitude = numpy.radians(values["latitude"]), numpy.radians(values["longitude"])
-    altitude = values.get("altitude", numpy.zeros_like(latitude))
-    known = numpy.isfinite(altitude)
-    if not known.all():
+    latitude, longitude = (numpy.radians(rows[name].to_numpy()) for name in ("latitude", "longitude"))
+    altitude = numpy.zeros_like(latitude)
+    if "altitude" in rows:
         # A few rows lack it, and a kilometre of height moves a target by 0.016 % of its range.
-        rows = numpy.arange(len(altitude))
-        altitude = numpy.interp(rows, rows[known], altitude[known]) if known.any() else 0.0 * latitude
-    origin = (math.radians(site[0]), math.radians(site[1]))
-    plane = zip("xy", east_north(latitude, longitude, altitude, origin), strict=True)
-    return {**dict(plane), "latitude": latitude, "longitude": longitude}
+        filled = rows["altitude"].reset_index(drop=True).interpolate(limit_direction="both")
+        altitude = filled.fillna(0.0).to_numpy()
+    x, y = east_north(latitude, longitude, altitude, (math.radians(site[0]), math.radians(site[1])))
+    return rows.assign(x=x, y=y)

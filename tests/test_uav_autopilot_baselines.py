@@ -8,7 +8,7 @@ import numpy
 import pytest
 import xarray
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.measurement_noise import MeasurementNoise, VariationalBayes
+from filtergym.baselines.measurement_noise import VariationalBayes
 from filtergym.baselines.uav_autopilot import policies as module
 from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInteractingMultipleModel
 from filtergym.baselines.uav_autopilot.metrics import METRICS
@@ -456,7 +456,7 @@ def test_theory_spectra_integrate_to_the_variances(plant: str) -> None:
 def test_with_noise_as_stated_an_adaptive_filter_is_the_papers(plant):
     makers: dict[str, Any] = {
         "kalman": "kalman",
-        "own": lambda task: AdaptiveKalman(task, MeasurementNoise()),
+        "own": AdaptiveKalman,
     }
     makers["own"].kind = "estimator"
     error = evaluate(ID, makers, "random", 8, plant=plant)["error"]
@@ -470,7 +470,7 @@ def test_an_imm_over_equal_gusts_is_one_filter(plant):
         return GustInteractingMultipleModel(task, memory=50.0, low=1.0, high=1.0)
 
     def one(task: Any) -> AdaptiveKalman:
-        return AdaptiveKalman(task, VariationalBayes(50.0, 50.0))
+        return AdaptiveKalman(task, VariationalBayes, memory=50.0)
 
     equal.kind = one.kind = "estimator"  # type: ignore[attr-defined]
     error = evaluate(ID, {"imm": equal, "one": one}, "random", 8, plant=plant)["error"]

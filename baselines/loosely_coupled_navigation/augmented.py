@@ -13,10 +13,31 @@ from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigati
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import Array, namespace
 from ...filters.ordered_sums import ordered_sum
-from ..measurement_noise import MeasurementNoise, chosen
+from ..measurement_noise import RULES, MeasurementNoise, chosen
+from ..table import Tunable, Variant, tunable
 
 WINDOW = 25.0
 """Measurements of a window without tuning: 0.25 s, the time constant of the averages that are shown."""
+
+_FADING = {"memory": (5.0, WINDOW, 200.0), "trust": (1.0, WINDOW, 200.0)}
+LIMITS = {"mehra": {"window": (5.0, WINDOW, 150.0)}, "sage-husa": _FADING, "variational-bayes": _FADING}
+"""Of the arguments of each rule: the least, those without tuning, the largest."""
+
+
+def with_rules(host: type, name: str, description: str) -> tuple[dict[str, Variant], dict[str, Tunable]]:
+    """Return a policy or an estimator with each rule for the receiver's noise, and what is tuned in it, by name.
+
+    Args:
+        host: its class, which takes the task, a rule, and the arguments of the rule.
+        name: of the host, to which that of the rule is added.
+        description: of the host, to which that of the rule is added.
+    """
+    variants, tunables = {}, {}
+    for rule, (cls, words) in RULES.items():
+        untuned = {value: start for value, (_, start, _) in LIMITS[rule].items()}
+        variants[f"{name}-{rule}"] = Variant(host, f"{description} {words}.", rule=cls, **untuned)
+        tunables[f"{name}-{rule}"] = tunable(variants[f"{name}-{rule}"], **LIMITS[rule])
+    return variants, tunables
 
 
 class AugmentedMemory(NamedTuple):

@@ -11,8 +11,8 @@ from ...envs.loosely_coupled_navigation.world import Measurement
 from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters.ordered_sums import ordered_sum
-from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
-from .augmented import WINDOW, AugmentedFilter, AugmentedMemory
+from ..measurement_noise import MeasurementNoise
+from .augmented import AugmentedFilter, AugmentedMemory
 
 
 class Navigator(NamedTuple):
@@ -45,8 +45,10 @@ class AugmentedEstimator:
     kind = "estimator"
     traceable = True
 
-    def __init__(self, task: LooselyCoupledNavigation, noise: MeasurementNoise | None = None) -> None:
-        self.filter = AugmentedFilter(task.parameters, MeasurementNoise() if noise is None else noise)
+    def __init__(
+        self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
+    ) -> None:
+        self.filter = AugmentedFilter(task.parameters, rule(**values))
         self.xp = task.xp
         self.eye = task.constant(numpy.eye(task.parameters.axes))[:, :, None]
 
@@ -68,24 +70,3 @@ class AugmentedEstimator:
             innovation, predicted.covariance.position + rates.variance, measurement.available, self.xp
         )
         return position, self.eye * rates.covariance.position, Navigator(position, rates), likelihood
-
-
-class AugmentedMehra(AugmentedEstimator):
-    """The augmented filter, receiver noise by the mean square of the last innovations (Mehra 1972)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, window: float = WINDOW) -> None:
-        super().__init__(task, Mehra(window))
-
-
-class AugmentedSageHusa(AugmentedEstimator):
-    """The augmented filter, receiver noise by the fading mean square of the innovations (Sage and Husa 1969)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
-        super().__init__(task, SageHusa(memory, trust))
-
-
-class AugmentedVariationalBayes(AugmentedEstimator):
-    """The augmented filter, receiver noise by variational Bayes (Särkkä and Nummenmaa 2009)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
-        super().__init__(task, VariationalBayes(memory, trust))

@@ -4,14 +4,13 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
 
 import math
-from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
 from ...envs.catalogue import task_class
-from ...envs.loosely_coupled_navigation.banks import GainBank
+from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
 from ...envs.task import Task
 from ...evaluation.bootstrap import Bootstrap, ratio
@@ -20,11 +19,11 @@ from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, sums_of_present
 from ...evaluation.own_metrics import Gathered, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
-from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes, chosen
-from ..table import Baselines, Tunable
+from ..measurement_noise import MeasurementNoise, chosen
+from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
-from .augmented import WINDOW, AugmentedFilter, AugmentedMemory
-from .estimators import AugmentedMehra, AugmentedSageHusa, AugmentedVariationalBayes
+from .augmented import AugmentedFilter, AugmentedMemory, with_rules
+from .estimators import AugmentedEstimator
 from .references import Matched, MatchedCovariance
 
 
@@ -47,18 +46,10 @@ class FixedGain(ConstantPolicy):
         self.action = (float(gain_bank(task).action_for_gain(gain)),) * task.parameters.axes
 
 
-class InsOnly(FixedGain):
-    """The INS alone: no measurement is used."""
+class PlainReduced(PaperAction):
+    """The paper's scheme: settled gain with the coloured part reduced to white noise."""
 
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task, 0.0)
-
-
-class GnssOnly(FixedGain):
-    """The receiver alone: the estimate is the measurement, and the INS increment where there is none."""
-
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task, 1.0)
+    control = "gain"
 
 
 class PlainWhite(FixedGain):
@@ -66,16 +57,6 @@ class PlainWhite(FixedGain):
 
     def __init__(self, task: LooselyCoupledNavigation) -> None:
         super().__init__(task, task.parameters.settled_gains[0])
-
-
-class PlainReduced(ConstantPolicy):
-    """The paper's scheme: settled gain with the coloured part reduced to white noise."""
-
-    control = "gain"
-
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task)
-        self.action = task.paper_policy.action
 
 
 class BestConstant(FixedGain):
@@ -207,9 +188,11 @@ class AugmentedGain(TimeVarying):
     So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
     """
 
-    def __init__(self, task: LooselyCoupledNavigation, noise: MeasurementNoise | None = None) -> None:
+    def __init__(
+        self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
+    ) -> None:
         super().__init__(task)
-        self.filter = AugmentedFilter(task.parameters, MeasurementNoise() if noise is None else noise)
+        self.filter = AugmentedFilter(task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
@@ -232,40 +215,6 @@ class AugmentedGain(TimeVarying):
         gain = numpy.clip(gain, 0.0, 1.0)
         gain = numpy.where(gain <= p.smallest_gain, 0.0, gain)
         return gain_bank(self.task).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
-
-
-class AugmentedGainMehra(AugmentedGain):
-    """`augmented-gain` with the receiver's noise by the mean square of the last innovations (Mehra 1972)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, window: float = WINDOW) -> None:
-        super().__init__(task, Mehra(window))
-
-
-class AugmentedGainSageHusa(AugmentedGain):
-    """`augmented-gain` with the receiver's noise by their fading mean square (Sage and Husa 1969)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
-        super().__init__(task, SageHusa(memory, trust))
-
-
-class AugmentedGainVariationalBayes(AugmentedGain):
-    """`augmented-gain` with the receiver's noise by variational Bayes (Särkkä and Nummenmaa 2009)."""
-
-    def __init__(self, task: LooselyCoupledNavigation, memory: float = WINDOW, trust: float = WINDOW) -> None:
-        super().__init__(task, VariationalBayes(memory, trust))
-
-
-# --- the bank
-
-
-class Augmented(Policy):
-    """Believe the augmented error-state filter, which also estimates the constant and coloured rate errors."""
-
-    control = "mode"
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the third filter of the bank."""
-        return numpy.full(len(observation), 2), None
 
 
 # --- metrics of one's own
@@ -339,56 +288,20 @@ def _outage_measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarra
 # --- what can be tuned
 
 
-def _intensity_tuned(
-    make: Callable[[Any, float, Mapping[str, float]], Policy],
-) -> Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]:
-    def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-        return {}, lambda task: make(task, 10.0 ** values["log10_intensity"], values)
-
-    return apply
-
-
-_INTENSITY_LIMITS = (-2.0, 1.0)
-_INTENSITY_START = math.log10(0.36)
-_WINDOW = {"window": (5.0, 150.0)}
-_FADING = {"memory": (5.0, 200.0), "trust": (1.0, 200.0)}
-
-
-def _noise_tuned(control: str | None, make: Callable[..., Any], limits: Mapping[str, Any]) -> Tunable:
-    """Make a rule for the receiver's noise tunable, of a policy or an estimator."""
-    return Tunable(
-        control,
-        limits,
-        dict.fromkeys(limits, WINDOW),
-        lambda values: ({}, lambda task: make(task, **values)),
-    )
-
+POLICIES_BY_RULE, TUNABLE_POLICIES = with_rules(
+    AugmentedGain, "augmented-gain", "`augmented-gain` with the receiver's noise"
+)
+ESTIMATORS, TUNABLE_ESTIMATORS = with_rules(
+    AugmentedEstimator, "augmented", "The augmented filter, receiver noise"
+)
+_INTENSITY = (-2.0, math.log10(0.36), 1.0)
 
 TUNABLE = {
-    "best-constant": Tunable(
-        "gain",
-        {"log10_gain": (-3.0, -0.5)},
-        {"log10_gain": math.log10(0.0462)},
-        lambda values: ({}, lambda task: BestConstant(task, 10.0 ** values["log10_gain"])),
-    ),
-    "time-varying": Tunable(
-        "gain",
-        {"log10_intensity": _INTENSITY_LIMITS},
-        {"log10_intensity": _INTENSITY_START},
-        _intensity_tuned(lambda task, intensity, _: TimeVarying(task, intensity)),
-    ),
-    "innovation-adaptive": Tunable(
-        "gain",
-        {"log10_intensity": _INTENSITY_LIMITS, "window": (0.05, 2.0)},
-        {"log10_intensity": _INTENSITY_START, "window": 0.25},
-        _intensity_tuned(lambda task, intensity, v: InnovationAdaptive(task, intensity, v["window"])),
-    ),
-    "augmented-gain-mehra": _noise_tuned("gain", AugmentedGainMehra, _WINDOW),
-    "augmented-gain-sage-husa": _noise_tuned("gain", AugmentedGainSageHusa, _FADING),
-    "augmented-gain-variational-bayes": _noise_tuned("gain", AugmentedGainVariationalBayes, _FADING),
-    "augmented-mehra": _noise_tuned(None, AugmentedMehra, _WINDOW),
-    "augmented-sage-husa": _noise_tuned(None, AugmentedSageHusa, _FADING),
-    "augmented-variational-bayes": _noise_tuned(None, AugmentedVariationalBayes, _FADING),
+    "best-constant": tunable(BestConstant, log10_gain=(-3.0, math.log10(0.0462), -0.5)),
+    "time-varying": tunable(TimeVarying, log10_intensity=_INTENSITY),
+    "innovation-adaptive": tunable(InnovationAdaptive, log10_intensity=_INTENSITY, window=(0.05, 0.25, 2.0)),
+    **TUNABLE_POLICIES,
+    **TUNABLE_ESTIMATORS,
 }
 
 BASELINES = Baselines(
@@ -401,19 +314,21 @@ BASELINES = Baselines(
         "time-varying-white": TimeVaryingWhite,
         "innovation-adaptive": InnovationAdaptive,
         "augmented-gain": AugmentedGain,
-        "augmented-gain-mehra": AugmentedGainMehra,
-        "augmented-gain-sage-husa": AugmentedGainSageHusa,
-        "augmented-gain-variational-bayes": AugmentedGainVariationalBayes,
-        "augmented": Augmented,
-        "ins-only": InsOnly,
-        "gnss-only": GnssOnly,
+        **POLICIES_BY_RULE,
+        "augmented": Variant(
+            ConstantMode,
+            "Believe the augmented error-state filter, which also estimates the constant and coloured rate errors.",
+            mode=SCHEMES.index("augmented"),
+        ),
+        "ins-only": Variant(FixedGain, "The INS alone: no measurement is used.", gain=0.0),
+        "gnss-only": Variant(
+            FixedGain,
+            "The receiver alone: the estimate is the measurement, and the INS increment where there is none.",
+            gain=1.0,
+        ),
         "random": RandomPolicy,
     },
-    estimators={
-        "augmented-mehra": AugmentedMehra,
-        "augmented-sage-husa": AugmentedSageHusa,
-        "augmented-variational-bayes": AugmentedVariationalBayes,
-    },
+    estimators=ESTIMATORS,
     references={"matched": Matched},
     bounds={"matched-covariance": MatchedCovariance},
     score_paper="plain-reduced",

@@ -14,7 +14,7 @@ from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
-from ..table import Baselines, Tunable
+from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm
 from .references import KnownInputBound, KnownTurn
 from .tunable_estimators import ESTIMATORS
@@ -56,14 +56,10 @@ class HardInteractingMultipleModel(InteractingMultipleModel):
         return numpy.argmax(self.probabilities(observation), axis=1), None
 
 
-class ZeroEvidence(ConstantPolicy):
+class ZeroEvidence(PaperAction):
     """Nothing added to Bayes' rule: the paper's IMM, inside the task."""
 
     control = "evidence"
-
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.action = task.paper_policy.action
 
 
 def gain_bank(task: Task) -> GainBank:
@@ -150,46 +146,27 @@ def _tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[A
     return {"gains": _gains(values), "transition": transition}, InteractingMultipleModel
 
 
-def _tuned_adaptive(cls: type[AdaptiveGain]) -> Callable[[Mapping[str, float]], Any]:
+def _tunable_adaptive(cls: type[AdaptiveGain]) -> Tunable:
     def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-        def make(task: ManeuveringTarget) -> Policy:
-            return cls(task, 10.0 ** values["log10_false_alarm"], values["ramp_scans"])
+        false_alarm, ramp = 10.0 ** values["log10_false_alarm"], values["ramp_scans"]
+        return {"gains": _gains(values)}, lambda task: cls(task, false_alarm, ramp)
 
-        return {"gains": _gains(values)}, make
-
-    return apply
+    return tunable(cls, apply, **_GAINS, log10_false_alarm=(-5.0, -3.0, -0.5), ramp_scans=(1.0, 7.0, 20.0))
 
 
-_GAIN_LIMITS = {"low": (0.05, 0.5), "high": (0.4, 0.95)}
-_GAIN_START = {"low": 0.3, "high": 0.7}
-_RAMP_LIMITS = {"log10_false_alarm": (-5.0, -0.5), "ramp_scans": (1.0, 20.0)}
-_RAMP_START = {"log10_false_alarm": -3.0, "ramp_scans": 7.0}
+_GAINS = {"low": (0.05, 0.3, 0.5), "high": (0.4, 0.7, 0.95)}
 
 TUNABLE = {
-    "imm": Tunable(
-        "weights",
-        {**_GAIN_LIMITS, "stay_low": (0.5, 0.999), "stay_high": (0.3, 0.999)},
-        {**_GAIN_START, "stay_low": 0.9, "stay_high": 0.9},
+    "imm": tunable(
+        InteractingMultipleModel,
         _tuned_imm,
+        **_GAINS,
+        stay_low=(0.5, 0.9, 0.999),
+        stay_high=(0.3, 0.9, 0.999),
     ),
-    "adaptive": Tunable(
-        "gain",
-        {**_GAIN_LIMITS, **_RAMP_LIMITS},
-        {**_GAIN_START, **_RAMP_START},
-        _tuned_adaptive(AdaptiveGain),
-    ),
-    "adaptive-rearm": Tunable(
-        "gain",
-        {**_GAIN_LIMITS, **_RAMP_LIMITS},
-        {**_GAIN_START, **_RAMP_START},
-        _tuned_adaptive(RearmingAdaptiveGain),
-    ),
-    "fixed-best": Tunable(
-        "gain",
-        {"alpha": (0.05, 0.95)},
-        {"alpha": 0.65},
-        lambda values: ({}, lambda task: FixedBest(task, values["alpha"])),
-    ),
+    "adaptive": _tunable_adaptive(AdaptiveGain),
+    "adaptive-rearm": _tunable_adaptive(RearmingAdaptiveGain),
+    "fixed-best": tunable(FixedBest, alpha=(0.05, 0.65, 0.95)),
     **TUNABLE_ESTIMATORS,
 }
 

@@ -3,11 +3,11 @@
 Deviations and small probabilities are searched by their logarithm: their sizes are not known beforehand.
 """
 
-import math
 from collections.abc import Callable, Mapping
+from math import log10
 from typing import Any
 
-from ..table import Tunable
+from ..table import tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
 
@@ -23,19 +23,6 @@ ESTIMATORS = {
 }
 
 
-def _plain(values: Mapping[str, float]) -> dict[str, float]:
-    """Values by their names, those searched by their logarithm without it."""
-    return {
-        name.removeprefix("log10_"): 10.0**value if name.startswith("log10_") else value
-        for name, value in values.items()
-    }
-
-
-def _of_keywords(cls: Callable[..., Any]) -> Callable[[Mapping[str, float]], Applied]:
-    """Of an estimator whose keywords are what is tuned."""
-    return lambda values: ({}, lambda task: cls(task, **_plain(values)))
-
-
 def _imm(values: Mapping[str, float]) -> Applied:
     accelerations = values["acceleration_quiet"], values["acceleration_noisy"]
     stay = values["stay_quiet"], values["stay_noisy"]
@@ -43,7 +30,7 @@ def _imm(values: Mapping[str, float]) -> Applied:
 
 
 def _imm_turn(values: Mapping[str, float]) -> Applied:
-    v = _plain(values)
+    v = without_logarithms(values)
     modes = ("quiet", "noisy", "turn")
     return {}, lambda task: KalmanTurnInteractingMultipleModel(
         task,
@@ -54,70 +41,47 @@ def _imm_turn(values: Mapping[str, float]) -> Applied:
     )
 
 
-def _logarithms(**values: float) -> dict[str, float]:
-    return {f"log10_{name}": math.log10(value) for name, value in values.items()}
-
-
-_ACCELERATION = {"log10_acceleration": (-1.5, 1.0)}
-_TURN_RATES = {"log10_turn_rate_start": (-1.0, 0.7), "log10_turn_rate_change": (-1.5, 0.3)}
+_TURN_RATES = {
+    "log10_turn_rate_start": (-1.0, log10(2.0), 0.7),
+    "log10_turn_rate_change": (-1.5, log10(0.3), 0.3),
+}
 
 TUNABLE = {
-    "kalman-imm": Tunable(
-        None,
-        {
-            "acceleration_quiet": (0.0, 0.5),
-            "acceleration_noisy": (0.5, 10.0),
-            "stay_quiet": (0.8, 0.999),
-            "stay_noisy": (0.5, 0.999),
-        },
-        {"acceleration_quiet": 0.0, "acceleration_noisy": 2.775, "stay_quiet": 0.9, "stay_noisy": 0.9},
+    "kalman-imm": tunable(
+        KalmanInteractingMultipleModel,
         _imm,
+        acceleration_quiet=(0.0, 0.0, 0.5),
+        acceleration_noisy=(0.5, 2.775, 10.0),
+        stay_quiet=(0.8, 0.9, 0.999),
+        stay_noisy=(0.5, 0.9, 0.999),
     ),
-    "kalman-imm-turn": Tunable(
-        None,
-        {
-            "log10_acceleration_quiet": (-3.0, -0.5),
-            "log10_acceleration_noisy": (0.0, 1.0),
-            "log10_acceleration_turn": (-1.0, 0.5),
-            **_TURN_RATES,
-            "log10_leave_quiet": (-3.0, -1.0),
-            "log10_leave_noisy": (-3.0, -0.5),
-            "log10_leave_turn": (-3.0, -0.5),
-        },
-        _logarithms(
-            acceleration_quiet=0.05,
-            acceleration_noisy=3.0,
-            acceleration_turn=0.3,
-            turn_rate_start=2.0,
-            turn_rate_change=0.3,
-            leave_quiet=0.05,
-            leave_noisy=0.2,
-            leave_turn=0.2,
-        ),
+    "kalman-imm-turn": tunable(
+        KalmanTurnInteractingMultipleModel,
         _imm_turn,
+        log10_acceleration_quiet=(-3.0, log10(0.05), -0.5),
+        log10_acceleration_noisy=(0.0, log10(3.0), 1.0),
+        log10_acceleration_turn=(-1.0, log10(0.3), 0.5),
+        **_TURN_RATES,
+        log10_leave_quiet=(-3.0, log10(0.05), -1.0),
+        log10_leave_noisy=(-3.0, log10(0.2), -0.5),
+        log10_leave_turn=(-3.0, log10(0.2), -0.5),
     ),
-    "unscented-turn": Tunable(
-        None,
-        {**_ACCELERATION, **_TURN_RATES},
-        _logarithms(acceleration=0.3, turn_rate_start=2.0, turn_rate_change=0.3),
-        _of_keywords(UnscentedTurn),
+    "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
+    "sage-husa": tunable(
+        SageHusa,
+        log10_acceleration=(-1.5, log10(1.0), 1.0),
+        forgetting=(0.3, 0.9, 0.99),
+        log10_least=(-2.0, log10(0.1), 0.7),
     ),
-    "sage-husa": Tunable(
-        None,
-        {**_ACCELERATION, "forgetting": (0.3, 0.99), "log10_least": (-2.0, 0.7)},
-        {**_logarithms(acceleration=1.0, least=0.1), "forgetting": 0.9},
-        _of_keywords(SageHusa),
+    "variational-bayes": tunable(
+        VariationalBayes,
+        log10_acceleration=(-1.5, log10(2.775), 1.0),
+        forgetting=(0.5, 0.95, 1.0),
+        log10_shape=(-0.3, log10(5.0), 3.0),
     ),
-    "variational-bayes": Tunable(
-        None,
-        {**_ACCELERATION, "forgetting": (0.5, 1.0), "log10_shape": (-0.3, 3.0)},
-        {**_logarithms(acceleration=2.775, shape=5.0), "forgetting": 0.95},
-        _of_keywords(VariationalBayes),
-    ),
-    "variational-bayes-prediction": Tunable(
-        None,
-        {**_ACCELERATION, "log10_strength": (-1.0, 2.0)},
-        _logarithms(acceleration=1.0, strength=3.0),
-        _of_keywords(VariationalBayesPrediction),
+    "variational-bayes-prediction": tunable(
+        VariationalBayesPrediction,
+        log10_acceleration=(-1.5, log10(1.0), 1.0),
+        log10_strength=(-1.0, log10(3.0), 2.0),
     ),
 }

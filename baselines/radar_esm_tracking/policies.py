@@ -15,30 +15,16 @@ from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
-from ..table import Baselines, Tunable
+from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import ClassAlarm
 from .metrics import METRICS
 from .references import Ideal, KnownClassBound
 
 
-class QuasiOptimal(ConstantPolicy):
+class QuasiOptimal(PaperAction):
     """The paper's algorithm (8)-(12): nothing added to its rule."""
 
     control = "evidence"
-
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.action = task.paper_policy.action
-
-
-class NonAdaptive(Policy):
-    """The paper's comparator: the filter of the most agile class, whatever the target."""
-
-    control = "mode"
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the last class for every episode."""
-        return numpy.full(len(observation), len(self.task.modes) - 1), None
 
 
 class FixedWeights(ConstantPolicy):
@@ -215,35 +201,16 @@ def _fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callabl
     return {}, lambda task: FixedWeights(task, weights)
 
 
-def _forgetting(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
-    change, refused, esm = 10.0 ** values["log10_change"], values["refused"], values["esm"]
-    return {}, lambda task: ForgettingJointType(task, change, refused, esm)
-
+_COUNTS = {"refused": (0.0, 0.0, 1.0), "esm": (0.0, 1.0, 1.0)}
 
 TUNABLE = {
-    "fixed-weights": Tunable(
-        "weights",
-        {"S0": (0.0, 1.0), "S1": (0.0, 1.0), "S2": (0.0, 1.0)},
-        {"S0": 1.0, "S1": 1.0, "S2": 1.0},
-        _fixed_weights,
+    "fixed-weights": tunable(
+        FixedWeights, _fixed_weights, S0=(0.0, 1.0, 1.0), S1=(0.0, 1.0, 1.0), S2=(0.0, 1.0, 1.0)
     ),
-    "leaky": Tunable(
-        "weights",
-        {"log10_leak": (-6.0, -0.5), "esm": (0.0, 1.0)},
-        {"log10_leak": -2.0, "esm": 1.0},
-        lambda values: ({}, lambda task: Leaky(task, 10.0 ** values["log10_leak"], values["esm"])),
-    ),
-    "joint-type": Tunable(
-        "weights",
-        {"refused": (0.0, 1.0), "esm": (0.0, 1.0)},
-        {"refused": 0.0, "esm": 1.0},
-        lambda values: ({}, lambda task: JointType(task, values["refused"], values["esm"])),
-    ),
-    "forgetting-joint-type": Tunable(
-        "weights",
-        {"log10_change": (-6.0, -0.5), "refused": (0.0, 1.0), "esm": (0.0, 1.0)},
-        {"log10_change": math.log10(0.002), "refused": 0.0, "esm": 1.0},
-        _forgetting,
+    "leaky": tunable(Leaky, log10_leak=(-6.0, -2.0, -0.5), esm=(0.0, 1.0, 1.0)),
+    "joint-type": tunable(JointType, **_COUNTS),
+    "forgetting-joint-type": tunable(
+        ForgettingJointType, log10_change=(-6.0, math.log10(0.002), -0.5), **_COUNTS
     ),
 }
 
@@ -258,7 +225,11 @@ BASELINES = Baselines(
         "most-probable": MostProbable,
         "radar-only": RadarOnly,
         "esm-only": EsmOnly,
-        "non-adaptive": NonAdaptive,
+        "non-adaptive": Variant(
+            ConstantMode,
+            "The paper's comparator: the filter of the most agile class, whatever the target.",
+            mode=-1,
+        ),
         "fixed-weights": FixedWeights,
         "random": RandomPolicy,
     },

@@ -14,21 +14,17 @@ from ...envs.task import Task
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ..table import Baselines, Tunable
+from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import SensorAlarm
 from .estimators import EFFICIENT, Huber, HuberStuckCheck
 from .metrics import METRICS
 from .references import KnownMode, KnownModeBound
 
 
-class MultiHypothesis(ConstantPolicy):
+class MultiHypothesis(PaperAction):
     """The paper's algorithm, steps 1 to 8: nothing added to Bayes' rule."""
 
     control = "evidence"
-
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.action = task.paper_policy.action
 
 
 def chain(stay: float) -> tuple[tuple[float, ...], ...]:
@@ -46,35 +42,6 @@ class Sticky(MultiHypothesis):
     """
 
     task_keywords: ClassVar[dict[str, Any]] = {"transition": chain(0.9999)}
-
-
-class _OneHypothesis(Policy):
-    """One filter whose model never changes."""
-
-    control = "mode"
-    hypothesis: ClassVar[int]
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the hypothesis for every episode."""
-        return numpy.full(len(observation), self.hypothesis), None
-
-
-class Rest(_OneHypothesis):
-    """Hypothesis 1 alone."""
-
-    hypothesis = REST
-
-
-class ConstantVelocity(_OneHypothesis):
-    """Hypothesis 2 alone."""
-
-    hypothesis = LINE
-
-
-class Singer(_OneHypothesis):
-    """The paper's non-adaptive measurer: Singer's model alone, as in the third filter of the bank."""
-
-    hypothesis = SINGER
 
 
 class FixedGain(ConstantPolicy):
@@ -208,50 +175,22 @@ def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any]
     return {"transition": chain(1.0 - 10.0 ** values["log10_leave"])}, MultiHypothesis
 
 
-def _adaptive(
-    cls: type[NisAdaptive],
-) -> Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Policy]]]:
-    return lambda values: ({}, lambda task: cls(task, **values))
-
-
 TUNABLE = {
-    "fixed-gain": Tunable(
-        "gain",
-        {"rates": (-0.2, 0.3), "accelerometers": (0.0, 1.0)},
-        {"rates": 0.0, "accelerometers": 0.8},
-        _fixed_gain,
+    "fixed-gain": tunable(FixedGain, _fixed_gain, rates=(-0.2, 0.0, 0.3), accelerometers=(0.0, 0.8, 1.0)),
+    "nis-adaptive": tunable(
+        NisAdaptive,
+        threshold=(0.5, 3.0, 10.0),
+        rates=(0.0, 1.0, 2.0),
+        accelerometers=(0.0, 1.0, 4.0),
+        own=(0.0, 1.0, 2.0),
+        base=(0.0, 0.0, 1.0),
     ),
-    "nis-adaptive": Tunable(
-        "gain",
-        {
-            "threshold": (0.5, 10.0),
-            "rates": (0.0, 2.0),
-            "accelerometers": (0.0, 4.0),
-            "own": (0.0, 2.0),
-            "base": (0.0, 1.0),
-        },
-        {"threshold": 3.0, "rates": 1.0, "accelerometers": 1.0, "own": 1.0, "base": 0.0},
-        _adaptive(NisAdaptive),
+    "stuck-check": tunable(StuckCheck, threshold=(0.5, 3.0, 10.0), rates=(0.0, 0.0, 2.0)),
+    "fixed-robust": tunable(
+        FixedRobust, accelerometers=(0.0, 0.0, 0.5), pseudoranges=(0.0, 1.0, 1.0), rates=(0.0, 1.0, 1.0)
     ),
-    "stuck-check": Tunable(
-        "gain",
-        {"threshold": (0.5, 10.0), "rates": (0.0, 2.0)},
-        {"threshold": 3.0, "rates": 0.0},
-        _adaptive(StuckCheck),
-    ),
-    "fixed-robust": Tunable(
-        "robust",
-        {"accelerometers": (0.0, 0.5), "pseudoranges": (0.0, 1.0), "rates": (0.0, 1.0)},
-        {"accelerometers": 0.0, "pseudoranges": 1.0, "rates": 1.0},
-        lambda values: ({}, lambda task: FixedRobust(task, **values)),
-    ),
-    "huber-stuck-check": Tunable(
-        None,
-        {"rates": (0.5, 6.0), "manoeuvre": (1.0, 20.0)},
-        {"rates": EFFICIENT, "manoeuvre": 4.0},
-        lambda values: ({}, lambda task: HuberStuckCheck(task, **values)),
-    ),
-    "sticky": Tunable("evidence", {"log10_leave": (-6.0, -0.5)}, {"log10_leave": -4.0}, _sticky),
+    "huber-stuck-check": tunable(HuberStuckCheck, rates=(0.5, EFFICIENT, 6.0), manoeuvre=(1.0, 4.0, 20.0)),
+    "sticky": tunable(Sticky, _sticky, log10_leave=(-6.0, -4.0, -0.5)),
 }
 
 BASELINES = Baselines(
@@ -264,9 +203,13 @@ BASELINES = Baselines(
         "stuck-check-fallback": StuckCheckFallback,
         "fixed-gain": FixedGain,
         "fixed-robust": FixedRobust,
-        "singer": Singer,
-        "constant-velocity": ConstantVelocity,
-        "rest": Rest,
+        "singer": Variant(
+            ConstantMode,
+            "The paper's non-adaptive measurer: Singer's model alone, as in the third filter of the bank.",
+            mode=SINGER,
+        ),
+        "constant-velocity": Variant(ConstantMode, "Hypothesis 2 alone.", mode=LINE),
+        "rest": Variant(ConstantMode, "Hypothesis 1 alone.", mode=REST),
         "random": RandomPolicy,
     },
     estimators={"huber": Huber, "huber-stuck-check": HuberStuckCheck},

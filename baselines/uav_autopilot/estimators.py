@@ -17,6 +17,7 @@ from ...filters import imm, packed_covariance
 from ...filters import noise_adaptation as adaptation
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBayes
+from ..table import Variant
 
 
 def told_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
@@ -82,8 +83,10 @@ class AdaptiveKalman:
     kind = "estimator"
     traceable = True
 
-    def __init__(self, task: UavAutopilot, sensor_noise: MeasurementNoise) -> None:
-        self.task, self.xp, self.sensor_noise = task, task.xp, sensor_noise
+    def __init__(
+        self, task: UavAutopilot, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
+    ) -> None:
+        self.task, self.xp, self.sensor_noise = task, task.xp, rule(**values)
         model, pack = task.design.model, packed_covariance.pack
         self.F, self.B = task.constant(model.F), task.constant(model.B)
         self.propagator = task.constant(packed_covariance.propagator(model.F))
@@ -132,13 +135,6 @@ class AdaptiveKalman:
         return after.mean, packed_covariance.unpack(after.covariance, self.n), after, likelihood
 
 
-class MehraKalman(AdaptiveKalman):
-    """The paper's filter, each sensor's noise by the mean square of its last innovations (Mehra 1972)."""
-
-    def __init__(self, task: UavAutopilot, window: float = 100.0) -> None:
-        super().__init__(task, Mehra(window))
-
-
 class AdaptiveGusts(AdaptiveKalman):
     """Sensor noise estimated, and the disturbance by equation (3) from the corrections of the last coordinate.
 
@@ -148,15 +144,17 @@ class AdaptiveGusts(AdaptiveKalman):
     limits: ClassVar[tuple[float, float]] = (1.0 / 16.0, 16.0)
     """Of the factor on the disturbance's covariance: the range of ``random``."""
 
-    def __init__(self, task: UavAutopilot, sensor_noise: MeasurementNoise, memory: float) -> None:
-        super().__init__(task, sensor_noise)
-        self.memory, self.forgetting = memory, 1.0 - 1.0 / memory
+    def __init__(
+        self, task: UavAutopilot, rule: type[MeasurementNoise], gust_memory: float, **values: float
+    ) -> None:
+        super().__init__(task, rule, **values)
+        self.gust_memory, self.forgetting = gust_memory, 1.0 - 1.0 / gust_memory
         self.last = packed_covariance.position(self.n, self.n - 1, self.n - 1)
 
     def start(self, initial: Initial, N: int) -> tuple[Filter, adaptation.Level]:
         """Start with gusts as designed."""
         one = 0.0 * initial.mean[0] + 1.0
-        return self.started(initial), adaptation.Level(one, self.memory * one)
+        return self.started(initial), adaptation.Level(one, self.gust_memory * one)
 
     def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, and the factor for the next."""
@@ -170,20 +168,6 @@ class AdaptiveGusts(AdaptiveKalman):
         level = level._replace(value=self.xp.clip(level.value, *self.limits))
         likelihood = told_of(measurement, log_likelihood, nis, self.xp)
         return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level), likelihood
-
-
-class SageHusaKalman(AdaptiveGusts):
-    """The paper's filter, noise of sensors and gusts by fading means of the innovations (Sage and Husa 1969)."""
-
-    def __init__(self, task: UavAutopilot, memory: float = 100.0, gust_memory: float = 100.0) -> None:
-        super().__init__(task, SageHusa(memory, memory), gust_memory)
-
-
-class VariationalBayesKalman(AdaptiveGusts):
-    """The paper's filter, gusts by Sage and Husa, sensors by variational Bayes (Särkkä and Nummenmaa 2009)."""
-
-    def __init__(self, task: UavAutopilot, memory: float = 100.0, gust_memory: float = 100.0) -> None:
-        super().__init__(task, VariationalBayes(memory, memory), gust_memory)
 
 
 class GustModels(NamedTuple):
@@ -209,7 +193,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         low: float = 0.5,
         high: float = 2.0,
     ) -> None:
-        super().__init__(task, VariationalBayes(memory, memory))
+        super().__init__(task, VariationalBayes, memory=memory)
         self.levels = low, 1.0, high
         change = (1.0 - stay) / 2.0
         self.transition = task.constant([[stay if i == j else change for j in range(3)] for i in range(3)])
@@ -248,3 +232,30 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)
+
+
+ESTIMATORS = {
+    "mehra": Variant(
+        AdaptiveKalman,
+        "The paper's filter, each sensor's noise by the mean square of its last innovations (Mehra 1972).",
+        rule=Mehra,
+        window=100.0,
+    ),
+    "sage-husa": Variant(
+        AdaptiveGusts,
+        "The paper's filter, noise of sensors and gusts by fading means of the innovations (Sage and Husa 1969).",
+        rule=SageHusa,
+        memory=100.0,
+        gust_memory=100.0,
+    ),
+    "variational-bayes": Variant(
+        AdaptiveGusts,
+        "The paper's filter, gusts by Sage and Husa, sensors by variational Bayes (Särkkä and Nummenmaa 2009).",
+        rule=VariationalBayes,
+        memory=100.0,
+        gust_memory=100.0,
+    ),
+    "gust-imm": GustInteractingMultipleModel,
+    "steady-kalman": SteadyKalman,
+}
+"""By their names in the table."""

@@ -4,22 +4,16 @@ Equation numbers are those of the task's paper (Gridnev, Rusetski, Rak).
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy
 
 from ...envs.uav_autopilot.banks import MODES
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
-from ..table import Baselines, Tunable
+from ..table import Baselines, ConstantMode, Variant, tunable
 from .alarm import AutopilotAlarm
-from .estimators import (
-    GustInteractingMultipleModel,
-    MehraKalman,
-    SageHusaKalman,
-    SteadyKalman,
-    VariationalBayesKalman,
-)
+from .estimators import ESTIMATORS, GustInteractingMultipleModel
 from .metrics import METRICS
 from .references import KnownNoiseBound, Matched, TrueState
 
@@ -39,35 +33,6 @@ class FixedScale(ConstantPolicy):
 
 class Kalman(FixedScale):
     """The paper's filter, equations (10)-(12): the process noise is what the design says."""
-
-
-class FixedMode(Policy):
-    """One mode, never changed."""
-
-    control = "mode"
-    mode: ClassVar[str]
-
-    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Name the mode."""
-        return numpy.full(len(observation), MODES.index(self.mode)), None
-
-
-class OverSmoothed(FixedMode):
-    """A filter that trusts its model too much: process noise times 0.01."""
-
-    mode = "over-smoothed"
-
-
-class WideBand(FixedMode):
-    """A filter that trusts its sensors too much: process noise times 100."""
-
-    mode = "wide-band"
-
-
-class RawSensors(FixedMode):
-    """No filter: the readings are fed back, the last valid one during a dropout."""
-
-    mode = "raw-sensors"
 
 
 class InnovationAdaptive(Policy):
@@ -129,50 +94,34 @@ def _tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callab
     return {}, make
 
 
-def _tuned_estimator(
-    make: Callable[..., Any], limits: Mapping[str, tuple[float, float]], start: Mapping[str, float]
-) -> Tunable:
-    return Tunable(None, limits, start, lambda values: ({}, lambda task: make(task, **values)))
-
-
-_MEMORY = (20.0, 400.0)
-_MEMORIES = {"memory": _MEMORY, "gust_memory": _MEMORY}
-_MEMORIES_START = {"memory": 100.0, "gust_memory": 100.0}
+_MEMORY = (20.0, 100.0, 400.0)
+_WEIGHT = (-3.0, 1.0 / 3.0, 3.0)
 
 TUNABLE = {
-    "fixed-best": Tunable(
-        "gain",
-        {"log10_scale": (-0.5, 0.5)},
-        {"log10_scale": 0.0},
+    "fixed-best": tunable(
+        FixedScale,
         lambda values: ({}, lambda task: FixedScale(task, values["log10_scale"])),
+        log10_scale=(-0.5, 0.0, 0.5),
     ),
-    "innovation-adaptive": Tunable(
-        "gain",
-        {
-            "window": (5.0, 150.0),
-            "memory": (0.0, 0.95),
-            "offset": (-1.0, 1.0),
-            "output_weight": (-3.0, 3.0),
-            "rate_weight": (-3.0, 3.0),
-            "elevator_weight": (-3.0, 3.0),
-        },
-        {
-            "window": 50.0,
-            "memory": 0.5,
-            "offset": 0.0,
-            "output_weight": 1.0 / 3.0,
-            "rate_weight": 1.0 / 3.0,
-            "elevator_weight": 1.0 / 3.0,
-        },
+    "innovation-adaptive": tunable(
+        InnovationAdaptive,
         _tuned_adaptive,
+        window=(5.0, 50.0, 150.0),
+        memory=(0.0, 0.5, 0.95),
+        offset=(-1.0, 0.0, 1.0),
+        output_weight=_WEIGHT,
+        rate_weight=_WEIGHT,
+        elevator_weight=_WEIGHT,
     ),
-    "mehra": _tuned_estimator(MehraKalman, {"window": _MEMORY}, {"window": 100.0}),
-    "sage-husa": _tuned_estimator(SageHusaKalman, _MEMORIES, _MEMORIES_START),
-    "variational-bayes": _tuned_estimator(VariationalBayesKalman, _MEMORIES, _MEMORIES_START),
-    "gust-imm": _tuned_estimator(
+    "mehra": tunable(ESTIMATORS["mehra"], window=_MEMORY),
+    "sage-husa": tunable(ESTIMATORS["sage-husa"], memory=_MEMORY, gust_memory=_MEMORY),
+    "variational-bayes": tunable(ESTIMATORS["variational-bayes"], memory=_MEMORY, gust_memory=_MEMORY),
+    "gust-imm": tunable(
         GustInteractingMultipleModel,
-        {"memory": (10.0, 150.0), "stay": (0.95, 0.9995), "low": (0.1, 0.9), "high": (1.2, 4.0)},
-        {"memory": 50.0, "stay": 0.99, "low": 0.5, "high": 2.0},
+        memory=(10.0, 50.0, 150.0),
+        stay=(0.95, 0.99, 0.9995),
+        low=(0.1, 0.5, 0.9),
+        high=(1.2, 2.0, 4.0),
     ),
 }
 
@@ -180,20 +129,26 @@ BASELINES = Baselines(
     environment="filtergym/UavAutopilot-v0",
     policies={
         "kalman": Kalman,
-        "over-smoothed": OverSmoothed,
-        "wide-band": WideBand,
-        "raw-sensors": RawSensors,
+        "over-smoothed": Variant(
+            ConstantMode,
+            "A filter that trusts its model too much: process noise times 0.01.",
+            mode=MODES.index("over-smoothed"),
+        ),
+        "wide-band": Variant(
+            ConstantMode,
+            "A filter that trusts its sensors too much: process noise times 100.",
+            mode=MODES.index("wide-band"),
+        ),
+        "raw-sensors": Variant(
+            ConstantMode,
+            "No filter: the readings are fed back, the last valid one during a dropout.",
+            mode=MODES.index("raw-sensors"),
+        ),
         "innovation-adaptive": InnovationAdaptive,
         "fixed-best": FixedScale,
         "random": RandomPolicy,
     },
-    estimators={
-        "mehra": MehraKalman,
-        "sage-husa": SageHusaKalman,
-        "variational-bayes": VariationalBayesKalman,
-        "gust-imm": GustInteractingMultipleModel,
-        "steady-kalman": SteadyKalman,
-    },
+    estimators=ESTIMATORS,
     references={"true-state": TrueState, "matched": Matched},
     bounds={"known-noise-bound": KnownNoiseBound},
     score_paper="kalman",

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ...baselines.uav_autopilot.policies import Kalman, RawSensors
-from ...baselines.uav_autopilot.references import TrueState
+from ...baselines.uav_autopilot.policies import BASELINES
 from ...envs.catalogue import make_task
 from ...envs.task import Episode
 from ...envs.uav_autopilot.task import UavAutopilot
@@ -95,7 +94,7 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
             "truth": episode.truth.state,
         }
 
-    actor = {"true-state": TrueState, "kalman": Kalman, "raw-sensors": RawSensors}[loop](task)
+    actor = {**BASELINES.policies, **BASELINES.references}[loop](task)
     series = recorded(task, actor, episode_seeds("test", 0, episodes), fields)
     truth, plant_input = series.pop("truth"), series["control"].copy()
     if task.parameters.plant == "P":
