@@ -286,7 +286,8 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     if types.is_datetime64_any_dtype(values) or types.is_timedelta64_dtype(values):
         if values.isna().any():
             raise ValueError(f"time has no value in row {values.isna().idxmax()}")
-        return (values - values.iloc[0]).dt.total_seconds() if len(values) else values.astype(float)
+        # Not total_seconds of pandas, which can be wrong in the last bit.
+        return (values - values.iloc[:1].squeeze()) / pandas.Timedelta(seconds=1)
     found = numbers("time", values)
     first = found.iloc[0] if len(found) else 0.0
     # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
