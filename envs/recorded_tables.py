@@ -13,7 +13,7 @@ import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
 from .plausibility import check_interval, ignored_columns
-from .recording import Recording, measured_once
+from .recording import Recording, measured_once, side_by_side
 from .task import Task
 
 if TYPE_CHECKING:
@@ -218,50 +218,38 @@ def _joined(
     names: list[str],
 ) -> Recording:
     """Put the recordings of a file, whose columns have these names, side by side."""
-    task = cls(cls.Parameters(**{**parts[0][1].parameters, **keywords}), cls.controls[0])
+    first, known = parts[0][0], parts[0][1].parameters
+    task = cls(cls.Parameters(**{**known, **keywords}), cls.controls[0])
     true = [TRUTH + component.name for component in task.components]
     notes = tuple(ignored_columns(names, [*TIME, RECORDING, *cls.recorded_columns, *true]))
-    longest = max(len(found.rows) for _, found in parts)
-    for own, found in parts:
-        if found.parameters != parts[0][1].parameters:
-            raise ValueError(
-                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {parts[0][0].name!r} "
-                f"{dict(parts[0][1].parameters)}: put them into files of their own"
-            )
-
-    def padded(values: numpy.ndarray) -> numpy.ndarray:
-        fill = numpy.nan if values.dtype.kind == "f" else 0
-        widths = [(0, longest - len(values)), *[(0, 0)] * (values.ndim - 1)]
-        return numpy.pad(values, widths, constant_values=fill)
-
-    measurements = {
-        name: numpy.stack([padded(numpy.asarray(found.measurements[name])) for _, found in parts])
-        for name in parts[0][1].measurements
-    }
-    truth = None
-    if all(own.has(*true) for own, _ in parts):
-        for own, found in parts:
-            if (found.rows < 0).any():
-                raise ValueError(
-                    f"recording {own.name!r} has scans without a row, of which nobody knows the truth: add rows "
-                    "without plots, or leave out the truth"
-                )
-        truth = numpy.stack([padded(own.whole(*true)[found.rows]) for own, found in parts])
-    elif any(own.true for own, _ in parts):
+    with_truth = first.has(*true)
+    if first.true and not with_truth:
         raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")
-    return Recording(
-        environment=cls.id,
-        measurements=measurements,
-        initial={
-            name: numpy.stack([numpy.asarray(found.initial[name]) for _, found in parts])
-            for name in parts[0][1].initial
-        },
-        seconds=numpy.stack([padded(found.time - found.start) for _, found in parts]),
-        lengths=numpy.array([len(found.rows) for _, found in parts]),
-        truth=truth,
-        names=tuple(own.name for own, _ in parts),
-        parameters={**parts[0][1].parameters, **keywords},
-        name=path.name.partition(".")[0],
-        source=str(path),
-        notes=notes,
-    )
+    recordings = []
+    for own, found in parts:
+        if found.parameters != known:
+            raise ValueError(
+                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {first.name!r} "
+                f"{dict(known)}: put them into files of their own"
+            )
+        if with_truth and (found.rows < 0).any():
+            raise ValueError(
+                f"recording {own.name!r} has scans without a row, of which nobody knows the truth: add rows "
+                "without plots, or leave out the truth"
+            )
+        recordings.append(
+            Recording(
+                environment=cls.id,
+                measurements={name: numpy.asarray(v)[None] for name, v in found.measurements.items()},
+                initial={name: numpy.asarray(v)[None] for name, v in found.initial.items()},
+                seconds=(found.time - found.start)[None],
+                lengths=numpy.array([len(found.rows)]),
+                truth=own.whole(*true)[found.rows][None] if with_truth else None,
+                names=(own.name,),
+                parameters={**known, **keywords},
+                name=path.name.partition(".")[0],
+                source=str(path),
+                notes=notes,
+            )
+        )
+    return side_by_side(recordings)
