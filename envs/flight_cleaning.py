@@ -106,8 +106,13 @@ def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list
 
 def _arrays(rows: "pandas.DataFrame") -> tuple[numpy.ndarray, numpy.ndarray, numpy.ndarray | None]:
     """Times ``(n,)``, positions and velocities ``(n, 2)``."""
-    velocity = rows[["vx", "vy"]].to_numpy() if "vx" in rows else None
-    return rows["time"].to_numpy(), rows[["x", "y"]].to_numpy(), velocity
+    # In the order of rows in memory, on which the last bit of a fit depends.
+    pairs = [
+        numpy.ascontiguousarray(rows[[*pair]].to_numpy())
+        for pair in (("x", "y"), ("vx", "vy"))
+        if pair[0] in rows
+    ]
+    return rows["time"].to_numpy(), pairs[0], pairs[1] if len(pairs) > 1 else None
 
 
 FEWEST_IN_WINDOW = 5

@@ -65,7 +65,7 @@ class Table(NamedTuple):
 
 def _check_rows(rows: int) -> None:
     if rows > MOST_ROWS:
-        raise ValueError(f"it has more than {MOST_ROWS:,} rows ({rows:,}): split it, or keep fewer a second")
+        raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
 
 
 def _check_names(names: list[str]) -> list[str]:
@@ -95,8 +95,7 @@ def _csv(file: Path, known: Container[str]) -> Table:
         for number, row in enumerate(csv.reader(lines, delimiter=delimiter)):
             if row and len(row) != len(names):
                 raise ValueError(f"{len(names)} column names but {len(row)} columns in row {number}")
-            if number >= MOST_ROWS:
-                raise ValueError(f"it has more than {MOST_ROWS:,} rows: split it, or keep fewer a second")
+            _check_rows(number + 1)
             if row:
                 rows.append([row[i] for i in wanted.values()])
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
@@ -220,13 +219,11 @@ def flight_columns(table: Table) -> tuple["pandas.DataFrame", bool]:
     Raises:
         ValueError: if one is missing.
     """
-    found = {
-        alias: name
-        for name, aliases in COLUMNS.items()
-        for alias in [next((alias for alias in aliases if alias in table.columns), None)]
-        if alias is not None
+    there = {
+        name: [alias for alias in aliases if alias in table.columns] for name, aliases in COLUMNS.items()
     }
-    columns = table.columns[list(found)].rename(columns=found)
+    found = {aliases[0]: name for name, aliases in there.items() if aliases}
+    columns = table.columns[[*found]].rename(columns=found)
     missing = [] if "time" in columns else ["time"]
     position = [("x", "y"), ("latitude", "longitude")]
     if not any({*pair} <= {*columns} for pair in position):
@@ -273,8 +270,9 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     """
     import pandas
 
-    types, given = pandas.api.types, values.dropna()
-    if len(given) and isinstance(given.iloc[0], str) and not _is_number(given.iloc[0]):
+    types = pandas.api.types
+    first = next(iter(values.dropna()), None)
+    if isinstance(first, str) and first and pandas.isna(pandas.to_numeric(first, errors="coerce")):
         dates = pandas.to_datetime(values.str.strip(), utc=True, format="ISO8601", errors="coerce")
         if dates.isna().any():
             row = dates.isna().idxmax()
@@ -286,17 +284,10 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     if types.is_datetime64_any_dtype(values) or types.is_timedelta64_dtype(values):
         if values.isna().any():
             raise ValueError(f"time has no value in row {values.isna().idxmax()}")
-        return (values - values.iloc[0]).dt.total_seconds() if len(values) else values.astype(float)
+        # Not total_seconds of pandas, which can be wrong in the last bit.
+        return (values - values.iloc[:1].squeeze()) / pandas.Timedelta(seconds=1)
     found = numbers("time", values)
     first = found.iloc[0] if len(found) else 0.0
     # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
     unit = next((unit for unit in (1e9, 1e6, 1e3) if first > 1e8 * unit), 1.0)
     return found if unit == 1.0 else (found - first) / unit
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text or math.nan)
-    except ValueError:
-        return False
-    return True

@@ -7,14 +7,17 @@ and true values, ``truth_NAME`` for every component of the environment.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
 from .plausibility import check_interval, ignored_columns
-from .recording import Recording, measured_once
+from .recording import Recording, measured_once, side_by_side
 from .task import Task
+
+if TYPE_CHECKING:
+    import pandas
 
 TIME = ("time", "timestamp", "seconds")
 RECORDING = "recording"
@@ -28,38 +31,35 @@ class Columns:
 
     Args:
         name: of the recording.
-        columns: numbers by the names of the columns, NaN where a cell is empty.
-        time: s, increasing.
+        table: numbers by the names of the columns, missing where a cell is empty, with ``time`` in seconds. Its index
+            counts the rows of the file.
         given: parameters that the user has named.
     """
 
-    def __init__(
-        self,
-        name: str,
-        columns: Mapping[str, numpy.ndarray],
-        time: numpy.ndarray,
-        given: Mapping[str, Any],
-    ) -> None:
-        self.name, self.time, self.given = name, time, given
-        self._columns = columns
+    def __init__(self, name: str, table: "pandas.DataFrame", given: Mapping[str, Any]) -> None:
+        self.name, self.table, self.given = name, table, given
 
     def has(self, *names: str) -> bool:
         """Whether all of these columns are there."""
-        return all(name in self._columns for name in names)
+        return {*names} <= {*self.table}
+
+    @property
+    def time(self) -> numpy.ndarray:
+        """Times, s, ``(rows,)``."""
+        return self["time"]
 
     @property
     def true(self) -> list[str]:
         """Names of the columns that say what is true."""
-        return [name for name in self._columns if name.startswith(TRUTH)]
+        return [name for name in self.table if name.startswith(TRUTH)]
 
     def __getitem__(self, name: str) -> numpy.ndarray:
         """Column, NaN where a cell is empty."""
-        return self._columns[name]
+        return self.table[name].to_numpy()
 
     def only(self, rows: numpy.ndarray) -> "Columns":
         """Some rows of the same."""
-        columns = {name: values[rows] for name, values in self._columns.items()}
-        return Columns(self.name, columns, self.time[rows], self.given)
+        return Columns(self.name, self.table[rows], self.given)
 
     def whole(self, *names: str) -> numpy.ndarray:
         """Columns without an empty cell, ``(rows, columns)``.
@@ -68,12 +68,12 @@ class Columns:
             ValueError: if there is one.
         """
         for name in names:
-            missing = numpy.isnan(self[name])
+            missing = self.table[name].isna()
             if missing.any():
                 raise ValueError(
-                    f"{name} has no value in row {int(missing.argmax())}, and here nothing may be missing"
+                    f"{name} has no value in row {missing.idxmax()}, and here nothing may be missing"
                 )
-        return numpy.stack([self[name] for name in names], axis=1)
+        return numpy.ascontiguousarray(self.table[[*names]].to_numpy())
 
     def sigmas(self, *names: str) -> numpy.ndarray:
         """Standard deviations without an empty cell, ``(rows, columns)``.
@@ -82,9 +82,10 @@ class Columns:
             ValueError: if one is not above zero.
         """
         found = self.whole(*names)
-        for name, values in zip(names, found.T, strict=True):
+        for name in names:
+            values = self.table[name]
             if (values <= 0.0).any():
-                row = int((values <= 0.0).argmax())
+                row = (values <= 0.0).idxmax()
                 raise ValueError(
                     f"{name} is a standard deviation, above zero, and row {row} has {values[row]:g}"
                 )
@@ -152,30 +153,23 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     known = _Known({*TIME, RECORDING, *cls.recorded_columns})
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
-    table = {name.lower(): values for name, values in read_table(path, known).items()}
-    time_name = next((name for name in TIME if name in table), None)
-    if time_name is None or not any(name in table for name in cls.recorded_columns):
+    read, names = read_table(path, known)
+    names = [name.lower() for name in names]
+    time_name = next((name for name in TIME if name in read), None)
+    if time_name is None or not any(name in read for name in cls.recorded_columns):
         raise ValueError(
-            f"it has the columns {', '.join(table) or 'none'}, and {cls.id} reads time and "
+            f"it has the columns {', '.join(names) or 'none'}, and {cls.id} reads time and "
             f"{', '.join(cls.recorded_columns)}"
         )
-    time = seconds(table[time_name])
-    columns = {
-        name: numbers(name, values)
-        for name, values in table.items()
-        if name in known and name not in (*TIME, RECORDING)
-    }
-    for name, values in columns.items():
-        if numpy.isinf(values).any():
-            raise ValueError(f"{name} is not finite in row {int(numpy.isinf(values).argmax())}")
+    table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
+    for name in table:
+        table[name] = numbers(name, table[name])
+        if numpy.isinf(table[name]).any():
+            raise ValueError(f"{name} is not finite in row {numpy.isinf(table[name]).idxmax()}")
+    table.insert(0, "time", seconds(read[time_name]))
     parts = []
-    for name, rows in _recordings(table.get(RECORDING), len(time)).items():
-        own = Columns(
-            name or path.name.partition(".")[0],
-            {n: v[rows] for n, v in columns.items()},
-            time[rows],
-            keywords,
-        )
+    for name, rows in _by_recording(table, read.get(RECORDING)).items():
+        own = Columns(name or path.name.partition(".")[0], rows, keywords)
         try:
             _check_times(own.time)
             if "sampling_interval" not in keywords:
@@ -185,7 +179,7 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _joined(path, cls, keywords, parts, list(table))
+    return _joined(path, cls, keywords, parts, names)
 
 
 class _Known(set[str]):
@@ -195,12 +189,12 @@ class _Known(set[str]):
         return super().__contains__(name) or str(name).startswith(TRUTH)
 
 
-def _recordings(names: Any, rows: int) -> dict[str, numpy.ndarray]:
+def _by_recording(table: "pandas.DataFrame", names: "pandas.Series | None") -> dict[str, "pandas.DataFrame"]:
     """Rows of every recording of a table, in their order."""
     if names is None:
-        return {"": numpy.arange(rows)}
-    values = numpy.array([str(value) for value in numpy.asarray(names).tolist()])
-    return {name: numpy.flatnonzero(values == name) for name in dict.fromkeys(values.tolist())}
+        return {"": table}
+    words = names.astype(object).where(names.notna(), "").astype(str)
+    return {str(name): rows.reset_index(drop=True) for name, rows in table.groupby(words, sort=False)}
 
 
 def _check_times(time: numpy.ndarray) -> None:
@@ -224,50 +218,38 @@ def _joined(
     names: list[str],
 ) -> Recording:
     """Put the recordings of a file, whose columns have these names, side by side."""
-    task = cls(cls.Parameters(**{**parts[0][1].parameters, **keywords}), cls.controls[0])
+    first, known = parts[0][0], parts[0][1].parameters
+    task = cls(cls.Parameters(**{**known, **keywords}), cls.controls[0])
     true = [TRUTH + component.name for component in task.components]
     notes = tuple(ignored_columns(names, [*TIME, RECORDING, *cls.recorded_columns, *true]))
-    longest = max(len(found.rows) for _, found in parts)
-    for own, found in parts:
-        if found.parameters != parts[0][1].parameters:
-            raise ValueError(
-                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {parts[0][0].name!r} "
-                f"{dict(parts[0][1].parameters)}: put them into files of their own"
-            )
-
-    def padded(values: numpy.ndarray) -> numpy.ndarray:
-        fill = numpy.nan if values.dtype.kind == "f" else 0
-        widths = [(0, longest - len(values)), *[(0, 0)] * (values.ndim - 1)]
-        return numpy.pad(values, widths, constant_values=fill)
-
-    measurements = {
-        name: numpy.stack([padded(numpy.asarray(found.measurements[name])) for _, found in parts])
-        for name in parts[0][1].measurements
-    }
-    truth = None
-    if all(own.has(*true) for own, _ in parts):
-        for own, found in parts:
-            if (found.rows < 0).any():
-                raise ValueError(
-                    f"recording {own.name!r} has scans without a row, of which nobody knows the truth: add rows "
-                    "without plots, or leave out the truth"
-                )
-        truth = numpy.stack([padded(own.whole(*true)[found.rows]) for own, found in parts])
-    elif any(own.true for own, _ in parts):
+    with_truth = first.has(*true)
+    if first.true and not with_truth:
         raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")
-    return Recording(
-        environment=cls.id,
-        measurements=measurements,
-        initial={
-            name: numpy.stack([numpy.asarray(found.initial[name]) for _, found in parts])
-            for name in parts[0][1].initial
-        },
-        seconds=numpy.stack([padded(found.time - found.start) for _, found in parts]),
-        lengths=numpy.array([len(found.rows) for _, found in parts]),
-        truth=truth,
-        names=tuple(own.name for own, _ in parts),
-        parameters={**parts[0][1].parameters, **keywords},
-        name=path.name.partition(".")[0],
-        source=str(path),
-        notes=notes,
-    )
+    recordings = []
+    for own, found in parts:
+        if found.parameters != known:
+            raise ValueError(
+                f"recording {own.name!r} needs the parameters {dict(found.parameters)} and {first.name!r} "
+                f"{dict(known)}: put them into files of their own"
+            )
+        if with_truth and (found.rows < 0).any():
+            raise ValueError(
+                f"recording {own.name!r} has scans without a row, of which nobody knows the truth: add rows "
+                "without plots, or leave out the truth"
+            )
+        recordings.append(
+            Recording(
+                environment=cls.id,
+                measurements={name: numpy.asarray(v)[None] for name, v in found.measurements.items()},
+                initial={name: numpy.asarray(v)[None] for name, v in found.initial.items()},
+                seconds=(found.time - found.start)[None],
+                lengths=numpy.array([len(found.rows)]),
+                truth=own.whole(*true)[found.rows][None] if with_truth else None,
+                names=(own.name,),
+                parameters={**known, **keywords},
+                name=path.name.partition(".")[0],
+                source=str(path),
+                notes=notes,
+            )
+        )
+    return side_by_side(recordings)

@@ -341,37 +341,39 @@ def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()
     untrue = [one.name for one in kept if one.truth is None]
     if untrue and len(untrue) < len(kept):
         told.append(f"{untrue[0]}: has no truth, so nobody is judged")
-    longest = max(one.seconds.shape[1] for one in kept)
-
-    def side_by_side(arrays: Sequence[numpy.ndarray], padded: bool = True) -> numpy.ndarray:
-        if padded:
-            arrays = [
-                numpy.pad(
-                    values,
-                    [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)],
-                    constant_values=numpy.nan if values.dtype.kind == "f" else 0,
-                )
-                for values in arrays
-            ]
-        return numpy.concatenate(arrays)
-
     names = []
     for one in kept:
         alone = len(one.names) == 1
         names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
+    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(told))
+
+
+def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
+    """Put the episodes of recordings of one environment side by side.
+
+    Args:
+        recordings: at least one; the truth is known if it is of all.
+        **fields: of the whole, where they are not those of the first.
+    """
+    first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
+
+    def padded(values: numpy.ndarray) -> numpy.ndarray:
+        fill = numpy.nan if values.dtype.kind == "f" else 0
+        widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
+        return numpy.pad(values, widths, constant_values=fill)
+
+    truths = [padded(one.truth) for one in recordings if one.truth is not None]
     return dataclasses.replace(
         first,
         measurements={
-            key: side_by_side([one.measurements[key] for one in kept]) for key in first.measurements
+            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings])
+            for key in first.measurements
         },
-        initial={key: side_by_side([one.initial[key] for one in kept], False) for key in first.initial},
-        seconds=side_by_side([one.seconds for one in kept]),
-        lengths=numpy.concatenate([one.lengths for one in kept]),
-        truth=None if untrue else side_by_side([one.truth for one in kept if one.truth is not None]),
-        names=tuple(names),
-        name=name,
-        source=name,
-        notes=tuple(told),
+        initial={key: numpy.concatenate([one.initial[key] for one in recordings]) for key in first.initial},
+        seconds=numpy.concatenate([padded(one.seconds) for one in recordings]),
+        lengths=numpy.concatenate([one.lengths for one in recordings]),
+        truth=numpy.concatenate(truths) if len(truths) == len(recordings) else None,
+        **{"names": tuple(name for one in recordings for name in one.names), **fields},
     )
 
 

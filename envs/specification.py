@@ -29,15 +29,12 @@ def told(spec: EnvSpec, decisions: int) -> EnvSpec:
 
 def plain(value: Any) -> Any:
     """Return what JSON can hold in place of a keyword's value; it makes the same environment."""
-    if isinstance(value, Trajectory):
+    if isinstance(value, Trajectory | Recording):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         return {name: plain(item) for name, item in fields.items()}
     if isinstance(value, Flights):
         flown = [plain(trajectory) for trajectory in value.trajectories]
         return {"trajectories": flown, "name": value.name, "fewest_scans": value.fewest_scans}
-    if isinstance(value, Recording):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
-        return {name: plain(item) for name, item in fields.items()}
     if isinstance(value, enum.Enum):
         return value.value
     if isinstance(value, numpy.ndarray | numpy.generic):

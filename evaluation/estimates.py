@@ -1,8 +1,6 @@
 """What every competitor has estimated, as a file that other programs read."""
 
-import csv
 from pathlib import Path
-from typing import Any
 
 import numpy
 import xarray
@@ -52,22 +50,14 @@ def write_estimates(path: Path, dataset: xarray.Dataset) -> None:
 
 
 def _write_csv(path: Path, found: xarray.Dataset) -> None:
-    components = found["component"].values.tolist()
-    series = [name for name in SERIES if name in found]
-    vectors = [name for name in ("estimate", "sigma", "truth") if name in found]
-    header = ["policy", "recording", "measurement", *series]
-    header += [f"{vector}_{component}" for vector in vectors for component in components]
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for policy in found["policy"].values.tolist():
-            run = found.sel(policy=policy)
-            for episode, recording in enumerate(found["recording"].values.tolist()):
-                one = run.isel(episode=episode)
-                columns: list[Any] = [one[name].values[:, None] for name in series]
-                rows = numpy.concatenate([*columns, *(one[name].values for name in vectors)], axis=1)
-                # Beyond the end of a shorter episode there is none.
-                there = numpy.isfinite(one["estimate"].values[:, 0])
-                for row in numpy.flatnonzero(there).tolist():
-                    cells = ["" if value != value else repr(value) for value in rows[row].tolist()]
-                    writer.writerow([policy, recording, row + 1, *cells])
+    columns = {name: found[name] for name in SERIES if name in found}
+    for name in ("estimate", "sigma", "truth"):
+        if name in found:
+            for component in found["component"].values.tolist():
+                columns[f"{name}_{component}"] = found[name].sel(component=component, drop=True)
+    numbered = {"measurement": ("time", 1 + numpy.arange(found.sizes["time"]))}
+    flat = xarray.Dataset(columns).drop_vars("time", errors="ignore").assign(numbered)
+    table = flat.to_dataframe(dim_order=["policy", "episode", "time"]).reset_index()
+    # Beyond the end of a shorter episode there is no estimate.
+    there = numpy.isfinite(table[next(name for name in columns if name.startswith("estimate_"))])
+    table[there].to_csv(path, columns=["policy", "recording", "measurement", *columns], index=False)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pandas
 import pytest
 import xarray
 from filtergym.envs.catalogue import make_task, task_class
@@ -490,7 +491,7 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
     time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
     x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
-    found = plot_measurements(Columns("track", {"x": x, "y": x + 1.0}, time, {}))
+    found = plot_measurements(Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {}))
     said = found.measurements
     assert set(said) == set(fields)
     assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]

@@ -178,21 +178,19 @@ def _variances(columns: Columns, position: numpy.ndarray, there: numpy.ndarray) 
 
 def _scans(columns: Columns, first: int, interval: float) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Rows and times of all scans after the start; -1 for scans that have no row, put evenly into gaps."""
-    rows: list[int] = []
-    times: list[float] = []
-    for row in range(first + 1, len(columns.time)):
-        last, now = float(columns.time[row - 1]), float(columns.time[row])
-        missed = round((now - last) / interval) - 1
-        if missed > LARGEST_GAP:
-            raise ValueError(
-                f"{now - last:g} s lie between rows {row - 1} and {row}, {missed:,} scans of {interval:g} s: cut it"
-            )
-        for i in range(1, missed + 1):
-            rows.append(-1)
-            times.append(last + (now - last) * i / (missed + 1))
-        rows.append(row)
-        times.append(now)
-    return numpy.array(rows), numpy.array(times)
+    before, now = columns.time[first:-1], columns.time[first + 1 :]
+    scans = numpy.maximum(numpy.rint((now - before) / interval).astype(int), 1)
+    if scans.max() > LARGEST_GAP + 1:
+        gap = int(numpy.argmax(scans > LARGEST_GAP + 1))
+        raise ValueError(
+            f"{now[gap] - before[gap]:g} s lie between rows {first + gap} and {first + gap + 1}, {scans[gap] - 1:,} "
+            f"scans of {interval:g} s: cut it"
+        )
+    step = numpy.repeat(numpy.arange(len(scans)), scans)
+    number = numpy.arange(1, len(step) + 1) - (numpy.cumsum(scans) - scans)[step]
+    between = before[step] + (now - before)[step] * number / scans[step]
+    last = number == scans[step]
+    return numpy.where(last, first + 1 + step, -1), numpy.where(last, now[step], between)
 
 
 def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray]:
@@ -202,8 +200,7 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
         time: of the start, and of the scans, ``(1 + T,)``.
         seen: whether a scan has a plot, ``(T,)``.
     """
-    elapsed, last = [], time[0]
-    for now, has in zip(time[1:], seen, strict=True):
-        elapsed.append(now - last)
-        last = now if has else last
-    return {"interval": numpy.diff(time), "elapsed": numpy.array(elapsed)}
+    import pandas
+
+    last = pandas.Series(numpy.where([True, *seen], time, numpy.nan)).ffill().to_numpy()[:-1]
+    return {"interval": numpy.diff(time), "elapsed": time[1:] - last}
