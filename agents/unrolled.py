@@ -219,7 +219,7 @@ class Unrolled:
                 rollout.action[measurement, :, :count] = action
                 rollout.noise[measurement] = self._lanes.next_row()
                 rollout.forward()
-                paid += float(rollout.paid[:count].sum())
+                paid += float(rollout.reward[:count].sum())
                 if interval > 1:
                     mean = mean + rollout.shown[self._mean, :count]
             self._observation = rollout.shown[:, :count].copy()
@@ -228,7 +228,7 @@ class Unrolled:
         if not numpy.isfinite(rollout.action[: decisions * interval]).all():
             raise ValueError("the policy has answered with what are no finite numbers")
         share = 1.0 / (count * decisions * interval)
-        rollout.paid_adjoint[:count] = -share
+        rollout.reward_adjoint[:count] = -share
         rollout.backward_from_here()
         policy.backward_from_here()
         rollout.shown_adjoint[...] = 0.0

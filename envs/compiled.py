@@ -1,7 +1,7 @@
 """Tasks whose steps are compiled: the same functions, traced once and run as code of the processor.
 
 :func:`compiled` returns a task that is used like any other; its methods run native code. :class:`Stepper` goes
-further for whoever only steps: it keeps the episodes in its own memory, bound to the code once and for all.
+further where episodes are only stepped: it keeps the episodes in its own memory, bound to the code once and for all.
 """
 
 import functools
@@ -50,7 +50,7 @@ MANY = 64
 
 
 Report = Callable[[Task, Episode], Any]
-"""What somebody wants to know of every episode after the action: nested tuples or dictionaries of arrays."""
+"""Function of a task and its episodes after the action: nested tuples or dictionaries of arrays."""
 
 
 # A step in four parts. Apart, because scenarios differ in the world, controls in the action and callers in the report:
@@ -103,7 +103,7 @@ class Parts(NamedTuple):
 def stepped(
     kind: str, task: Task, episode: Episode, action: Array, noise: Array
 ) -> tuple[Episode, Array, Array]:
-    """A whole step: episodes at the next measurement, what is paid for the action, and what is shown."""
+    """A whole step: episodes at the next measurement, the reward of the action, and the observation."""
     after = task.act(episode, action)
     following = task.measure(after, noise)
     return following, OWN_PAY[kind](task, after), task.observe(following)

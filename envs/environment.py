@@ -97,7 +97,7 @@ def _unexpected_action(expected: str, action: Array) -> ValueError:
 
 
 def _no_truth(course: Course) -> str:
-    return f"recording {course.names[0]!r} has no truth, so nobody knows what an estimate costs"
+    return f"recording {course.names[0]!r} has no truth, so the cost of an estimate is not known"
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class _EnvBase:
             self._scaled_errors = self.task.constant(numpy.zeros((count, len(self.task.components))))
 
     def _disable_reward(self, course: Course) -> None:
-        """Set every reward to zero, where nobody knows the truth.
+        """Set every reward to zero, where the truth is not known.
 
         Raises:
             ValueError: if a reward was asked for, or what is privileged.
@@ -223,7 +223,9 @@ class _EnvBase:
             (1.0,) if mixture is None else tuple(mixture.values()),
         )
         if hasattr(self, "task") and self.reward_kind != "none" and not all(t.has_truth for t in tasks):
-            raise ValueError(f"{_no_truth(course)}, and this environment pays: make another one of it")
+            raise ValueError(
+                f"{_no_truth(course)}, and this environment gives rewards: make another one of it"
+            )
         first = getattr(self, "task", tasks[0])
         for task, name in zip(tasks, names, strict=True):
             check_alike(first, task, name)
@@ -363,7 +365,7 @@ class _EnvBase:
         if self.privileged:
             self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
         info.update(self._gathered(infos)[0])
-        return self.fleet.gather([paid for paid, _ in answers])
+        return self.fleet.gather([reward for reward, _ in answers])
 
     def _step_part(
         self, lanes: Lanes, action: Array, info: dict[str, Array], watch: Callable[[Any], None] | None
@@ -514,7 +516,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = checked_action(self.action_space, action, None)
         info: dict[str, Any] = {}
-        paid = self._step_lanes(array[None], info)
+        reward = self._step_lanes(array[None], info)
         if self._late is not None:
             self._late.keep(array)
             self._show()
@@ -522,7 +524,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
             info = {name: values[0] for name, values in info.items()}
         if self.options.context:
             self._with_context(info)
-        reward = float(self._rounded(paid)[0])
+        reward = float(self._rounded(reward)[0])
         return self._shown_alone(), reward, False, bool(self.fleet.finished[0]), info
 
     def _show(self) -> None:
@@ -780,11 +782,11 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         array = self._actions(actions)
         info: dict[str, Any] = {}
-        paid = self._step_lanes(array, info, self._watch(array))
+        reward = self._step_lanes(array, info, self._watch(array))
         if waiting.any():
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self._restart(numpy.flatnonzero(waiting).tolist())
-            paid = self.task.xp.where(self._mask(waiting), 0.0, paid)
+            reward = self.task.xp.where(self._mask(waiting), 0.0, reward)
         finished = self.fleet.finished
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
@@ -801,8 +803,8 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             self._finished = finished
         if self.options.context:
             self._with_context(info, ~self._never)
-        shown, paid = self._observed(), self._rounded(paid)
-        return shown, paid, self._mask(self._never), self._mask(finished), info
+        shown, reward = self._observed(), self._rounded(reward)
+        return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
         """Return what keeps the states of this step for the pictures; None without a render mode."""

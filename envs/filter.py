@@ -1,7 +1,7 @@
 """What estimates.
 
 A **filter** starts where everyone starts, predicts to every measurement, updates with it, and reports mean and
-covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator that somebody brings,
+covariance. Everything that competes is one: a bank of filters that a policy steers, an estimator of a user,
 a learned estimator, a reference that is told more, a bound. So there is one rollout and one compilation for all.
 
 State and measurement are NamedTuples of arrays ``(..., N)``, batch on the last axis, and are never changed in place.

@@ -55,14 +55,14 @@ class TaskStepper:
     Args:
         task: the estimation problem.
         width: lanes, a multiple of eight.
-        report: made of every episode after the action; None where nobody asks.
+        report: function of task and episodes after the action; None makes no report.
     """
 
     def __init__(self, task: Task, width: int, report: Report | None = None) -> None:
         self.task, self.width, self.report_function = task, width, report
         self._episode: Any = None
         self._shown: Array = None
-        """What is shown, ``(fields, width)``; None until somebody looks."""
+        """What is shown, ``(fields, width)``; None until it is computed."""
         self._action: Array = None
         self._report: Any = None
 
@@ -117,7 +117,7 @@ class TaskStepper:
         return self._shown
 
     def kept_shown(self) -> Array:
-        """What is shown where somebody has looked, else None: whoever goes on looks again."""
+        """What is shown where it was computed, else None."""
         return self._shown
 
     def show_means(self, fields: Sequence[int], means: Array) -> None:
@@ -132,7 +132,7 @@ class TaskStepper:
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
         shown = self.shown()[:, :count].T
-        # Contiguous, and nobody else's memory.
+        # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
 
 
@@ -143,7 +143,7 @@ class Lanes:
         task: the estimation problem; its namespace decides where arrays live.
         count: number of lanes.
         paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
-        begun: told of new episodes at the start of the track, before their first measurement.
+        begun: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
 
     Attributes:
@@ -222,7 +222,7 @@ class Lanes:
             stepper.replace(each.measure(each.begin(scenario, start), row), where)
 
     def pay(self, action: Array, kind: str) -> Array:
-        """Apply one decision and return what is paid for it, the mean over its measurements, ``(count,)``.
+        """Apply one decision and return its reward, the mean over its measurements, ``(count,)``.
 
         Args:
             action: batch first, as the action space has it.
@@ -260,7 +260,7 @@ class Lanes:
         return answers
 
     def next_row(self) -> Array:
-        """Noise of the next measurement, ``(row width, width)``, for whoever steps the episodes elsewhere."""
+        """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
         self._noise.advance()
         return self._noise.row
 
@@ -339,7 +339,7 @@ class Lanes:
         self._steppers, self._moving = {}, self._by_tasks()
         self._load(parts)
 
-    # --- for whoever steps them in an unusual way
+    # --- copies, growth, gradients
 
     def _episodes(self) -> tuple[Any, ...]:
         """Episodes of every task with what is shown of them; the arrays never change."""

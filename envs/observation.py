@@ -2,7 +2,7 @@
 
 A :class:`Block` is one quantity of the observation: a function of what the filters know, and a
 :class:`Compression` that says how it is shown. The base class of the banks derives the observation from the
-list, and a :class:`Reader` for whoever wants a quantity back: policies never undo a compression by hand.
+list, and a :class:`Reader` that gives a quantity back: policies never undo a compression by hand.
 """
 
 import functools

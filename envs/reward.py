@@ -1,13 +1,16 @@
-"""What an agent is paid for one measurement.
+"""The reward of an agent for one measurement.
 
-``cost``: minus what the world charges for the estimate, in units of what the paper's algorithm is charged
-on average, and compressed: with the charge ``x`` in that unit the agent is paid ``-30 log(1 + x / 30)``. That is about
-``-x`` while the estimator works, and falls by 30 log(2) with every doubling once the track is lost: it always pays to
-find it again, and one lost track does not drown all that can be learned elsewhere. ``log-likelihood``: the logarithm of
-the reported Gaussian's density at the truth, which pays for an honest covariance too. ``cost-and-likelihood``: the sum
-of ``cost`` and of ``log-likelihood`` over the number of components, for what must be both accurate and consistent.
-``relative``: the ``cost`` reward with what the paper's algorithm is charged on the same noise added back (a control
-variate): positive where the agent does better than the paper. Which is the default, :attr:`.Task.reward` says.
+* ``cost``: minus the charge of the estimate, in units of its average for the paper's algorithm, and compressed: of a charge
+  ``x`` in that unit the reward is ``-30 log(1 + x / 30)``. That is about ``-x`` while the estimator works, and falls by
+  30 log(2) with every doubling once the track is lost. So it is always better to find the track again, and one lost track
+  does not drown all that can be learned elsewhere.
+* ``log-likelihood``: the logarithm of the reported Gaussian's density at the truth. It rewards an honest covariance, too.
+* ``cost-and-likelihood``: the sum of ``cost`` and of ``log-likelihood`` over the number of components, for what must be both
+  accurate and consistent.
+* ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate): positive where
+  the agent does better than the paper.
+
+:attr:`.Task.reward` says which is the default.
 
 What an evaluation compares is the cost, neither compressed nor in another unit.
 """
@@ -46,7 +49,7 @@ def cost_and_likelihood_reward(task: Task, state: Any) -> Array:
 
 
 def no_reward(task: Task, state: Any) -> Array:
-    """Zero, ``(N,)``: nobody knows the truth."""
+    """Zero, ``(N,)``, where the truth is not known."""
     return 0.0 * task.mean(state)[0]
 
 
@@ -57,7 +60,7 @@ OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
     "relative": cost_reward,
     "none": no_reward,
 }
-"""What each reward pays for an estimate; from "relative" the same of the paper's algorithm is then taken away. "none"
+"""Functions of a task and its episodes; from "relative" the same of the paper's algorithm is subtracted later. "none"
 is that of recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""

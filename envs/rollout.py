@@ -40,10 +40,10 @@ def _packed(episode: Episode) -> Any:
 
 
 def _forward(programs: Programs, kind: str, state: Any, action: Any, noise: Any) -> Any:
-    """Episodes at the next measurement, what is paid, and what is shown."""
+    """Episodes at the next measurement, reward, and observation."""
     episode = _unpacked(programs.later.episode, state)
-    episode, paid, shown = stepped(kind, programs.traced, episode, action, noise)
-    return _packed(episode), paid, shown
+    episode, reward, shown = stepped(kind, programs.traced, episode, action, noise)
+    return _packed(episode), reward, shown
 
 
 def _backward(programs: Programs, kind: str, state: Any, action: Any, noise: Any, *adjoints: Any) -> Any:
@@ -67,20 +67,20 @@ def _compiled(programs: Programs, kind: str) -> tuple[Specialised, Specialised]:
 
 
 class Rollout:
-    """Episodes of a compiled task under continuous actions, with the gradient of what they are paid.
+    """Episodes of a compiled task under continuous actions, with the gradient of their rewards.
 
     Args:
         task: compiled.
-        kind: reward that is paid.
+        kind: of reward.
         width: lanes, a multiple of eight.
         measurements: that are kept at once.
 
     Attributes:
         action: of every measurement, ``(measurements, A, width)``, to be written before it is flown.
         noise: likewise, ``(measurements, row width, width)``.
-        paid: for the last action, ``(width,)``.
+        reward: of the last action, ``(width,)``.
         shown: last observation, ``(fields, width)``.
-        paid_adjoint: gradient with respect to what is paid, ``(width,)``, to be written.
+        reward_adjoint: gradient with respect to the reward, ``(width,)``, to be written.
         shown_adjoint: gradient with respect to the observation, ``(fields, width)``, to be written.
         action_adjoint: gradient with respect to the action, ``(A, width)``.
     """
@@ -92,17 +92,17 @@ class Rollout:
         self._next = empty_lanes((rows,), width)
         self.action = numpy.zeros((measurements, actions, width))
         self.noise = numpy.zeros((measurements, noise, width))
-        self.paid, self.shown = numpy.empty(width), empty_lanes((len(task.fields),), width)
-        self.paid_adjoint = numpy.zeros(width)
+        self.reward, self.shown = numpy.empty(width), empty_lanes((len(task.fields),), width)
+        self.reward_adjoint = numpy.zeros(width)
         self.shown_adjoint = numpy.zeros((len(task.fields), width))
         self.action_adjoint = numpy.zeros((actions, width))
         given = [self._states[0], self.action[0], self.noise[0]]
-        self._forward = forward.bound(given, [self._next, self.paid, self.shown])
+        self._forward = forward.bound(given, [self._next, self.reward, self.shown])
         adjoint, other = empty_lanes((rows,), width), empty_lanes((rows,), width)
         # One reads what the other has written.
         self._backward = [
             backward.bound(
-                [*given, after, self.paid_adjoint, self.shown_adjoint], [before, self.action_adjoint]
+                [*given, after, self.reward_adjoint, self.shown_adjoint], [before, self.action_adjoint]
             )
             for after, before in ((adjoint, other), (other, adjoint))
         ]

@@ -74,7 +74,7 @@ class Scenario:
     """Where every episode flies one of several: name of each, and where pieces of one flight are flown, that several
     times."""
     notes: tuple[str, ...] = ()
-    """What is to be told of where it comes from, a line each."""
+    """Notes on where it comes from, a line each."""
     recording: Any = None
     """A :class:`~.recording.Recording` that is replayed in place of a simulated world."""
 
@@ -111,7 +111,7 @@ class Episode(NamedTuple):
     truth: Any
     """What is; the world's NamedTuple."""
     measurement: Any
-    """What the sensors say; between ``begin`` and the first measurement what is told of the start."""
+    """What the sensors say; between ``begin`` and the first measurement the initial estimate."""
     filter: Any
     """State of the filter."""
 
@@ -142,7 +142,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
 
     @abstractmethod
     def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
-        """Truth at the start of the track, and what everyone is told of it.
+        """Truth at the start of the track, and the initial estimate given to every filter.
 
         Args:
             draws: what fixes the scenario of each episode.
@@ -216,8 +216,8 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return self.error_cost(mean - self.state(truth))
 
     def charge(self, truth: Truth, mean: Array) -> Array:
-        """What the reward charges for an estimate, not below zero, ``(N,)``: its cost, unless part of that is known to
-        be none of its doing.
+        """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
+        known not to be its fault.
 
         Args:
             truth: at the measurement that the estimate is for.
@@ -259,7 +259,7 @@ class Task(ABC):
     """Names of ``banks``."""
     trained_banks: ClassVar[Mapping[str, type[Bank]]] = {}
     """Filters that a network of their own steers, by the algorithm that trains it: learned estimators. An environment
-    steers them like any bank, to train them; nobody else's policy acts in them."""
+    steers them like any bank, to train them; no other policy acts in them."""
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
     of_world_only: ClassVar[tuple[str, ...]] = ()
@@ -373,7 +373,7 @@ class Task(ABC):
     @property
     def interval(self) -> float | None:
         """Seconds from one measurement to the next, where all of them are that far apart, and the first that far from
-        the start of the track; None where they come at times of their own, or nobody says.
+        the start of the track; None where they come at times of their own, or the times are not known.
 
         It is the parameter ``sampling_interval`` where there is one, unless a recording says otherwise.
         """
@@ -462,7 +462,7 @@ class Task(ABC):
 
         Args:
             mean: of the estimate, ``(C, N)``.
-            measurement: that it has taken in, or what was told of the start.
+            measurement: that it has taken in, or the initial estimate.
         """
         return None
 
@@ -564,7 +564,7 @@ class Task(ABC):
         return self.world.cost(episode.truth, self.filter.mean(episode.filter))
 
     def charge(self, episode: Episode) -> Array:
-        """What the reward charges for the estimate, ``(N,)``; see :meth:`World.charge`."""
+        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.charge`."""
         return self.world.charge(episode.truth, self.filter.mean(episode.filter))
 
     def error(self, episode: Episode) -> Array:

@@ -50,7 +50,7 @@ class SingleTrackEstimator(ABC):
         """Begin a track.
 
         Args:
-            initial: what everyone is told of it, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
+            initial: the initial estimate, without the axis of episodes; ``mean`` ``(n,)`` and ``covariance``
                 ``(n, n)`` are those of ``state``, zero for what is no component of the task.
         """
 

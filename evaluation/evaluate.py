@@ -96,7 +96,7 @@ def _measured(task: Task, episode: Episode) -> dict[str, Any]:
 
 
 def _said(task: Task, episode: Episode) -> dict[str, Any]:
-    """What is kept where nobody knows the truth."""
+    """What is kept where the truth is not known."""
     return task.records(episode)
 
 
@@ -442,7 +442,7 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
 
 
 def _check_told(kinds: Mapping[str, Kind], name: str) -> None:
-    """Raise ValueError for whoever is told more than a recording holds."""
+    """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
         if kind not in RANKED:
             raise ValueError(

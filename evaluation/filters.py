@@ -28,7 +28,7 @@ from .dataset import FAULTS
 
 @contextmanager
 def explain_errors(what: str) -> Iterator[None]:
-    """Turn whatever somebody else's code raises into one sentence with the line that raised it."""
+    """Turn what a user's code raises into one sentence with the line that raised it."""
     try:
         yield
     except Exception as error:
@@ -123,8 +123,8 @@ class EstimatorFilter(ReferenceFilter):
     """An estimator in the loop, see :class:`.competitors.Estimator`, whose answers are checked.
 
     An episode in which an answer is not finite, or no covariance, is lost from that measurement on: the last valid
-    answer, or else the initial estimate, is held to the end. Any estimator could give that answer itself, so that
-    nobody gains by losing an episode.
+    answer, or else the initial estimate, is held to the end. Any estimator could give that answer itself, so
+    that losing an episode is no advantage.
     """
 
     def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:

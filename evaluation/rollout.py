@@ -16,7 +16,7 @@ from .filters import put_in_loop
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
-"""Told the number of measurements just done."""
+"""Called with the number of measurements just done."""
 
 
 def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
@@ -25,7 +25,7 @@ def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], N
     Args:
         task: the estimation problem.
         seeds: of the episodes.
-        begun: told of the episodes at the start of the track.
+        begun: called with the episodes at the start of the track.
     """
     lanes = Lanes(task, len(seeds), begun=begun)
     for lane, seed in enumerate(seeds):
@@ -95,7 +95,7 @@ def run_competitor(
         kind: likewise.
         seeds: likewise.
         report: of arrays ``(..., N)`` by name.
-        tick: told of progress.
+        tick: called with the number of measurements just done.
         name: of the competitor, in errors.
         first_episode: number of the first episode, in errors.
         actions: of a policy whose action is a box, report too what was applied: ``action``, ``(episodes, time, A)``,

@@ -41,7 +41,7 @@ def transitions_of(
         id: environment id.
         policy: made for it; its ``keywords`` make the environment.
         seeds: of the episodes.
-        tick: told the number of decisions done.
+        tick: called with the number of decisions done.
         **keywords: further ones of ``gymnasium.make_vec``, such as ``reward`` or ``dtype``.
 
     Returns:

@@ -69,7 +69,7 @@ class Measurement(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What everyone is told of the start of the track."""
+    """The initial estimate given to every filter."""
 
     mean: Array
     """Range (m) and range rate (m/s) as first measured, acceleration 0, ``(3, N)``."""

@@ -177,7 +177,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return self.xp.log(ordered_sum(self.trace_weights * variances))
 
     def start(self, initial: Start) -> Filter:
-        """Start as everyone is told, with averages as a consistent filter has them."""
+        """Start at the initial estimate, with averages as a consistent filter has them."""
         xp = self.xp
         zeros = 0.0 * self.task.readings_of(initial.mean)
         one = zeros[0] + 1.0

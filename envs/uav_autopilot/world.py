@@ -49,7 +49,7 @@ class Truth(NamedTuple):
 
 
 class Start(NamedTuple):
-    """What everyone is told of the start."""
+    """The initial estimate given to every filter."""
 
     mean: Array
     """Zero, ``(n, N)``."""
