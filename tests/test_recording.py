@@ -211,7 +211,7 @@ def test_without_truth_rewards_are_zero_and_nothing_is_judged(recordings):
     vector.reset(seed=0)
     assert vector.step(vector.action_space.sample())[1].tolist() == [0.0] * 3
     for keywords in ({"reward": "cost"}, {"observation": "asymmetric"}):
-        with pytest.raises(ValueError, match="has no truth, so nobody knows what an estimate costs"):
+        with pytest.raises(ValueError, match="has no truth, so the cost of an estimate is not known"):
             gym.make(TARGET, scenario=recording, **keywords)
     paying = gym.make(TARGET, horizon=24).unwrapped
     with pytest.raises(ValueError, match="and this environment pays: make another one"):
