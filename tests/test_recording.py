@@ -214,7 +214,7 @@ def test_without_truth_rewards_are_zero_and_nothing_is_judged(recordings):
         with pytest.raises(ValueError, match="has no truth, so the cost of an estimate is not known"):
             gym.make(TARGET, scenario=recording, **keywords)
     paying = gym.make(TARGET, horizon=24).unwrapped
-    with pytest.raises(ValueError, match="and this environment pays: make another one"):
+    with pytest.raises(ValueError, match="and this environment gives rewards: make another one"):
         paying.reset(options={"scenario": recording})
     paying.reset(options={"scenario": recordings[TARGET]}, seed=0)
     assert paying.step(paying.action_space.sample())[1] != 0.0
