@@ -148,6 +148,7 @@ class Lanes:
 
     Attributes:
         decisions: actions taken in each lane's current episode, ``(count,)``.
+        noise: random numbers of the episodes.
     """
 
     def __init__(
@@ -168,7 +169,7 @@ class Lanes:
         """Those of compiled tasks, by what they report."""
         self._moving: list[Any] = []
         """Steppers that hold the episodes, of the task and of the paper's; none before the first episode."""
-        self._noise = NoiseRing(task, count)
+        self.noise = NoiseRing(task, count)
         self.decisions = numpy.zeros(count, dtype=numpy.int64)
         horizon = task.horizon // task.decision_interval
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
@@ -189,14 +190,14 @@ class Lanes:
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
         """Give a lane the generator that its coming episodes are drawn from."""
-        self._noise.seed(lane, generator)
+        self.noise.seed(lane, generator)
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
         """Start new episodes in some lanes (default: all) and let their first measurement arrive."""
         task, xp = self.task, self.task.xp
         everyone = lanes is None or len(lanes) == self.count
         chosen: Sequence[int] = range(self.count) if lanes is None or everyone else list(lanes)
-        uniforms, normals = self._noise.draw_episodes(chosen)
+        uniforms, normals = self.noise.draw_episodes(chosen)
         index = numpy.asarray(chosen)
         self.decisions[index] = 0
         if task.flights:
@@ -209,10 +210,10 @@ class Lanes:
         if everyone:
             self._moving = self._moving or self._by_tasks()
             for stepper in self._moving:
-                stepper.begin(scenario, start, self._noise)
+                stepper.begin(scenario, start, self.noise)
             return
         where = index if xp is numpy else xp.asarray(chosen, device=task.device)
-        row = self._noise.row[:, where]
+        row = self.noise.row[:, where]
         padding = padded_width(len(chosen)) - len(chosen)
         if padding:
             row = xp.concat(
@@ -248,9 +249,9 @@ class Lanes:
         answers: list[tuple[Any, Any]] = []
         total: Any = 0.0
         for _ in range(self.task.decision_interval):
-            self._noise.advance()
+            self.noise.advance()
             for stepper in steppers:
-                stepper.step(self._noise)
+                stepper.step(self.noise)
             answers.append((own.report(), steppers[1].report() if self.paper else None))
             if self._averaged:
                 total = total + own.shown()[self._averaged]
@@ -261,8 +262,8 @@ class Lanes:
 
     def next_row(self) -> Array:
         """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""
-        self._noise.advance()
-        return self._noise.row
+        self.noise.advance()
+        return self.noise.row
 
     # --- what steps them
 
@@ -334,7 +335,7 @@ class Lanes:
         added = count - self.count
         self.decisions = numpy.append(self.decisions, numpy.zeros(added, dtype=numpy.int64))
         self._lengths = numpy.append(self._lengths, numpy.full(added, self.decisions_per_episode))
-        self._noise.grow(count, index)
+        self.noise.grow(count, index)
         self.count = self.width = count
         self._steppers, self._moving = {}, self._by_tasks()
         self._load(parts)
@@ -357,7 +358,7 @@ class Lanes:
         """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
         self._settle()
         kept = {"decisions": self.decisions.copy(), "_lengths": self._lengths.copy()}
-        return {"count": self.count, "episodes": self._episodes(), "noise": self._noise.snapshot(), **kept}
+        return {"count": self.count, "episodes": self._episodes(), "noise": self.noise.snapshot(), **kept}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go on from a snapshot of lanes of the same task.
@@ -367,7 +368,7 @@ class Lanes:
         """
         if snapshot["count"] != self.count:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
-        self._noise.restore(snapshot["noise"])
+        self.noise.restore(snapshot["noise"])
         self.decisions, self._lengths = snapshot["decisions"].copy(), snapshot["_lengths"].copy()
         self._moving = self._by_tasks() if snapshot["episodes"] else []
         self._load(snapshot["episodes"])

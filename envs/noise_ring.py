@@ -39,7 +39,7 @@ class NoiseRing:
     def __init__(self, task: Task, count: int) -> None:
         self.task, self._layout = task, task.noise
         self._width = padded_width(count)
-        self._generators: list[numpy.random.Generator] = []
+        self.generators: list[numpy.random.Generator] = []
         self._children: list[numpy.random.Generator | None] = [None] * count
         rows = task.horizon + 1
         self._row_width = task.noise.normals + task.noise.row_uniforms
@@ -54,9 +54,9 @@ class NoiseRing:
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
         """Give a lane the generator that its coming episodes are drawn from."""
-        while len(self._generators) <= lane:
-            self._generators.append(generator)
-        self._generators[lane] = generator
+        while len(self.generators) <= lane:
+            self.generators.append(generator)
+        self.generators[lane] = generator
 
     def draw_episodes(self, lanes: Sequence[int]) -> tuple[numpy.ndarray, numpy.ndarray]:
         """Draw new episodes: return uniforms and initial normals, lanes last; the rows go into the ring."""
@@ -64,7 +64,7 @@ class NoiseRing:
         self._started[numpy.asarray(lanes)] = self._clock
         uniforms = numpy.empty((len(lanes), layout.uniforms))
         normals = numpy.empty((len(lanes), layout.initial_normals))
-        generators = [self._generators[lane] for lane in lanes]
+        generators = [self.generators[lane] for lane in lanes]
         if layout.uniforms:
             for generator, numbers in zip(generators, uniforms, strict=True):
                 generator.random(out=numbers)
@@ -153,7 +153,7 @@ class NoiseRing:
         added = count - len(self._started)
         self._started = numpy.append(self._started, numpy.repeat(self._started[:1], added))
         # None that belongs to another lane: long episodes draw from theirs as they go.
-        self._generators += [numpy.random.default_rng(0) for _ in range(added)]
+        self.generators += [numpy.random.default_rng(0) for _ in range(added)]
         self._children += [child and numpy.random.default_rng(0) for child in self._children[:1] * added]
         if self._ring is not None:
             self._ring = self.task.xp.take(self._ring, index, axis=-1)

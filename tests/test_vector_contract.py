@@ -143,7 +143,7 @@ def test_same_noise_under_every_control(env_id, short, random_actions):
         env = native(env_id, 2, control=control, **short)
         env.reset(seed=4)
         lanes = env.unwrapped.fleet.only
-        rows.append([generator.bit_generator.state["state"]["state"] for generator in lanes.generators])
+        rows.append([generator.bit_generator.state["state"]["state"] for generator in lanes.noise.generators])
     assert all(row == rows[0] for row in rows)
 
 
