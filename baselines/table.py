@@ -32,6 +32,7 @@ class Tunable:
 def tunable(
     make: Callable[..., Any],
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]] | None = None,
+    /,
     **values: tuple[float, float, float],
 ) -> Tunable:
     """Declare which keywords of a policy or an estimator are tuned.

@@ -374,8 +374,9 @@ class _EnvBase:
         task, count = lanes.task, lanes.count
         asked = step_report(self.reward_kind, self.privileged, self.options.detailed_info, watch is not None)
         answers = lanes.decide(action, asked)
-        for own, _ in answers if watch is not None else ():
-            watch(own.episode)
+        if watch is not None:
+            for own, _ in answers:
+                watch(own.episode)
         last = answers[-1][0]
         for name, values in (last.details or {}).items():
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)

@@ -234,7 +234,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         return xp.stack([f.mean for f in filters], axis=1), xp.stack(covariances, axis=2)
 
 
-ESTIMATORS = {
+ESTIMATORS: dict[str, Any] = {
     "mehra": Variant(
         AdaptiveKalman,
         "The paper's filter, each sensor's noise by the mean square of its last innovations (Mehra 1972).",
