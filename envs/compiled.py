@@ -60,7 +60,7 @@ Report = Callable[[Task, Episode], Any]
 def _updated(task: Task, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
     """Filter after the measurement, and what it gives back to the world."""
     after = task.filter.update(state, Input(measurement, truth, action))
-    return after, task.filter.feedback(after)
+    return after, task.filter.feedback(after, measurement)
 
 
 def _advanced(task: Task, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
@@ -82,12 +82,12 @@ def _world_begun(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]
 def _filter_started(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
     state = task.filter.begin(Input(initial, truth))
-    return state, task.filter.feedback(state)
+    return state, task.filter.feedback(state, initial)
 
 
-def _feedback(task: Task, state: Any) -> Any:
+def _feedback(task: Task, state: Any, measurement: Any) -> Any:
     """What a filter gives back to the world."""
-    return task.filter.feedback(state)
+    return task.filter.feedback(state, measurement)
 
 
 class Parts(NamedTuple):
@@ -298,7 +298,7 @@ class _Compiled(Task):
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
         functions, threads = self.programs, self.threads
-        feedback = self.run(_feedback, episode.filter)
+        feedback = self.run(_feedback, episode.filter, episode.measurement)
         truth, measurement = functions.advanced(episode.truth, feedback, noise, threads=threads)
         state, _ = functions.predicted(episode.filter, measurement, threads=threads)
         return Episode(truth, measurement, state)

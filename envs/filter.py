@@ -100,9 +100,15 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
     def covariance(self, state: State) -> Array:
         """Covariance that is reported for it, ``(C, C, N)``."""
 
-    def feedback(self, state: State) -> Any:
-        """Report what a closed loop gives back to the world; None in an open loop."""
-        return None
+    def feedback(self, state: State, measurement: Any) -> Any:
+        """Report what a closed loop gives back to the world, by default what follows from the estimate; None in an
+        open loop.
+
+        Args:
+            state: after :meth:`start` or :meth:`update`.
+            measurement: that it has taken in, or the initial estimate.
+        """
+        return self.task.feedback(self.mean(state), measurement)  # type: ignore[attr-defined]
 
     def records(self, state: State, measurement: Measurement) -> dict[str, Array]:
         """Report what else an evaluation keeps of each measurement: arrays ``(N,)``, or ``(M, N)`` for

@@ -404,7 +404,7 @@ def measured_once(task: Task) -> tuple[Any, Any]:
     draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
     truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
     bank = task.bank.start(initial)
-    if task.bank.feedback(bank) is not None:
+    if task.bank.feedback(bank, initial) is not None:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
             "what the sensors said to one estimate is not what they would have said to another, and can be neither "

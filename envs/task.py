@@ -458,7 +458,8 @@ class Task(ABC):
         return numpy.asarray(self.flights)[self.flight_of(uniforms)]
 
     def feedback(self, mean: Array, measurement: Any) -> Any:
-        """Report what an estimate of any other filter than a bank gives back to the world; None in an open loop.
+        """Report what an estimate gives back to the world; None in an open loop. A filter may give back something
+        else, see :meth:`Filter.feedback`.
 
         Args:
             mean: of the estimate, ``(C, N)``.
@@ -534,7 +535,7 @@ class Task(ABC):
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
-        feedback = self.filter.feedback(episode.filter)
+        feedback = self.filter.feedback(episode.filter, episode.measurement)
         truth, measurement = self.world.advance(episode.truth, noise, feedback)
         return Episode(truth, measurement, self.filter.predict(episode.filter, measurement))
 

@@ -55,8 +55,6 @@ class Estimated(NamedTuple):
     """``(C, C, N)``."""
     memory: Any
     """Its own; None of what runs in Python."""
-    feedback: Any
-    """What a closed loop is given of the mean."""
     likelihood: Likelihood
     """Of the last measurement, NaN where it is not told."""
     fault: Array
@@ -89,18 +87,14 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
 
     def _started(self, initial: Any, memory: Any) -> Estimated:
         zero = 0.0 * initial.mean[0]
-        feedback = self.task.feedback(initial.mean, initial)
         nothing = Likelihood(zero + math.nan).filled()
-        return Estimated(initial.mean, initial.covariance, memory, feedback, nothing, zero, zero)
+        return Estimated(initial.mean, initial.covariance, memory, nothing, zero, zero)
 
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Take its answer as it is."""
         mean, covariance, memory, *told = self.own.update(given.measurement, given.truth, state.memory)
-        feedback = self.task.feedback(mean, given.measurement)
         likelihood = Likelihood.of(*told).filled() if told else state.likelihood
-        return state._replace(
-            mean=mean, covariance=covariance, memory=memory, feedback=feedback, likelihood=likelihood
-        )
+        return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
 
     def mean(self, state: Estimated) -> Array:
         """Last valid answer."""
@@ -109,10 +103,6 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
     def covariance(self, state: Estimated) -> Array:
         """Covariance of it."""
         return state.covariance
-
-    def feedback(self, state: Estimated) -> Any:
-        """Arrow back as it follows from the mean."""
-        return state.feedback
 
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was."""
@@ -143,12 +133,10 @@ class EstimatorFilter(ReferenceFilter):
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
         lost = fault > 0.0
-        mean = self._held(lost, state.mean, mean)
         return Estimated(
-            mean,
+            self._held(lost, state.mean, mean),
             self._held(lost, state.covariance, covariance),
             memory,
-            self.task.feedback(mean, given.measurement),
             Likelihood.of(*told).filled() if told else state.likelihood,
             fault,
             missed,
@@ -263,9 +251,9 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         """That of the bank."""
         return self.bank.covariance(state.bank)
 
-    def feedback(self, state: LimitState) -> Any:
+    def feedback(self, state: LimitState, measurement: Any) -> Any:
         """That of the bank."""
-        return self.bank.feedback(state.bank)
+        return self.bank.feedback(state.bank, measurement)
 
     def records(self, state: LimitState, measurement: Any) -> dict[str, Array]:
         """The limit."""

@@ -209,7 +209,7 @@ def test_what_the_sensors_hide_is_not_measured(hidden):
 def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
     task = make("paper", control)
     *_, (_, _, _, state) = drive(task, 8, 7, 5)
-    expected = task.bank.feedback(state.filter)
+    expected = task.bank.feedback(state.filter, state.measurement)
     row = numpy.zeros((task.noise.normals, 8))
     far = expected.copy()
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
@@ -221,7 +221,7 @@ def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
         assert (said.available[:4, :4] == 1.0).all()
         assert (said.available[4:8, 4:] == 1.0).all()
         assert (said.available[8:] == 1.0).all()
-    assert make("matched", control).bank.feedback(state.filter) is None
+    assert make("matched", control).bank.feedback(state.filter, state.measurement) is None
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)

@@ -266,9 +266,7 @@ def test_monte_carlo_of_the_reference_table(
         shown = state.filter.nis
         state = task.act(state, action)
         if feedback == "true":
-            true = state.truth.state
-            steered = task.feedback(true, state.measurement)
-            state = state._replace(filter=state.filter._replace(estimate=true, control=steered))
+            state = state._replace(filter=state.filter._replace(estimate=state.truth.state))
         if k >= burn:
             _, nees = gaussian.log_density(task.error(state), task.covariance(state))
             record = task.records(state)

@@ -182,10 +182,6 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         """Of the Kalman filter."""
         return state.covariance
 
-    def feedback(self, state: Filter) -> Array:
-        """Torque that holds the estimated pendulum upright."""
-        return self.task.feedback(state.mean, None)
-
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
         """NIS and the factor on the process noise."""
         return {"nis": state.nis, "nis_degrees": 1.0 + 0.0 * state.nis, "scale": state.scale}

@@ -215,7 +215,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         combined = weighted_sum(chain.probabilities, mean)
         return Prediction(mean, covariance, imm.log_probabilities(chain.probabilities), combined)
 
-    def feedback(self, state: Filters) -> Array | None:
+    def feedback(self, state: Filters, measurement: Any) -> Array | None:
         """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
         return state.predicted.combined if self.parameters.aperture else None
 

@@ -23,7 +23,7 @@ FLOORED_LOG = Compression("log of ", lambda value, xp: xp.log(xp.clip(value, 0.0
 
 
 class Filter(NamedTuple):
-    """N Kalman filters, and the controls that follow from them."""
+    """N Kalman filters."""
 
     mean: Array
     """After ``predict`` predicted, after ``act`` updated, ``(n, N)``."""
@@ -33,8 +33,6 @@ class Filter(NamedTuple):
     """What the autopilot uses and the task reports, ``(n, N)``."""
     estimate_covariance: Array
     """Packed triangle of its covariance."""
-    control: Array
-    """u that follows from it and from the command, ``(N,)``."""
     scale: Array
     """Factor on the process noise in the last update, ``(N,)``."""
     action: Array
@@ -187,7 +185,6 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             covariance=covariance,
             estimate=initial.mean,
             estimate_covariance=covariance,
-            control=self.task.autopilot(initial.mean, initial.command),
             scale=one,
             action=xp.stack([value * one for value in self.no_action]),
             innovation=zeros,
@@ -239,7 +236,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         return update.mean, update.covariance
 
     def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
-        """Equations (12), (11) with the noises that the action asks for, and the control."""
+        """Equations (12), (11) with the noises that the action asks for."""
         shown, scale = self.steered(action)
         update = packed_covariance.update_coordinates(
             state.mean,
@@ -255,7 +252,6 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             covariance=update.covariance,
             estimate=estimate,
             estimate_covariance=covariance,
-            control=self.task.autopilot(estimate, measurement.command),
             scale=scale,
             action=shown,
         )
@@ -267,10 +263,6 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
     def covariance(self, state: Filter) -> Array:
         """Covariance reported for it, ``(n, n, N)``."""
         return packed_covariance.unpack(state.estimate_covariance, len(self.task.components))
-
-    def feedback(self, state: Filter) -> Array:
-        """Report the control that follows from the estimate and the command, ``(N,)``."""
-        return state.control
 
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
         """NIS with the number of its readings, their log-density (both NaN in a dropout of all sensors), and the

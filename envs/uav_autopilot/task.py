@@ -172,7 +172,7 @@ class UavAutopilot(Task):
         """What is fed back is recorded too: the control that follows from the estimate."""
         return {
             **super().records(episode),
-            "control_signal": self.filter.feedback(episode.filter),
+            "control_signal": self.filter.feedback(episode.filter, episode.measurement),
         }
 
 
