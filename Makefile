@@ -91,7 +91,7 @@ distributions: $(VENV)/.dev  ## build what would be published; try the wheel, an
 check: $(VENV)/.dev  ## format, lint and types
 	$(BIN)/ruff format --check $(SOURCES)
 	$(BIN)/ruff check $(SOURCES)
-	rm -rf $(VENV)/typed
+	rm -rf $(VENV)/typed build/lib
 	$(BIN)/python -m pip install --quiet --no-deps --target $(VENV)/typed .
 	cp -r papers/. $(VENV)/typed/filtergym/papers
 	MYPYPATH=$(VENV)/typed $(BIN)/mypy -p filtergym

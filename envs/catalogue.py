@@ -305,7 +305,7 @@ def read_recording(
 
     Args:
         path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.recorded_columns`. A
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.log_format`. A
             folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
             broken one is left out and named in the notes.
         environment: id of the environment that it is for; default: what the file says.
@@ -393,10 +393,8 @@ def find_scenario(
             f"got {scenario!r}"
         )
     scenario = opened(cls, scenario)
-    if isinstance(scenario, Trajectory):
-        return cls.scenario_from_trajectory(scenario, keywords or {})
-    if isinstance(scenario, Flights):
-        return cls.scenario_from_flights(scenario, keywords or {})
+    if isinstance(scenario, (Trajectory, Flights)):
+        return cls.scenario_of_flights(scenario, keywords or {})
     if isinstance(scenario, Recording):
         return scenario.scenario(cls, keywords or {})
     name = cls.default_scenario if scenario is None else scenario

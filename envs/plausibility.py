@@ -226,7 +226,8 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
     Args:
         recording: what was read.
         task: that replays it.
-        speeds: lowest and highest that are possible, m/s; the lowest holds where ``task.targets_move``.
+        speeds: lowest and highest that are possible, m/s; the lowest holds where targets always
+            move, see :class:`.LogFormat`.
 
     Returns:
         What is noteworthy, a line each.
@@ -235,6 +236,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
         ValueError: for the first episode that cannot be true.
     """
     world: Any = task.world  # a RecordedWorld
+    moving = task.log_format is not None and task.log_format.targets_move
     seen, sigma = world.all_seen()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
@@ -254,14 +256,14 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
                 position, deviation = seen[measured, own].T[there], _length(sigma[measured, own].T[there])
             known = len(measured) > 0 and there.sum() >= 3
             if known:
-                _check_scale(time[there], position, deviation, speeds, task.targets_move)
+                _check_scale(time[there], position, deviation, speeds, moving)
             if truth is not None and rows >= 3:
                 _check_truth(time, truth, [component.name for component in task.components])
             if not known:
                 continue
             if truth is not None:
                 _check_apart(position, truth[there][:, measured], deviation)
-            found = _notes(time[there], position, deviation, 1 + numpy.flatnonzero(there), task.targets_move)
+            found = _notes(time[there], position, deviation, 1 + numpy.flatnonzero(there), moving)
         except ValueError as error:
             raise ValueError(f"{name}{error}") from error
         notes += [f"{name}{note}" for note in found]

@@ -1,17 +1,17 @@
 """Tables of what sensors said, one row a measurement, as they come out of a radar, a receiver or a logger.
 
-An environment says which columns it knows (:attr:`.Task.recorded_columns`) and makes measurements of them
-(:meth:`.Task.recorded`). What every table has in common is here: times, missing values, several recordings in one file,
-and true values, ``truth_NAME`` for every component of the environment.
+An environment says which columns it knows and makes measurements of them (:class:`.LogFormat`). What every table has in
+common is here: times, missing values, several recordings in one file, and true values, ``truth_NAME`` for every component of the environment.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
+from .log_format import TrackLog
 from .plausibility import check_interval, ignored_columns
 from .recording import Recording, measured_once, side_by_side
 from .task import Task
@@ -119,23 +119,6 @@ class Columns:
         return interval
 
 
-class Recorded(NamedTuple):
-    """What an environment makes of the columns of one recording; T measurements."""
-
-    measurements: Mapping[str, numpy.ndarray]
-    """``(T, ...)``."""
-    initial: Mapping[str, numpy.ndarray]
-    """``(...)``."""
-    rows: numpy.ndarray
-    """Row of the table that each measurement is of, ``(T,)``; -1 where it is of none."""
-    parameters: Mapping[str, Any]
-    """That follow from the table."""
-    start: float
-    """Time of the start of the track, s, as in the table."""
-    time: numpy.ndarray
-    """Of the measurements, likewise, ``(T,)``."""
-
-
 def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Recording:
     """Read a table of what sensors said.
 
@@ -147,19 +130,20 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
     """
-    if not cls.recorded_columns:
+    log_format = cls.log_format
+    if log_format is None:
         measured_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
-    known = _Known({*TIME, RECORDING, *cls.recorded_columns})
+    known = _Known({*TIME, RECORDING, *log_format.columns})
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     read, names = read_table(path, known)
     names = [name.lower() for name in names]
     time_name = next((name for name in TIME if name in read), None)
-    if time_name is None or not any(name in read for name in cls.recorded_columns):
+    if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
             f"it has the columns {', '.join(names) or 'none'}, and {cls.id} reads time and "
-            f"{', '.join(cls.recorded_columns)}"
+            f"{', '.join(log_format.columns)}"
         )
     table = read.drop(columns=[*TIME, RECORDING], errors="ignore")
     for name in table:
@@ -173,13 +157,13 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
         try:
             _check_times(own.time)
             if "sampling_interval" not in keywords:
-                check_interval(own.interval(), cls.longest_interval)
-            parts.append((own, cls.recorded(own)))
+                check_interval(own.interval(), log_format.longest_interval)
+            parts.append((own, log_format.read(own)))
         except ValueError as error:
             if not name:
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
-    return _joined(path, cls, keywords, parts, names)
+    return _side_by_side(path, cls, keywords, parts, names, log_format.columns)
 
 
 class _Known(set[str]):
@@ -210,18 +194,19 @@ def _check_times(time: numpy.ndarray) -> None:
         raise ValueError(f"time {what} {row} and {row + 1}: rows must be in the order of their times{hint}")
 
 
-def _joined(
+def _side_by_side(
     path: Path,
     cls: type[Task],
     keywords: Mapping[str, Any],
-    parts: list[tuple[Columns, Recorded]],
+    parts: list[tuple[Columns, TrackLog]],
     names: list[str],
+    columns: Iterable[str],
 ) -> Recording:
-    """Put the recordings of a file, whose columns have these names, side by side."""
+    """Put the recordings of a file, whose columns have these names, side by side; the environment reads ``columns``."""
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}), cls.controls[0])
     true = [TRUTH + component.name for component in task.components]
-    notes = tuple(ignored_columns(names, [*TIME, RECORDING, *cls.recorded_columns, *true]))
+    notes = tuple(ignored_columns(names, [*TIME, RECORDING, *columns, *true]))
     with_truth = first.has(*true)
     if first.true and not with_truth:
         raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")

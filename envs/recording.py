@@ -23,7 +23,8 @@ import numpy
 from .draws import Draws
 from .observation import Array
 from .parameters import check, declared, frozen
-from .task import Scenario, Task, World, named_arrays
+from .task import Scenario, Task, named_arrays
+from .world import World
 
 MOST_NUMBERS = 50_000_000
 """Of a recording: 400 MB; to replay it takes twice as much again."""
@@ -40,17 +41,6 @@ class Replayed(NamedTuple):
     """Column of the first measurement."""
     last: Array
     """Column of the last one."""
-
-
-class Started(NamedTuple):
-    """A start of the track that was made of the first measurements of E episodes."""
-
-    measurements: Mapping[str, numpy.ndarray]
-    """Those after the start, ``(E, T, ...)``."""
-    initial: Mapping[str, numpy.ndarray]
-    """``(E, ...)``."""
-    used: int
-    """Measurements that the start took."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -184,8 +184,12 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
 
 def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any]) -> None:
     """Let the tracks start from their first measurements."""
+    if cls.log_format is None:
+        raise ValueError(
+            f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
+        )
     try:
-        start = cls.recorded_start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
+        start = cls.log_format.start(fields["measurements"], fields["seconds"], cls.Parameters(**parameters))
     except KeyError as error:
         raise ValueError(f"it lacks {error.args[0]}") from error
     if start.used:

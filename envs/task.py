@@ -36,19 +36,20 @@ returns is given to the next :meth:`World.advance`. Each filter then flies a tru
 
 import copy
 import importlib
-import math
-from abc import ABC, abstractmethod
+from abc import ABC
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy
 
 from .draws import Draws
 from .filter import Bank, Filter, Input
+from .log_format import LogFormat
 from .observation import Array, Blocks, Field, Reader
+from .world import World
 
 
 class Component(NamedTuple):
@@ -100,11 +101,6 @@ class PaperPolicy(NamedTuple):
     action: tuple[float, ...]
 
 
-TaskT = TypeVar("TaskT", bound="Task")
-Truth = TypeVar("Truth")
-Measurement = TypeVar("Measurement")
-
-
 class Episode(NamedTuple):
     """N episodes at one moment: all that the engine keeps between steps."""
 
@@ -114,126 +110,6 @@ class Episode(NamedTuple):
     """What the sensors say; between ``begin`` and the first measurement the initial estimate."""
     filter: Any
     """State of the filter."""
-
-
-class World(ABC, Generic[TaskT, Truth, Measurement]):
-    """What is, and what the sensors say.
-
-    Args:
-        task: whose world it is, with the constants that both halves share.
-
-    Attributes:
-        initial_normals: standard normal numbers of the track's start.
-        normals: standard normal numbers of each measurement.
-        row_uniforms: uniform numbers of each measurement.
-    """
-
-    initial_normals: int
-    normals: int
-    row_uniforms: int = 0
-    received_field: ClassVar[str] = ""
-    """Field of the measurement whose values are received only where its field ``available`` is above zero, of the same
-    shape or ``(N,)``; empty where everything is received."""
-
-    def __init__(self, task: TaskT) -> None:
-        self.task = task
-        self.parameters = task.parameters
-        self.xp = task.xp
-
-    @abstractmethod
-    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
-        """Truth at the start of the track, and the initial estimate given to every filter.
-
-        Args:
-            draws: what fixes the scenario of each episode.
-            normals: ``(initial_normals, N)``, the errors of the track's start.
-
-        Returns:
-            The truth, and an :class:`Initial` or a NamedTuple that has its fields.
-        """
-
-    @abstractmethod
-    def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
-        """Step 1: the truth moves on and the sensors answer.
-
-        Args:
-            truth: at the measurement before.
-            noise: ``(normals + row_uniforms, N)``.
-            feedback: of a closed loop, what :meth:`Filter.feedback` returned; else None.
-        """
-
-    @abstractmethod
-    def state(self, truth: Truth) -> Array:
-        """True values of the task's components, ``(C, N)``."""
-
-    def received(self, measurement: Measurement) -> Measurement:
-        """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
-
-        The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
-        that overlooks the availability must not take that number for a measurement. Here the values of
-        ``received_field`` are replaced.
-
-        Args:
-            measurement: of :meth:`advance`.
-        """
-        if not self.received_field:
-            return measurement
-        there: Any = measurement
-        values = self.xp.where(there.available > 0.0, getattr(there, self.received_field), math.nan)
-        replaced: Measurement = there._replace(**{self.received_field: values})
-        return replaced
-
-    def seen(self, measurement: Measurement) -> Array | None:
-        """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
-
-        NaN where they say nothing; None, as here, where what is measured is no component at all.
-        """
-        return None
-
-    def stated_deviation(self, measurement: Measurement) -> Array | None:
-        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
-        return None
-
-    def error_cost(self, error: Array) -> Array:
-        """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
-        written, and recordings of the task can be judged.
-
-        Args:
-            error: estimate minus truth, ``(C, N)``, in the units of the task's components.
-        """
-        raise NotImplementedError(f"{type(self).__name__} needs error_cost, or a cost of its own")
-
-    def cost(self, truth: Truth, mean: Array) -> Array:
-        """Step 5: what an estimate costs, uncapped, ``(N,)``.
-
-        A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
-        control loop, the quadratic cost of the loop in a fixed unit.
-
-        Args:
-            truth: at the measurement that the estimate is for.
-            mean: of the estimate, ``(C, N)``.
-        """
-        return self.error_cost(mean - self.state(truth))
-
-    def charge(self, truth: Truth, mean: Array) -> Array:
-        """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
-        known not to be its fault.
-
-        Args:
-            truth: at the measurement that the estimate is for.
-            mean: of the estimate, ``(C, N)``.
-        """
-        return self.cost(truth, mean)
-
-    def records(self, truth: Truth) -> dict[str, Array]:
-        """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
-        return {}
-
-    def context(self, truth: Truth) -> dict[str, Array]:
-        """Report what was drawn for the episode, and what of it holds now: finite arrays ``(..., N)`` of one shape
-        throughout; -1 where a time is one of what does not happen.
-        """
-        return {}
 
 
 class Task(ABC):
@@ -262,15 +138,8 @@ class Task(ABC):
     steers them like any bank, to train them; no other policy acts in them."""
     actions: ClassVar[Mapping[str, str]] = {}
     """What an action means under each control, in words."""
-    of_world_only: ClassVar[tuple[str, ...]] = ()
-    """Parameters that only the simulated world reads and that are too much for a recording, such as tables."""
-    recorded_columns: ClassVar[Mapping[str, str]] = {}
-    """Columns of a table of what sensors really said that :meth:`recorded` knows, beside ``time``, with what they are;
-    empty where tables cannot be read."""
-    targets_move: ClassVar[bool] = False
-    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
-    longest_interval: ClassVar[float] = float("inf")
-    """Between measurements, s: what is longer in a table is taken for another unit."""
+    log_format: ClassVar[LogFormat | None] = None
+    """Tables of real measurements that can be read; None where they cannot."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
@@ -394,50 +263,17 @@ class Task(ABC):
         return None
 
     @classmethod
-    def scenario_from_trajectory(cls, trajectory: Any, keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario of a user's trajectory, given the other keywords; few tasks can."""
-        raise ValueError(f"{cls.id} does not take a trajectory as scenario")
+    def scenario_of_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
+        """Make a scenario in which every episode flies one of some flights; few tasks can.
 
-    @classmethod
-    def scenario_from_flights(cls, flights: Any, keywords: Mapping[str, Any]) -> Scenario:
-        """Make a scenario of a set of flights of which every episode flies one; see :attr:`flights`."""
+        Args:
+            flights: a :class:`~.trajectory.Trajectory`, or :class:`~.flights.Flights`.
+            keywords: of ``gym.make``, beside the scenario.
+
+        Raises:
+            ValueError: if they cannot be flown, as by default.
+        """
         raise ValueError(f"{cls.id} does not take flights as scenario")
-
-    @classmethod
-    def recorded(cls, columns: Any) -> Any:
-        """Make measurements and a start of the track of one table of what sensors really said.
-
-        Args:
-            columns: :class:`~.recorded_tables.Columns`, of the names in :attr:`recorded_columns`.
-
-        Returns:
-            :class:`~.recorded_tables.Recorded`.
-
-        Raises:
-            ValueError: for what lacks, or cannot be.
-        """
-        raise NotImplementedError(f"{cls.__name__} has recorded_columns and no method for them")
-
-    @classmethod
-    def recorded_start(
-        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
-    ) -> Any:
-        """Make the start of the track of the first measurements, where a recording has none; few tasks can.
-
-        Args:
-            measurements: by name, ``(E, T, ...)``.
-            seconds: ``(E, T)``.
-            parameters: of the task.
-
-        Returns:
-            :class:`~.recording.Started`.
-
-        Raises:
-            ValueError: if that cannot be.
-        """
-        raise ValueError(
-            f"it lacks initial_mean and initial_covariance, and {cls.id} does not start from measurements"
-        )
 
     def flight_of(self, uniforms: numpy.ndarray) -> numpy.ndarray:
         """Number of the flight that each episode flies, where there are :attr:`flights`, ``(N,)``.

@@ -97,7 +97,7 @@ def record(
         times = getattr(plain.parameters, "sampling_interval", 1.0) * numpy.arange(1, truth.shape[1] + 1)
     there = times_there(lengths, truth.shape[1])
     parameters = differing(plain.parameters)
-    for name in cls.of_world_only:
+    for name in cls.World.own_parameters:
         parameters.pop(name, None)
     names = [str(i) for i in range(episodes)]
     if plain.flights:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.privileged import context_shapes
-from filtergym.envs.task import World
+from filtergym.envs.world import World
 
 from filtergym import evaluate, make_policy
 

@@ -17,7 +17,7 @@ from filtergym.envs.catalogue import make_task, task_class
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.maneuvering_target.recorded import recorded as plot_measurements
+from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.envs.recorded_tables import Columns
 from filtergym.envs.recording import measured_once
 from filtergym.envs.task import named_arrays
@@ -491,7 +491,7 @@ def test_scans_without_a_plot_are_missing_measurements(tmp_path):
     fields = ["scan", "position", "variance", "available", "interval", "elapsed"]
     time = np.array([0.0, 5.0, 10.2, 15.0, 30.0, 35.0])  # none at 15 s, no rows at 20 and 25 s
     x = np.array([1e3, 2e3, 3e3, np.nan, 6e3, 7e3])
-    found = plot_measurements(Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {}))
+    found = read_log(Columns("track", pandas.DataFrame({"time": time, "x": x, "y": x + 1.0}), {}))
     said = found.measurements
     assert set(said) == set(fields)
     assert found.rows.tolist() == [2, 3, -1, -1, 4, 5]
@@ -776,7 +776,7 @@ def test_a_single_mistake_of_arrays_is_told(recordings):
 
 def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
     from filtergym.envs.maneuvering_target.world import RadarWorld
-    from filtergym.envs.task import World
+    from filtergym.envs.world import World
 
     monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
     with pytest.raises(ValueError, match="does not say what an error costs"):
@@ -813,7 +813,7 @@ def test_every_column_is_on_the_page():
     text = PAGE.read_text(encoding="utf-8")
     axes = ("ins_y", "ins_z", "fix_y", "fix_z")
     for env in (TARGET, LOOSE, ESM):
-        columns = [name for name in task_class(env).recorded_columns if name not in axes]
+        columns = [name for name in task_class(env).log_format.columns if name not in axes]
         assert [name for name in columns if f"`{name}`" not in text] == []
 
 

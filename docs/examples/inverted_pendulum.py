@@ -19,7 +19,8 @@ from filtergym.envs.draws import Draws
 from filtergym.envs.observation import LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.parameters import TaskParameters, parameter
 from filtergym.envs.filter import Bank, Initial
-from filtergym.envs.task import Component, PaperPolicy, Scenario, Task, World
+from filtergym.envs.task import Component, PaperPolicy, Scenario, Task
+from filtergym.envs.world import World
 from filtergym.evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from filtergym.filters import kalman
 

@@ -10,18 +10,13 @@ complexes". The reference ``Xr`` is ``amplitude sin(rate t)``; the INS integrate
 Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 and 5 look as described.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
-import numpy
-
-from ..recorded_tables import Columns, Recorded
-from ..recording import Started
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .kalman_net import KalmanNetBank
+from .logs import LOG_FORMAT
 from .parameters import AXES, LooselyCoupledNavigationParameters
-from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
 from .world import InsGnssWorld
 
@@ -101,9 +96,7 @@ class LooselyCoupledNavigation(Task):
     )
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
-    of_world_only = ("duration",)
-    recorded_columns = COLUMNS
-    longest_interval = 5.0
+    log_format = LOG_FORMAT
     actions = {
         "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
         "`receiver_scale` to the power of a positive, `receiver_reduction` to that of a negative action for the "
@@ -132,18 +125,6 @@ class LooselyCoupledNavigation(Task):
         self.groups = {} if p.axes == 1 else {"position": names}
         action = float(GainBank(self).action_for_gain(p.settled_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
-
-    @classmethod
-    def recorded(cls, columns: Columns) -> Recorded:
-        """Make measurements of positions by INS and receiver."""
-        return recorded(columns)
-
-    @classmethod
-    def recorded_start(
-        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
-    ) -> Started:
-        """Start where the INS was before the first increment."""
-        return started(measurements)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -11,7 +11,8 @@ from ..faults import Outliers
 from ..filter import Initial
 from ..observation import Array
 from ..schedules import Steps, within
-from ..task import Task, World
+from ..task import Task
+from ..world import World
 from .parameters import LooselyCoupledNavigationParameters
 
 NEVER = 1e9
@@ -83,6 +84,7 @@ class Measurement(NamedTuple):
 class InsGnssWorld(World[Task, Truth, Measurement]):
     """A sine motion, an inertial system with three rate errors, and a satellite receiver."""
 
+    own_parameters = ("duration",)
     parameters: LooselyCoupledNavigationParameters
     received_field = "fix"
 

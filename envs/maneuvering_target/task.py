@@ -13,14 +13,12 @@ import numpy
 
 from ..flights import Flights, flight_of
 from ..parameters import check, declared, frozen
-from ..recorded_tables import Columns, Recorded
-from ..recording import Started
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .kalman_net import KalmanNetBank
+from .logs import FARTHEST_RANGE, LOG_FORMAT, scanned_regularly
 from .parameters import ManeuveringTargetParameters
-from .recorded import COLUMNS, FARTHEST_RANGE, recorded, scanned_regularly, started
 from .scenarios import SCENARIOS
 from .world import RadarWorld
 
@@ -97,10 +95,7 @@ class ManeuveringTarget(Task):
     )
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
-    of_world_only = ("flight", "track", "track_scans")
-    recorded_columns = COLUMNS
-    targets_move = True
-    longest_interval = 60.0
+    log_format = LOG_FORMAT
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "
@@ -145,18 +140,6 @@ class ManeuveringTarget(Task):
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))
         self.paper_policy = PaperPolicy("evidence", (0.0,) * count)
 
-    @classmethod
-    def recorded(cls, columns: Columns) -> Recorded:
-        """Make measurements of plots."""
-        return recorded(columns)
-
-    @classmethod
-    def recorded_start(
-        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
-    ) -> Started:
-        """Start from the first two plots, equation (24)."""
-        return started(measurements, seconds)
-
     def _sampling_interval(self) -> float | None:
         """Return the time between scans, s; None where some miss the target, or come early."""
         return self.parameters.sampling_interval if self.regular else None
@@ -168,7 +151,7 @@ class ManeuveringTarget(Task):
         return PICTURE(self)
 
     @classmethod
-    def scenario_from_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
+    def _scenario_of_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:
         """Fly a user's trajectory, sampled once a scan and straight on beyond its end."""
         interval, _, horizon = cls._sampling(keywords)
         farthest = float(numpy.hypot(*trajectory.position.T).max())
@@ -203,12 +186,14 @@ class ManeuveringTarget(Task):
         return found["sampling_interval"], found["decision_interval"], found["horizon"]
 
     @classmethod
-    def scenario_from_flights(cls, flights: Flights, keywords: Mapping[str, Any]) -> Scenario:
+    def scenario_of_flights(cls, flights: Trajectory | Flights, keywords: Mapping[str, Any]) -> Scenario:
         """Fly a user's flights, one in every episode, each to its end or for the horizon that is asked for."""
+        if isinstance(flights, Trajectory):
+            return cls._scenario_of_trajectory(flights, keywords)
         interval, held, horizon = cls._sampling(keywords)
         used, notes = flights.flyable(interval, FARTHEST_RANGE)
         if len(used) == 1:
-            return replace(cls.scenario_from_trajectory(used[0], keywords), notes=tuple(notes))
+            return replace(cls._scenario_of_trajectory(used[0], keywords), notes=tuple(notes))
         scans = [flight.intervals(interval) for flight in used]
         if horizon is not None:
             scans = [min(count, horizon) for count in scans]

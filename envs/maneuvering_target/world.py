@@ -8,7 +8,8 @@ from ..draws import Draws
 from ..faults import Outliers
 from ..filter import Initial
 from ..observation import Array
-from ..task import Task, World
+from ..task import Task
+from ..world import World
 from .courses import course_of
 from .parameters import ManeuveringTargetParameters
 from .scans import RegularScans, Reliability, UnreliableScans
@@ -57,6 +58,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         glint: which of them have larger errors.
     """
 
+    own_parameters = ("flight", "track", "track_scans")
     parameters: ManeuveringTargetParameters
     received_field = "position"
     initial_normals = 4

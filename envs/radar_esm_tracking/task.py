@@ -5,7 +5,6 @@ support measures (ESM) station with recognition of the target's class (in Russia
 theirs; the mathematics stands in ``filters/class_fusion.py`` and ``filters/singer.py``.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy
@@ -13,12 +12,10 @@ import numpy
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
 from ..observation import Array
-from ..recorded_tables import Columns, Recorded
-from ..recording import Started
 from ..task import Component, Episode, PaperPolicy, Task
 from .banks import ClassBank, one_hot
+from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
-from .recorded import COLUMNS, recorded, started
 from .scenarios import SCENARIOS
 from .world import RadarEsmWorld
 
@@ -110,8 +107,7 @@ class RadarEsmTracking(Task):
     )
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
-    recorded_columns = COLUMNS
-    longest_interval = 60.0
+    log_format = LOG_FORMAT
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",
@@ -163,18 +159,6 @@ class RadarEsmTracking(Task):
         )
         starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
         return models, numpy.stack(starts, axis=-1)
-
-    @classmethod
-    def recorded(cls, columns: Columns) -> Recorded:
-        """Make measurements of ranges, their rates, bearings and decisions."""
-        return recorded(columns, cls.Parameters)
-
-    @classmethod
-    def recorded_start(
-        cls, measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
-    ) -> Started:
-        """Start on the first measurement, which is that of scan 0."""
-        return started(measurements, parameters)
 
     def picture(self) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""

@@ -10,7 +10,7 @@ from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between, category
 from ..faults import Outliers
 from ..observation import Array
-from ..task import World
+from ..world import World
 from .parameters import RadarEsmTrackingParameters
 
 if TYPE_CHECKING:

@@ -16,7 +16,8 @@ from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws, between
 from ..filter import Initial
 from ..observation import Array
-from ..task import Task, World
+from ..task import Task
+from ..world import World
 from .parameters import DEGREE, LINE, REST, SINGER, TightlyCoupledNavigationParameters
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from ...filters import linear_systems
 from ..draws import Draws
 from ..observation import Array
 from ..schedules import Steps, within
-from ..task import World
+from ..world import World
 from .parameters import UavAutopilotParameters
 
 if TYPE_CHECKING:

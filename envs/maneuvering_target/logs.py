@@ -11,9 +11,10 @@ from typing import Any
 import numpy
 
 from ...filters import polar
+from ..log_format import LogFormat, TrackLog, TrackStart
 from ..plausibility import check_bearings
-from ..recorded_tables import Columns, Recorded
-from ..recording import Recording, Started
+from ..recorded_tables import Columns
+from ..recording import Recording
 from .parameters import ManeuveringTargetParameters
 
 COLUMNS = {
@@ -33,7 +34,7 @@ LARGEST_GAP = 1000
 """Scans that may be missing between two rows; more is a mistake of units."""
 
 
-def recorded(columns: Columns) -> Recorded:
+def read_log(columns: Columns) -> TrackLog:
     """Make measurements of the plots of one track.
 
     Raises:
@@ -76,7 +77,7 @@ def recorded(columns: Columns) -> Recorded:
         "available": seen.astype(float),
         **_clocks(numpy.append(columns.time[first], time), seen),
     }
-    return Recorded(
+    return TrackLog(
         said,
         initial,
         rows,
@@ -121,7 +122,9 @@ def two_plot_start(
     return {"mean": mean, "covariance": covariance}
 
 
-def started(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray) -> Started:
+def start_track(
+    measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+) -> TrackStart:
     """Start every episode from its first two plots.
 
     Raises:
@@ -138,7 +141,7 @@ def started(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray) -
     )
     later = {name: values[:, 2:] for name, values in measurements.items()}
     later["scan"] = later["scan"] - measurements["scan"][:, 1:2]
-    return Started(later, initial, 2)
+    return TrackStart(later, initial, 2)
 
 
 def _positions(columns: Columns) -> numpy.ndarray:
@@ -204,3 +207,6 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 
     last = pandas.Series(numpy.where([True, *seen], time, numpy.nan)).ffill().to_numpy()[:-1]
     return {"interval": numpy.diff(time), "elapsed": time[1:] - last}
+
+
+LOG_FORMAT = LogFormat(COLUMNS, read_log, start_track, targets_move=True, longest_interval=60.0)

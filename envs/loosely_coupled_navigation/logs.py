@@ -5,12 +5,13 @@ it. Every further row is a measurement.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy
 
+from ..log_format import LogFormat, TrackLog, TrackStart
 from ..plausibility import check_extents
-from ..recorded_tables import Columns, Recorded
-from ..recording import Started
+from ..recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
 
 COLUMNS = {
@@ -21,14 +22,16 @@ COLUMNS = {
 }
 
 
-def started(measurements: Mapping[str, numpy.ndarray]) -> Started:
+def start_track(
+    measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, parameters: Any
+) -> TrackStart:
     """Start every episode where its INS was before the first increment."""
     mean = measurements["ins"][:, 0] - measurements["increment"][:, 0]
     covariance = numpy.zeros((*mean.shape, mean.shape[-1]))
-    return Started(measurements, {"mean": mean, "covariance": covariance}, 0)
+    return TrackStart(measurements, {"mean": mean, "covariance": covariance}, 0)
 
 
-def recorded(columns: Columns) -> Recorded:
+def read_log(columns: Columns) -> TrackLog:
     """Make measurements of one track.
 
     Raises:
@@ -63,7 +66,7 @@ def recorded(columns: Columns) -> Recorded:
         "available": available[1:].astype(float),
         "reported_deviation": sigma[1:],
     }
-    return Recorded(
+    return TrackLog(
         measurements,
         {"mean": ins[0], "covariance": numpy.zeros((len(ends), len(ends)))},
         numpy.arange(1, count + 1),
@@ -71,3 +74,6 @@ def recorded(columns: Columns) -> Recorded:
         float(columns.time[0]),
         columns.time[1:],
     )
+
+
+LOG_FORMAT = LogFormat(COLUMNS, read_log, start_track, longest_interval=5.0)

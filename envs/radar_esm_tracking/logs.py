@@ -10,8 +10,9 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..recorded_tables import Columns, Recorded
-from ..recording import Started
+from ..log_format import LogFormat, TrackLog, TrackStart
+from ..recorded_tables import Columns
+from .parameters import RadarEsmTrackingParameters
 
 COLUMNS = {
     "range": "m",
@@ -24,12 +25,8 @@ COLUMNS = {
 }
 
 
-def recorded(columns: Columns, parameters_of: Any) -> Recorded:
+def read_log(columns: Columns) -> TrackLog:
     """Make measurements of one track.
-
-    Args:
-        columns: of the track.
-        parameters_of: makes the parameters of keywords.
 
     Raises:
         ValueError: for what lacks or cannot be.
@@ -40,7 +37,7 @@ def recorded(columns: Columns, parameters_of: Any) -> Recorded:
     radar = columns.whole("range", "range_rate")
     interval = columns.regular("the filters of this environment are tabulated by scans")
     named = {n: v for n, v in columns.given.items() if n not in ("horizon", "decision_interval")}
-    p = parameters_of(**{"sampling_interval": interval, **named})
+    p = RadarEsmTrackingParameters(**{"sampling_interval": interval, **named})
     types, scans = len(p.recognition), numpy.arange(len(radar))
     decision = columns["decision"] if columns.has("decision") else numpy.full(len(radar), numpy.nan)
     decided = numpy.isfinite(decision)
@@ -59,8 +56,9 @@ def recorded(columns: Columns, parameters_of: Any) -> Recorded:
         "decision": numpy.where(decided, decision, types).astype(numpy.int64),
         "bearing_difference": numpy.where(decided, difference, 0.0),
     }
-    later, initial, _ = started({name: values[None] for name, values in said.items()}, p)
-    return Recorded(
+    measured = {name: values[None] for name, values in said.items()}
+    later, initial, _ = start_track(measured, columns.time[None], p)
+    return TrackLog(
         {name: values[0] for name, values in later.items()},
         {name: values[0] for name, values in initial.items()},
         scans[1:],
@@ -70,11 +68,12 @@ def recorded(columns: Columns, parameters_of: Any) -> Recorded:
     )
 
 
-def started(measurements: Mapping[str, numpy.ndarray], p: Any) -> Started:
+def start_track(measurements: Mapping[str, numpy.ndarray], seconds: numpy.ndarray, p: Any) -> TrackStart:
     """Start every episode on its first measurement.
 
     Args:
         measurements: ``(E, T, ...)``.
+        seconds: ``(E, T)``.
         p: parameters.
 
     Raises:
@@ -93,7 +92,7 @@ def started(measurements: Mapping[str, numpy.ndarray], p: Any) -> Started:
     }
     later = {name: values[:, 1:] for name, values in measurements.items()}
     later["scan"], initial["first_scan"] = later["scan"] - first["scan"][:, None], 0 * first["scan"]
-    return Started(later, initial, 1)
+    return TrackStart(later, initial, 1)
 
 
 def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:
@@ -112,3 +111,6 @@ def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:
         row = int(numpy.argmax(decided & ~numpy.isfinite(found)))
         raise ValueError(f"row {row} has a decision and lacks a bearing")
     return numpy.where(decided, found, 0.0)
+
+
+LOG_FORMAT = LogFormat(COLUMNS, read_log, start_track, longest_interval=60.0)

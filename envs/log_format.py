@@ -1,0 +1,55 @@
+"""What tables of real measurements look like to an environment, and what it makes of them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy
+
+if TYPE_CHECKING:
+    from .recorded_tables import Columns
+
+
+class TrackStart(NamedTuple):
+    """The start of the tracks of E episodes, made of their first measurements."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """Those after the start, ``(E, T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """The initial estimate, ``(E, ...)``."""
+    used: int
+    """Measurements that the start took."""
+
+
+class TrackLog(NamedTuple):
+    """The measurements of one track, made of the columns of a table; T measurements."""
+
+    measurements: Mapping[str, numpy.ndarray]
+    """``(T, ...)``."""
+    initial: Mapping[str, numpy.ndarray]
+    """The initial estimate, ``(...)``."""
+    rows: numpy.ndarray
+    """Row of the table that each measurement is of, ``(T,)``; -1 where it is of none."""
+    parameters: Mapping[str, Any]
+    """Parameters of the environment that follow from the table."""
+    start: float
+    """Time of the start of the track, s, as in the table."""
+    time: numpy.ndarray
+    """Of the measurements, likewise, ``(T,)``."""
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """The tables of real measurements that an environment reads."""
+
+    columns: Mapping[str, str]
+    """Names of the columns beside ``time``, and what they hold."""
+    read: "Callable[[Columns], TrackLog]"
+    """Makes the measurements of one track of its columns; raises :class:`ValueError` for what lacks or cannot be."""
+    start: Callable[[Mapping[str, numpy.ndarray], numpy.ndarray, Any], TrackStart]
+    """Makes the start of the tracks of measurements ``(E, T, ...)`` by name, of their times ``(E, T)``, s, and of the
+    parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""
+    targets_move: bool = False
+    """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    longest_interval: float = float("inf")
+    """Between measurements, s: what is longer in a table is taken for another unit."""

@@ -1,0 +1,137 @@
+"""What is, and what the sensors say: the half of a task that is simulated, or replayed."""
+
+import math
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from .draws import Draws
+from .observation import Array
+
+if TYPE_CHECKING:
+    from .task import Task
+
+TaskT = TypeVar("TaskT", bound="Task")
+Truth = TypeVar("Truth")
+Measurement = TypeVar("Measurement")
+
+
+class World(ABC, Generic[TaskT, Truth, Measurement]):
+    """What is, and what the sensors say.
+
+    Args:
+        task: whose world it is, with the constants that both halves share.
+
+    Attributes:
+        initial_normals: standard normal numbers of the track's start.
+        normals: standard normal numbers of each measurement.
+        row_uniforms: uniform numbers of each measurement.
+    """
+
+    initial_normals: int
+    normals: int
+    row_uniforms: int = 0
+    own_parameters: ClassVar[tuple[str, ...]] = ()
+    """Parameters that only the simulated world reads and that are too much for a recording, such as tables."""
+    received_field: ClassVar[str] = ""
+    """Field of the measurement whose values are received only where its field ``available`` is above zero, of the same
+    shape or ``(N,)``; empty where everything is received."""
+
+    def __init__(self, task: TaskT) -> None:
+        self.task = task
+        self.parameters = task.parameters
+        self.xp = task.xp
+
+    @abstractmethod
+    def begin(self, draws: Draws, normals: Array) -> tuple[Truth, Any]:
+        """Truth at the start of the track, and the initial estimate given to every filter.
+
+        Args:
+            draws: what fixes the scenario of each episode.
+            normals: ``(initial_normals, N)``, the errors of the track's start.
+
+        Returns:
+            The truth, and an :class:`Initial` or a NamedTuple that has its fields.
+        """
+
+    @abstractmethod
+    def advance(self, truth: Truth, noise: Array, feedback: Any) -> tuple[Truth, Measurement]:
+        """Step 1: the truth moves on and the sensors answer.
+
+        Args:
+            truth: at the measurement before.
+            noise: ``(normals + row_uniforms, N)``.
+            feedback: of a closed loop, what :meth:`Filter.feedback` returned; else None.
+        """
+
+    @abstractmethod
+    def state(self, truth: Truth) -> Array:
+        """True values of the task's components, ``(C, N)``."""
+
+    def received(self, measurement: Measurement) -> Measurement:
+        """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
+
+        The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
+        that overlooks the availability must not take that number for a measurement. Here the values of
+        ``received_field`` are replaced.
+
+        Args:
+            measurement: of :meth:`advance`.
+        """
+        if not self.received_field:
+            return measurement
+        there: Any = measurement
+        values = self.xp.where(there.available > 0.0, getattr(there, self.received_field), math.nan)
+        replaced: Measurement = there._replace(**{self.received_field: values})
+        return replaced
+
+    def seen(self, measurement: Measurement) -> Array | None:
+        """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
+
+        NaN where they say nothing; None, as here, where what is measured is no component at all.
+        """
+        return None
+
+    def stated_deviation(self, measurement: Measurement) -> Array | None:
+        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
+        return None
+
+    def error_cost(self, error: Array) -> Array:
+        """What an error of the estimate costs where nothing else matters, ``(N,)``; :meth:`cost` then need not be
+        written, and recordings of the task can be judged.
+
+        Args:
+            error: estimate minus truth, ``(C, N)``, in the units of the task's components.
+        """
+        raise NotImplementedError(f"{type(self).__name__} needs error_cost, or a cost of its own")
+
+    def cost(self, truth: Truth, mean: Array) -> Array:
+        """Step 5: what an estimate costs, uncapped, ``(N,)``.
+
+        A squared error in units of the sensor's nominal variance (:meth:`error_cost`), or, where the estimate drives a
+        control loop, the quadratic cost of the loop in a fixed unit.
+
+        Args:
+            truth: at the measurement that the estimate is for.
+            mean: of the estimate, ``(C, N)``.
+        """
+        return self.error_cost(mean - self.state(truth))
+
+    def charge(self, truth: Truth, mean: Array) -> Array:
+        """Part of the cost of an estimate that its reward counts, not below zero, ``(N,)``: all of it, unless some is
+        known not to be its fault.
+
+        Args:
+            truth: at the measurement that the estimate is for.
+            mean: of the estimate, ``(C, N)``.
+        """
+        return self.cost(truth, mean)
+
+    def records(self, truth: Truth) -> dict[str, Array]:
+        """Report what an evaluation keeps of the truth at each measurement: arrays ``(N,)``."""
+        return {}
+
+    def context(self, truth: Truth) -> dict[str, Array]:
+        """Report what was drawn for the episode, and what of it holds now: finite arrays ``(..., N)`` of one shape
+        throughout; -1 where a time is one of what does not happen.
+        """
+        return {}
