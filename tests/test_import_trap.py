@@ -284,7 +284,11 @@ def results_ways(folder, command):
     store.write(work, 1.0)
     [kept] = (folder / "kept").iterdir()
     named = {"name": CLASS, "kind": CLASS, "control": NAME, "head": CLASS}
-    for content in (pickle.dumps(Executed()), msgspec.msgpack.encode(named), msgspec.msgpack.encode([CLASS] * 4)):
+    for content in (
+        pickle.dumps(Executed()),
+        msgspec.msgpack.encode(named),
+        msgspec.msgpack.encode([CLASS] * 4),
+    ):
         kept.write_bytes(content)
         yield "what a store keeps", lambda: store.read(work, Summary)
     name = "unfinished/ManeuveringTarget-v0.paper.2.test0.json"

@@ -25,9 +25,15 @@ class Outcome(NamedTuple):
 
 def outcome(costs=None):
     dataset = xarray.Dataset(
-        {"x": (("policy", "time"), np.array([[0.1, np.nan]]))}, {"policy": ["imm"]}, {"paper": "imm", "seed": 3}
+        {"x": (("policy", "time"), np.array([[0.1, np.nan]]))},
+        {"policy": ["imm"]},
+        {"paper": "imm", "seed": 3},
     )
-    measured = [Measured(0.1 + 0.2, "rmse"), Measured(float("nan"), "lost"), Measured(np.float64(np.inf), "x")]
+    measured = [
+        Measured(0.1 + 0.2, "rmse"),
+        Measured(float("nan"), "lost"),
+        Measured(np.float64(np.inf), "x"),
+    ]
     curves = {"rmse": np.arange(6.0).reshape(2, 3).T, "none": np.zeros((0, 2)), "mean": np.array(1.5)}
     return Outcome(measured, costs, curves, dataset, 7)
 
@@ -66,7 +72,9 @@ def test_another_content_name_or_code_is_another_piece(tmp_path, monkeypatch):
     assert store.read(WORK, float) == 2.0
 
 
-@pytest.mark.parametrize("content", [b"", b"half", msgspec.msgpack.encode([1, 2]), msgspec.msgpack.encode("a" * 9)])
+@pytest.mark.parametrize(
+    "content", [b"", b"half", msgspec.msgpack.encode([1, 2]), msgspec.msgpack.encode("a" * 9)]
+)
 def test_what_is_no_result_is_made_again(tmp_path, content):
     store = Store(tmp_path)
     for kind, whole in ((float, 1.0), (np.ndarray, np.zeros(2)), (xarray.Dataset, outcome().head)):

@@ -81,8 +81,7 @@ def test_the_numbers_follow_from_the_episodes(folders):
     study = Study(runs, ["adaptive"], 30, split="validation")
     means = episode_means(study, "random")
     found = {
-        (c.policy, c.statistic, c.against, c.metric, c.component): c
-        for c in compare(study, means, "random")
+        (c.policy, c.statistic, c.against, c.metric, c.component): c for c in compare(study, means, "random")
     }
     cost = {name: values.mean() for name, values in means.cost.items()}
     each = [cost[f"bptt seed {seed}"] for seed in (0, 1)]
@@ -118,7 +117,10 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
         return whole(asked, declare, tick)
 
     monkeypatch.setattr(training_seeds, "reduce_episodes", reduce_episodes)
-    study, store = Study(load_runs(folders), ["adaptive"], 10, split="validation"), Store(tmp_path / "unfinished")
+    study, store = (
+        Study(load_runs(folders), ["adaptive"], 10, split="validation"),
+        Store(tmp_path / "unfinished"),
+    )
     stop = 99
     expected = episode_means(study, "random")
     scored.clear()

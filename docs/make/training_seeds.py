@@ -359,7 +359,13 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
     opponents = [name for name in cost if name not in trained]
     for name in cost:
         statistic = "run" if name in trained else "opponent"
-        add(name, statistic, paper, "relative_cost_difference", bootstrap.relative_difference(cost[name], cost[paper]))
+        add(
+            name,
+            statistic,
+            paper,
+            "relative_cost_difference",
+            bootstrap.relative_difference(cost[name], cost[paper]),
+        )
         if reference in cost:
             add(
                 name,
