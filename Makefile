@@ -6,9 +6,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := docs/conf.py docs/make filtergym compiler filters envs evaluation baselines agents papers tests benchmarks
 
-# Numbers, and every library once: gymnasium, scipy, pandas, xarray, matplotlib, typer and rich, safetensors.
+# Numbers, and every library once: gymnasium, scipy, pandas, xarray, matplotlib, typer and rich, safetensors, msgspec.
 CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.py test_parameters.py \
-  test_linear_systems.py test_bounds.py test_files.py \
+  test_linear_systems.py test_bounds.py test_files.py test_store.py \
   test_recording.py::test_several_tracks_with_truth_in_one_table test_recording.py::test_estimates_are_written \
   test_evaluation.py::test_tuning_improves_on_fresh_episodes_and_is_repeatable \
   test_evaluation.py::test_dataset_has_named_axes_and_units \

@@ -9,7 +9,6 @@ import json
 import math
 import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -20,12 +19,12 @@ import numpy
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, short_name, task_class
 from ..envs.task import Episode, Task
-from ..evaluation.code import code_digest
 from ..evaluation.competitors import Kind
-from ..evaluation.files import append_line, write_text
+from ..evaluation.files import write_text
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress, rollout
 from ..evaluation.seeds import episode_seeds
+from ..evaluation.store import Store, Work
 from ..evaluation.stored import fits, read_json
 from .catalogue import baselines_of, package_of
 from .table import Tunable
@@ -101,42 +100,6 @@ def mean_cost(
     return total / costs.size
 
 
-class _Met:
-    """Costs of the candidates that a search has met, in a file that grows by a line with each.
-
-    A search is repeatable: begun again it asks for the same candidates, and is told what it was told.
-    """
-
-    def __init__(self, path: Path | None, asked: Any) -> None:
-        """Take what is there of the same search, else begin a file."""
-        self._path, self._costs = path, dict[str, float]()
-        if path is None:
-            return
-        first = json.dumps(asked)
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-        if lines[:1] == [first]:
-            for line in lines[1:]:
-                with suppress(ValueError):  # of what a crash has left half
-                    key, cost = json.loads(line)
-                    self._costs[key] = cost
-        entries = [json.dumps(entry) for entry in self._costs.items()]
-        write_text(path, "".join(f"{line}\n" for line in (first, *entries)))
-
-    def cost(self, values: Mapping[str, float], measure: Callable[[], float]) -> float:
-        """Return the cost of a candidate, measured if it was not met before."""
-        key = json.dumps(values)
-        if key not in self._costs:
-            self._costs[key] = measure()
-            if self._path is not None:
-                append_line(self._path, json.dumps([key, self._costs[key]]))
-        return self._costs[key]
-
-    def forget(self) -> None:
-        """Remove the file."""
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
-
-
 def tune(
     id: str,
     policy: str,
@@ -148,7 +111,7 @@ def tune(
     progress: Callable[[int], None] = lambda steps: None,
     backend: str = "auto",
     workers: Workers | None = None,
-    waiting: Path | None = None,
+    store: Store | None = None,
 ) -> Tuned:
     """Search a policy's values.
 
@@ -164,8 +127,9 @@ def tune(
         backend: what computes the steps, see :func:`~.envs.backend.task_on`.
         workers: who shares the episodes of a candidate; candidates follow each other, since the search learns from
             each. Default: this process.
-        waiting: file that keeps the costs of candidates until the search has ended, from which a second call goes on;
-            not of an environment of one's own, whose code may have changed meanwhile.
+        store: keeps the costs of candidates until the search has ended, from which a second call goes on: begun again,
+            a search asks for the same candidates. Nothing is kept of an environment of one's own, whose code may have
+            changed meanwhile. Default: nothing is kept.
 
     Raises:
         ValueError: for a held-out scenario, a budget too small for one generation, or a file that cannot be written.
@@ -193,26 +157,23 @@ def tune(
     best: tuple[float, dict[str, float]] = (math.inf, dict(tunable.start))
     spent = 0
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
-    search = [
-        cls.id,
-        chosen.name,
-        policy,
-        limited,
-        dict(tunable.start),
-        seed,
-        episodes,
-        backend,
-        code_digest(),
-    ]
-    met = _Met(None if package_of(cls.id) is None else waiting, search)
+    store = store or Store()
+    search = [chosen.name, limited, dict(tunable.start), seed, episodes, backend]
+
+    def work_of(values: Mapping[str, float]) -> Work | None:
+        """Return the piece of work that the cost of a candidate is."""
+        if package_of(cls.id) is None:
+            return None
+        return Work(f"{short_name(cls.id)}.{policy}", json.dumps([*search, values]))
 
     def objective(vector: numpy.ndarray) -> float:
         nonlocal best, spent
         if spent >= evaluations:
             return math.inf
         values = dict(zip(names, map(float, vector), strict=True))
-        cost = met.cost(
-            values,
+        cost = store.result(
+            work_of(values),
+            float,
             lambda: mean_cost(cls.id, chosen.name, tunable, values, train, backend, workers),
         )
         spent += 1
@@ -241,7 +202,7 @@ def tune(
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
     kept = {name: rounded(value) for name, value in values.items()}
-    met.forget()
+    store.clear()
     return Tuned(cls.id, policy, chosen.name, kept, cost, untuned, spent * steps, seed)
 
 

@@ -54,7 +54,8 @@ from filtergym.evaluation.evaluate import Experiment
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
-from filtergym.evaluation.summary import Asked, Part, _resampling, combine_summaries, summarise, write_summary
+from filtergym.evaluation.store import Store, Work
+from filtergym.evaluation.summary import Asked, Part, _resampling, combine_summaries, summarise
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.progress import track
@@ -186,7 +187,7 @@ def told_seconds(id: str, episodes: int) -> float:
     _resampling(episodes)  # once for all cells
     seconds = spent(lambda: combine_summaries([one, other]))[1] / 2
     with tempfile.TemporaryDirectory() as folder:
-        return seconds + spent(lambda: write_summary(Path(folder) / "one.npz", one, ""))[1]
+        return seconds + spent(lambda: Store(Path(folder)).write(Work("one", ""), one))[1]
 
 
 def training_units(id: str, algorithm: str, folder: Path) -> Units:

@@ -84,16 +84,6 @@ def whole_file(path: Path) -> Iterator[Path]:
             partial.unlink(missing_ok=True)
 
 
-def append_line(path: Path, line: str) -> None:
-    """Let a file grow by a line.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
-    with _refusals_told(f"file {path}"), _made_folder(path.parent), path.open("a", encoding="utf-8") as file:
-        file.write(line + "\n")
-
-
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
     """Give a new folder whose files go into another one together, when all of them are complete; those of its folders

@@ -5,26 +5,21 @@ next begins, and what they come to is added in their order; so its bits depend o
 """
 
 import functools
-import io
-import json
-import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 import xarray
 
-from .bootstrap import BLOCK, RESAMPLES, Bootstrap, Estimate, block_of
+from .bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
-from .dataset import Losses
 from .evaluate import DRAWN, Experiment, check_sendable, plan_of, run_piece
-from .files import whole_file
-from .metrics import Contender, Measure, Record, contender_of, record_statistics, records_of
+from .metrics import Contender, Record, contender_of, record_statistics, records_of
 from .own_metrics import OwnMetrics
 from .parallel import Workers
 from .rollout import Progress
 from .statistics import Reduction, Statistic, reduce_run
+from .store import Store, Work
 from .threads import one_thread
 
 TOGETHER = 4 * BLOCK
@@ -77,14 +72,6 @@ class Summary(NamedTuple):
     head: xarray.Dataset
     """Its part of the evaluation, without what was kept of every episode."""
     episodes: int
-
-
-class Kept(NamedTuple):
-    """Where a summary waits for the rest."""
-
-    path: Path
-    made_by: str
-    """What it depends on, in words; one that depends on something else is made again."""
 
 
 class Part(NamedTuple):
@@ -166,7 +153,8 @@ def summaries(
     asked: Sequence[Asked],
     workers: Workers,
     progress: Progress | None = None,
-    kept: Sequence[Kept | None] = (),
+    store: Store | None = None,
+    work: Sequence[Work | None] = (),
 ) -> Iterator[tuple[int, Summary]]:
     """Summarise competitors, of any environments.
 
@@ -174,7 +162,8 @@ def summaries(
         asked: whom, over what; they are begun in this order.
         workers: who does it.
         progress: told of measurements done.
-        kept: where the summary of each waits, from which a second call takes it; None: it is not kept.
+        store: keeps the summary of each, from which a second call takes it. Default: nothing is kept.
+        work: that each is, for the store; None: it is not kept.
 
     Yields:
         Number of a competitor among them and its summary, as they are finished.
@@ -183,10 +172,11 @@ def summaries(
         ValueError: if a competitor cannot be sent to another process, or a file not be written; and as
             :func:`.evaluate.evaluate`.
     """
-    places = list(kept) or [None] * len(asked)
+    store = store or Store()
+    keys = list(work) or [None] * len(asked)
     missing = []
-    for i, (one, place) in enumerate(zip(asked, places, strict=True)):
-        found = None if place is None else read_summary(*place)
+    for i, (one, key) in enumerate(zip(asked, keys, strict=True)):
+        found = store.read(key, Summary)
         if found is None:
             missing.append(i)
             continue
@@ -194,8 +184,7 @@ def summaries(
             progress(one.measurements)
         yield i, found
     for i, found in _summarised(asked, missing, workers, progress):
-        if (place := places[i]) is not None:
-            write_summary(place.path, found, place.made_by)
+        store.write(keys[i], found)
         yield i, found
 
 
@@ -269,69 +258,3 @@ def _heads_together(found: Sequence[Summary]) -> xarray.Dataset:
     return xarray.Dataset(
         variables, dict(sorted(coords.items())), {**heads[0].attrs, "notes": "\n".join(notes)}
     )
-
-
-def write_summary(path: Path, summary: Summary, made_by: str) -> None:
-    """Keep a summary in a file, from which nothing is executed when it is read.
-
-    Args:
-        path: of the file, whole or as it was.
-        summary: of a competitor.
-        made_by: what else it depends on, such as versions, in words.
-
-    Raises:
-        ValueError: if it cannot be written.
-    """
-    own = summary.contender
-    words = {
-        "made_by": made_by,
-        "name": own.name,
-        "kind": own.kind,
-        "control": own.control,
-        "measures": own.measures,
-        "further": own.further,
-        "actions": summary.curves.actions,
-        "gains": summary.curves.gains,
-        "losses": own.losses,
-        "episodes": summary.episodes,
-    }
-    arrays: dict[str, Any] = {f"curve {name}": values for name, values in summary.curves.curves.items()}
-    if own.costs is not None:
-        arrays["costs"] = own.costs
-    head = numpy.frombuffer(
-        bytes(summary.head.to_netcdf(engine="scipy", format="NETCDF3_64BIT")), numpy.uint8
-    )
-    with whole_file(path) as partial, partial.open("wb") as file:
-        numpy.savez(file, words=json.dumps(words), head=head, **arrays)
-
-
-def read_summary(path: Path, made_by: str) -> Summary | None:
-    """Return what :func:`write_summary` has kept; None where there is nothing, or nothing that was made by the same."""
-    if not path.exists():
-        return None
-    try:
-        with numpy.load(path, allow_pickle=False) as kept:
-            words = json.loads(str(kept["words"]))
-            if words["made_by"] != made_by:
-                return None
-            with xarray.open_dataset(io.BytesIO(kept["head"].tobytes()), engine="scipy") as read:
-                head = read.load()
-            curves = {n.removeprefix("curve "): kept[n] for n in kept.files if n.startswith("curve ")}
-            costs = kept["costs"] if "costs" in kept.files else None
-            measures, further = (
-                [Measure(m[0], m[1], m[2], Estimate(*m[3]), m[4]) for m in words[word]]
-                for word in ("measures", "further")
-            )
-            losses = Losses(*words["losses"]) if words["losses"] else None
-            name, kind, control = (words[word] for word in ("name", "kind", "control"))
-            contender = Contender(name, kind, control, measures, further, costs, losses)
-            own = CompetitorCurves(curves, words["actions"], words["gains"])
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-        return None  # what a crash has left half: it is made again
-    head.attrs = {name: _plain(value) for name, value in head.attrs.items()}
-    return Summary(contender, own, head, words["episodes"])
-
-
-def _plain(value: Any) -> Any:
-    """Return an attribute as it was before a file held it."""
-    return value.item() if isinstance(value, numpy.generic) else value

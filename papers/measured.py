@@ -14,7 +14,7 @@ import numpy
 import xarray
 
 from ..baselines.names import evaluate
-from ..evaluation.bootstrap import Bootstrap
+from ..evaluation.bootstrap import Bootstrap, percentile_interval
 from ..evaluation.rollout import rollout
 
 RESAMPLES = 500
@@ -57,8 +57,8 @@ def measured(samples: numpy.ndarray) -> Measured:
     """Value and uncertainty of a quantity, ``(1 + resamples,)``."""
     if len(samples) == 1:
         return Measured(*[float(samples[0])] * 3)
-    low, high = band(samples)
-    return Measured(float(samples[0]), float(low), float(high), float(samples[1:].std()))
+    value, low, high = percentile_interval(samples).tolist()
+    return Measured(value, low, high, float(samples[1:].std()))
 
 
 def mean(values: numpy.ndarray) -> Measured:
@@ -68,7 +68,7 @@ def mean(values: numpy.ndarray) -> Measured:
 
 def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Bounds of the 95 % interval of curves, ``(1 + resamples, ...)``."""
-    low, high = numpy.percentile(samples[1:], [2.5, 97.5], axis=0)
+    _, low, high = percentile_interval(samples)
     return low, high
 
 

@@ -3,19 +3,22 @@
 import csv
 import importlib
 import json
+import pickle
 import shutil
 import sys
 import warnings
 from contextlib import suppress
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import pytest
 import xarray
 from filtergym.agents.learned_policy import PRETRAINED, read_header
 from filtergym.agents.training_run import load_run
 from filtergym.baselines.tuning import stored_values
-from filtergym.evaluation.summary import read_summary
+from filtergym.evaluation.store import Store, Work
+from filtergym.evaluation.summary import Summary
 
 import filtergym
 from filtergym import evaluate, make_policy, read_recording, record, tidy_records
@@ -277,9 +280,17 @@ def results_ways(folder, command):
         data.assign_attrs(attrs).to_netcdf(folder / "told.nc", engine="scipy", format="NETCDF3_64BIT")
         yield "an evaluation as scenario", lambda: gym.make(ENV, scenario=str(folder / "told.nc"))
         yield "an evaluation as recording", lambda: read_recording(folder / "told.nc")
-    for words in (json.dumps({"made_by": NAME, "name": CLASS, "kind": CLASS}), [Executed()]):
-        np.savez(folder / "kept.npz", words=np.array(words), head=np.array([Executed()]))
-        yield "read_summary", lambda: read_summary(folder / "kept.npz", NAME)
+    store, work = Store(folder / "kept"), Work("kept", NAME)
+    store.write(work, 1.0)
+    [kept] = (folder / "kept").iterdir()
+    named = {"name": CLASS, "kind": CLASS, "control": NAME, "head": CLASS}
+    for content in (
+        pickle.dumps(Executed()),
+        msgspec.msgpack.encode(named),
+        msgspec.msgpack.encode([CLASS] * 4),
+    ):
+        kept.write_bytes(content)
+        yield "what a store keeps", lambda: store.read(work, Summary)
     name = "unfinished/ManeuveringTarget-v0.paper.2.test0.json"
     for content in (folder / "results-0.json", folder / "results-2.json"):
         (folder / "begun" / "unfinished").mkdir(parents=True, exist_ok=True)

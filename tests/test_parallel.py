@@ -24,12 +24,13 @@ from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
 from filtergym.evaluation.parallel import Workers
-from filtergym.evaluation.summary import combine_summaries, summaries
+from filtergym.evaluation.store import Store
+from filtergym.evaluation.summary import Summary, combine_summaries, summaries
 
 import filtergym
 from filtergym import evaluate, tidy_records
 from filtergym.names import asked_of
-from filtergym.reports import benchmark, waiting
+from filtergym.reports import benchmark, work
 
 ENV = "filtergym/ManeuveringTarget-v0"
 RADAR = "filtergym/RadarEsmTracking-v0"
@@ -180,9 +181,8 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
     monkeypatch.setattr(summary, "summarise", ending)
     with suppress(KeyboardInterrupt):
         assert command(*words)[0] != 0
-    assert [path.name for path in (tmp_path / "out/unfinished").iterdir()] == [
-        "ManeuveringTarget-v0.default.4.test0.imm.npz"
-    ]
+    [file] = (tmp_path / "out/unfinished").iterdir()
+    assert file.name.startswith("ManeuveringTarget-v0.default.4.test0.imm.")
     assert command(*words)[0] == 0
     assert done == ["imm", "known-turn", "known-turn"]
     assert (tmp_path / "out/records.json").read_text() == whole
@@ -190,16 +190,20 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
     [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm-tuned"])
-    kept = waiting.kept_in(tmp_path, asked)
-    [(_, found)] = summaries([asked], Workers(), None, [kept])
-    assert summary.read_summary(*kept).contender.measures == found.contender.measures
-    assert waiting.kept_in(tmp_path, asked) == kept
+    store = Store(tmp_path / "unfinished")
+
+    def read(other):
+        return store.read(work.work_of(other), Summary)
+
+    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(asked)])
+    assert read(asked).contender.measures == found.contender.measures
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
-        other = asked._replace(experiment=replace(asked.experiment, **changed))
-        assert summary.read_summary(*waiting.kept_in(tmp_path, other)) is None
-    monkeypatch.setattr(waiting, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
-    assert summary.read_summary(*waiting.kept_in(tmp_path, asked)) is None
-    assert waiting.kept_in(tmp_path, asked._replace(name="mine.py:Mine")) is None
+        assert read(asked._replace(experiment=replace(asked.experiment, **changed))) is None
+    monkeypatch.setattr(work, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
+    assert read(asked) is None
+    assert work.work_of(asked._replace(name="mine.py:Mine")) is None
+    store.clear()
+    assert not (tmp_path / "unfinished").exists()
 
 
 @pytest.fixture
@@ -226,30 +230,31 @@ def edit(tmp_path, monkeypatch):
 def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
     [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
-    list(summaries([asked], Workers(), None, [waiting.kept_in(tmp_path, asked)]))
+    store = Store(tmp_path / "unfinished")
+    list(summaries([asked], Workers(), None, store, [work.work_of(asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
-    tunable, costs = baselines_of(ENV).tunable["fixed-best"], tmp_path / "costs.jsonl"
+    tunable = baselines_of(ENV).tunable["fixed-best"]
 
     def interrupted(steps):
         raise KeyboardInterrupt
 
     def search():
         with suppress(KeyboardInterrupt):
-            tuning.tune(ENV, "fixed-best", tunable, 20_000, None, 0, 8, interrupted, waiting=costs)
+            tuning.tune(ENV, "fixed-best", tunable, 20_000, None, 0, 8, interrupted, store=store)
         return len(calls)
 
     assert (search(), search()) == (1, 1)
     edit(file, " ")
-    assert (summary.read_summary(*waiting.kept_in(tmp_path, asked)) is not None) is same
+    assert (store.read(work.work_of(asked), Summary) is not None) is same
     assert search() == (1 if same else 2)
 
 
-def test_of_an_environment_of_ones_own_nothing_is_kept(tmp_path, monkeypatch):
+def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
-    assert waiting.kept_in(tmp_path, asked) is None
+    assert work.work_of(asked) is None
 
 
 def test_an_error_elsewhere_is_the_same_sentence(two):
@@ -465,19 +470,20 @@ def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
         return own(*arguments)
 
     monkeypatch.setattr(tuning, "mean_cost", counted)
-    place = tmp_path / "costs.jsonl"
+    folder = tmp_path / "unfinished"
     with pytest.raises(KeyboardInterrupt):
-        tuning.tune(*asked, waiting=place)
-    with place.open("a") as file:
-        file.write('{"half')  # what a crash may leave
-    assert tuning.tune(*asked, waiting=place) == whole
-    assert len(calls) == 10 + (whole.environment_steps // 800 - 9) + 2
-    assert not place.exists()
+        tuning.tune(*asked, store=Store(folder))
+    kept = sorted(folder.iterdir())
+    assert len(kept) == 9
+    kept[0].write_bytes(b"half")  # what a crash may leave
+    assert tuning.tune(*asked, store=Store(folder)) == whole
+    assert len(calls) == 10 + 1 + (whole.environment_steps // 800 - 9) + 2
+    assert not folder.exists()
 
 
 def test_training_seeds_are_scored_the_same(two, tmp_path):
     from filtergym.agents.learned_policy import PRETRAINED
-    from training_seeds import episode_means, load_runs
+    from training_seeds import Study, episode_means, load_runs
 
     folders = []
     for seed, shipped in ((0, "ppo"), (1, "bptt")):
@@ -487,16 +493,16 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
         shutil.copyfile(source.with_suffix(".safetensors"), folders[-1] / "best" / "agent.safetensors")
         record = json.loads((PRETRAINED / "ManeuveringTarget-v0" / "bptt.json").read_text(encoding="utf-8"))
         (folders[-1] / "run.json").write_text(json.dumps(record | {"seed": seed}))
-    asked = (load_runs(folders), ["adaptive"], "random", 10, 0, "validation")
-    one = episode_means(*asked)
-    other = episode_means(*asked, waiting=tmp_path, workers=two)
+    study = Study(load_runs(folders), ["adaptive"], 10, split="validation")
+    one = episode_means(study, "random")
+    other = episode_means(study, "random", store=Store(tmp_path / "unfinished"), workers=two)
     assert list(one.cost) == list(other.cost)
     assert one.units == other.units
     for name in one.cost:
         np.testing.assert_array_equal(one.cost[name], other.cost[name])
         for component in one.squares:
             np.testing.assert_array_equal(one.squares[component][name], other.squares[component][name])
-    assert len(list(tmp_path.glob("*.npz"))) == 4
+    assert len(list((tmp_path / "unfinished").iterdir())) == 4
 
 
 def test_units_of_a_reproduction_stand_in_their_places(two):

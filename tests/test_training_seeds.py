@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import training_seeds
 from filtergym.agents.learned_policy import PRETRAINED
-from training_seeds import compare, episode_means, load_runs, spread
+from filtergym.evaluation.store import Store
+from training_seeds import Study, compare, episode_means, load_runs, spread
 
 ENV = "filtergym/ManeuveringTarget-v0"
 
@@ -77,10 +78,10 @@ def folders(tmp_path):
 
 def test_the_numbers_follow_from_the_episodes(folders):
     runs = load_runs(folders)
-    means = episode_means(runs, ["adaptive"], "random", 30, 0, "validation")
+    study = Study(runs, ["adaptive"], 30, split="validation")
+    means = episode_means(study, "random")
     found = {
-        (c.policy, c.statistic, c.against, c.metric, c.component): c
-        for c in compare(runs, means, "random", 0, "validation")
+        (c.policy, c.statistic, c.against, c.metric, c.component): c for c in compare(study, means, "random")
     }
     cost = {name: values.mean() for name, values in means.cost.items()}
     each = [cost[f"bptt seed {seed}"] for seed in (0, 1)]
@@ -101,31 +102,34 @@ def test_a_learned_estimator_is_scored_beside_policies(folders):
     shutil.copyfile(shipped.with_suffix(".safetensors"), folders[0] / "best" / "agent.safetensors")
     shutil.copyfile(shipped.with_suffix(".json"), folders[0] / "run.json")
     runs = load_runs(folders)
-    means = episode_means(runs, ["kalman-net"], "random", 10, 0, "validation")
+    means = episode_means(Study(runs, ["kalman-net"], 10, split="validation"), "random")
     [member] = [member for member in runs if member.run.algorithm == "kalman-net"]
     assert (means.cost[member.name] == means.cost["kalman-net"]).all()
 
 
 def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
-    scored, whole = [], training_seeds.run_experiment
+    scored, whole = [], training_seeds.reduce_episodes
 
-    def run_experiment(experiment, competitors, progress):
+    def reduce_episodes(asked, declare, tick):
         if len(scored) == stop:
             raise KeyboardInterrupt
-        scored.append(next(iter(competitors)))
-        return whole(experiment, competitors, progress)
+        scored.append(asked.name)
+        return whole(asked, declare, tick)
 
-    monkeypatch.setattr(training_seeds, "run_experiment", run_experiment)
-    asked = (load_runs(folders), ["adaptive"], "random", 10, 0, "validation")
+    monkeypatch.setattr(training_seeds, "reduce_episodes", reduce_episodes)
+    study, store = (
+        Study(load_runs(folders), ["adaptive"], 10, split="validation"),
+        Store(tmp_path / "unfinished"),
+    )
     stop = 99
-    expected = episode_means(*asked)
+    expected = episode_means(study, "random")
     scored.clear()
     stop = 3
     with pytest.raises(KeyboardInterrupt):
-        episode_means(*asked, waiting=tmp_path)
+        episode_means(study, "random", store=store)
     assert scored == ["agent", "agent", "imm"]
     stop = 99
-    found = episode_means(*asked, waiting=tmp_path)
+    found = episode_means(study, "random", store=store)
     assert scored == ["agent", "agent", "imm", "adaptive"]
     assert found.units == expected.units
     np.testing.assert_equal(found.cost, expected.cost)
@@ -134,12 +138,13 @@ def test_what_was_scored_is_not_scored_again(folders, monkeypatch, tmp_path):
     shutil.copyfile(
         PRETRAINED / "ManeuveringTarget-v0" / "ppo.safetensors", folders[1] / "best/agent.safetensors"
     )
-    episode_means(*asked, waiting=tmp_path)
+    episode_means(study, "random", store=store)
     assert scored[4:] == ["agent"]
-    episode_means(asked[0], [], "random", 11, 0, "validation", waiting=tmp_path)
+    other = study._replace(opponents=[], episodes=11)
+    episode_means(other, "random", store=store)
     assert scored[5:] == ["agent", "agent", "imm"]
-    monkeypatch.setattr("filtergym.reports.waiting.code_digest", lambda: "of an edited package")
-    episode_means(asked[0], [], "random", 11, 0, "validation", waiting=tmp_path)
+    monkeypatch.setattr("filtergym.evaluation.store.code_digest", lambda: "of an edited package")
+    episode_means(other, "random", store=store)
     assert scored[8:] == ["agent", "agent", "imm"]
 
 
@@ -176,7 +181,7 @@ def test_command_fills_the_page(folders, tmp_path, make_page, monkeypatch):
     for part in folded:
         assert re.match(r"<summary>[^`]*<code>random</code></summary>\n\n\| ", part)
     assert (tmp_path / "curves.png").stat().st_size > 10_000
-    assert not (tmp_path / "seeds.json.unfinished").exists()
+    assert not (tmp_path / "unfinished").exists()
     records = json.loads((tmp_path / "seeds.json").read_text())
     assert {r["statistic"] for r in records} >= {"run", "opponent", "median", "mean", "between seeds"}
 

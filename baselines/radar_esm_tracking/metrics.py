@@ -27,7 +27,7 @@ def _ratio(means: numpy.ndarray, shares: numpy.ndarray) -> numpy.ndarray:
 def time_quantile(
     bootstrap: Bootstrap, first: numpy.ndarray, chosen: numpy.ndarray, seconds: numpy.ndarray, share: float
 ) -> Estimate:
-    """Time by which a share of the chosen episodes has got there; infinite where too few do.
+    """Time by which a share of the chosen episodes has got there; infinite where too few do, NaN where none is chosen.
 
     Args:
         bootstrap: of the episodes.
@@ -36,13 +36,8 @@ def time_quantile(
         seconds: of each time, ``(T,)``.
         share: such as 0.5 for the median.
     """
-    reached = (first[:, None] == numpy.arange(len(seconds))) & chosen[:, None]
-    arrived = numpy.cumsum(bootstrap.means(reached.astype(float)), axis=1)
-    everyone = bootstrap.means(chosen.astype(float))[:, None]
-    # Rounding of the sums must not move a share that is met exactly.
-    enough = arrived >= share * everyone * (1.0 - 1e-9)
-    times = numpy.where(enough.any(axis=1), seconds[enough.argmax(axis=1)], math.inf)
-    return bootstrap.interval(times)
+    times = numpy.append(seconds, math.inf)[first]
+    return bootstrap.interval(bootstrap.quantiles(times, share, chosen))
 
 
 def _first(condition: numpy.ndarray) -> numpy.ndarray:

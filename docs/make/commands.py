@@ -1,6 +1,5 @@
 """Commands that make this project's own pages: ``python docs/make COMMAND``."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +11,10 @@ from command_line import MARKER as COMMANDS_MARKER
 from command_line import command_line_markdown
 from environment_page import environment_tables, put_tables
 from filtergym.envs.catalogue import find_scenario, importable_name, short_name, task_class
-from filtergym.evaluation.files import whole_files, writable_file, writable_folder
+from filtergym.evaluation.files import whole_files, writable_file
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
+from filtergym.evaluation.store import UNFINISHED, Store
 from pages import check_markers, insert_between_markers, markers_of
 from room import MARKER, measure_room, room_markdown
 
@@ -168,24 +168,16 @@ def seeds(
     for file in (out, curves):
         if file is not None:
             writable_file(file)
-    waiting = None if out is None else writable_folder(out.with_name(f"{out.name}.unfinished"))
+    store = Store(None if out is None else out.with_name(UNFINISHED))
     if into is not None:
         check_markers(into, [marker])
     if curves is not None:
         save(training_seeds.learning_curves(found, columns), curves)
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
+        study = training_seeds.Study(found, opponents, episodes, seed, split, trust)
         records, grids = training_seeds.compare_scenarios(
-            found,
-            opponents,
-            scenarios,
-            episodes,
-            seed,
-            split,
-            lambda done: bar.update(line, advance=done),
-            trust,
-            waiting,
-            workers,
+            study, scenarios, lambda done: bar.update(line, advance=done), store, workers
         )
     if out is not None:
         write_records(out, records)
@@ -194,8 +186,7 @@ def seeds(
         command += "".join(f"--policy {name} " for name in policy or ())
         command += f"--episodes {episodes} --split {split} --seed {seed}"
         insert_between_markers(into, {marker: training_seeds.grids_as_markdown(grids, found, command)})
-    if waiting is not None and waiting.exists():
-        shutil.rmtree(waiting)  # measured by this code: another time it is measured anew
+    store.clear()
     for grid in grids:
         console.print(grid)
 

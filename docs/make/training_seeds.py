@@ -4,35 +4,39 @@ One agent says little about its algorithm. Here the runs of several training see
 that what comes from the training seed and what comes from the episodes can be told apart.
 """
 
+import functools
 import hashlib
 import html
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
+import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
 from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.problem import problem_of
+from filtergym.baselines.problem import Problem, problem_of
 from filtergym.baselines.tuning import tuned_names
-from filtergym.envs.catalogue import make_task, task_class
+from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
+from filtergym.evaluation.code import files_digest
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
-from filtergym.evaluation.evaluate import check_sendable, run_experiment
-from filtergym.evaluation.files import whole_file
-from filtergym.evaluation.metrics import reported_components, score, squared_errors
+from filtergym.evaluation.evaluate import check_sendable
+from filtergym.evaluation.metrics import mean_over_time, reported_components, score, squared_errors
 from filtergym.evaluation.parallel import Workers, check_workers
-from filtergym.evaluation.summary import Asked
+from filtergym.evaluation.statistics import ALL, Statistic
+from filtergym.evaluation.store import Store, Work
+from filtergym.evaluation.summary import Asked, reduce_episodes
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
 from scipy.special import stdtrit
 
 from filtergym.names import find_competitor
 from filtergym.reports.tables import shown_components, with_interval
-from filtergym.reports.waiting import made_by
+from filtergym.reports.work import meaning_of, stem_of
 
 
 class Comparison(NamedTuple):
@@ -79,6 +83,16 @@ class EpisodeMeans(NamedTuple):
     """Policy -> ``(episodes,)``."""
     squares: dict[str, dict[str, numpy.ndarray]]
     """Component -> policy -> squared error, ``(episodes,)``."""
+    units: dict[str, str]
+
+
+class PolicyMeans(NamedTuple):
+    """Means over every episode of one policy."""
+
+    cost: numpy.ndarray
+    """``(episodes,)``."""
+    squares: dict[str, numpy.ndarray]
+    """Component -> squared error, ``(episodes,)``."""
     units: dict[str, str]
 
 
@@ -192,122 +206,127 @@ def default_opponents(id: str) -> list[str]:
     return list(dict.fromkeys([paper_of(id), *known.compared, *untuned, *tuned, *known.references]))
 
 
+class Study(NamedTuple):
+    """Which runs are compared with whom, over which episodes of every scenario."""
+
+    runs: Sequence[SeedRun]
+    opponents: Sequence[str]
+    episodes: int
+    seed: int = 0
+    """Number of the experiment."""
+    split: str = "test"
+    trust: bool = False
+    """Load models that can execute code."""
+
+    @property
+    def problem(self) -> Problem:
+        """That all runs are of."""
+        return problem_of(self.runs[0].run.environment)
+
+
 def episode_means(
-    runs: Sequence[SeedRun],
-    opponents: Sequence[str],
+    study: Study,
     scenario: str | None,
-    episodes: int,
-    seed: int,
-    split: str,
     progress: Callable[[int], None] = lambda done: None,
-    trust: bool = False,
-    waiting: Path | None = None,
+    store: Store | None = None,
     workers: Workers | None = None,
 ) -> EpisodeMeans:
     """Evaluate runs and opponents on the same episodes, each by itself to save memory.
 
-    With ``trust``, models that can execute code are loaded. In the folder ``waiting`` the means of each are kept as
-    soon as they are there, and those that are kept there are taken from it. ``workers`` share them.
+    Args:
+        study: whom, and over what.
+        scenario: name of the scenario.
+        progress: told of measurements done.
+        store: keeps the means of each as soon as they are there. Default: nothing is kept.
+        workers: who share them.
 
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
     """
-    id = runs[0].run.environment
-    problem = problem_of(id)
-    policies: dict[str, tuple[Any, str | None]] = {}
-    for member in runs:
-        maker = find_competitor(problem, str(member.agent), trust)
-        # A learned estimator has a filter of its own, and steers nothing.
-        policies[member.name] = maker, member.run.control if kind_of(maker) == "policy" else None
-    for name in dict.fromkeys([paper_of(id), *opponents]):
-        policies[name] = find_competitor(problem, name, trust), None
-        if kind_of(policies[name][0]) == "bound":
-            raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
-    agents = {member.name: member.agent for member in runs}
-    found: dict[str, Means | None] = {}
-    missing: list[tuple[str, Path | None]] = []
-    work: list[Asked] = []
-    horizon = make_task(id, None, scenario).horizon
-    for name, (maker, control) in policies.items():
-        code = made_by(problem, paper_of(id) if name in agents else name)
-        key = json.dumps([code, id, scenario, episodes, seed, split, name])
-        kept = None if waiting is None or code is None else _kept_file(waiting, key, agents.get(name))
-        found[name] = None if kept is None else _read_means(kept)
+    store = store or Store()
+    found: dict[str, PolicyMeans | None] = {}
+    missing: list[tuple[str, Asked, Work | None]] = []
+    for name, (asked, work) in _asked_of(study, scenario).items():
+        found[name] = store.read(work, PolicyMeans)
         if found[name] is None:
-            missing.append((name, kept))
-            # An agent's name may be that of a competitor.
-            known_as = "agent" if name in agents else name
-            experiment = problem.experiment(scenario, episodes, seed, split, control)
-            work.append(Asked(experiment, known_as, maker, horizon=horizon))
+            missing.append((name, asked, work))
     workers = check_workers(workers)
     if not workers.alone:
-        for asked in work:
+        for _, asked, _ in missing:
             check_sendable(asked.experiment.environment, {asked.name: asked.maker})
-    for i, measured in workers.run(_means_of, work, [asked.measurements for asked in work], progress):
-        name, kept = missing[i]
-        if kept is not None:
-            _write_means(kept, *measured)
-        found[name] = measured
+    everyone = [asked for _, asked, _ in missing]
+    for i, means in workers.run(_means_of, everyone, [asked.measurements for asked in everyone], progress):
+        name, _, work = missing[i]
+        store.write(work, means)
+        found[name] = means
     cost: dict[str, numpy.ndarray] = {}
     squares: dict[str, dict[str, numpy.ndarray]] = {}
     units: dict[str, str] = {}
     for name, every in found.items():
         assert every is not None
-        cost[name], errors, units = every
-        for component, values in errors.items():
+        cost[name], units = every.cost, every.units
+        for component, values in every.squares.items():
             squares.setdefault(component, {})[name] = values
     return EpisodeMeans(cost, squares, units)
 
 
-Means = tuple[numpy.ndarray, dict[str, numpy.ndarray], dict[str, str]]
-"""Cost and squared errors of every episode, and units of the components."""
+def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work | None]]:
+    """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
+    problem = study.problem
+    makers = {member.name: find_competitor(problem, str(member.agent), study.trust) for member in study.runs}
+    for name in dict.fromkeys([paper_of(problem.id), *study.opponents]):
+        makers[name] = find_competitor(problem, name, study.trust)
+        if kind_of(makers[name]) == "bound":
+            raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
+    members = {member.name: member for member in study.runs}
+    horizon = make_task(problem.id, None, scenario).horizon
+    found: dict[str, tuple[Asked, Work | None]] = {}
+    for name, maker in makers.items():
+        member = members.get(name)
+        # A learned estimator has a filter of its own, and steers nothing.
+        control = member.run.control if member and kind_of(maker) == "policy" else None
+        experiment = problem.experiment(scenario, study.episodes, study.seed, study.split, control)
+        meaning = meaning_of(problem, paper_of(problem.id) if member else name)
+        work = None
+        if meaning is not None:
+            agent = hashlib.sha256(member.agent.read_bytes()).hexdigest() if member else ""
+            content = json.dumps([meaning, agent, name, repr(experiment), _own_digest()])
+            work = Work(f"{stem_of(experiment)}.seeds", content)
+        # An agent's name may be that of a competitor.
+        found[name] = Asked(experiment, "agent" if member else name, maker, horizon=horizon), work
+    return found
 
 
-def _means_of(asked: Asked, tick: Callable[[int], None]) -> Means:
-    dataset = run_experiment(asked.experiment, {asked.name: asked.maker}, tick)
-    data = dataset.isel(policy=0)
-    first, last = windows_of(dataset)["all"]
-    known = reported_components(dataset)
-    errors = {}
-    for component in shown_components(list(known)):
-        values = squared_errors(data, component, groups_of(dataset))[:, first - 1 : last]
-        errors[component] = values.mean(axis=1)
-    return data["cost"].values.mean(axis=1), errors, known
+@functools.cache
+def _own_digest() -> str:
+    """Return a digest of the code of this folder, which is no part of the package."""
+    return files_digest([Path(__file__).parent])
 
 
-def _kept_file(waiting: Path, key: str, agent: Path | None) -> Path:
-    """File of one competitor's means; another one if the agent is trained on, or anything else is asked for."""
-    digest = hashlib.sha256(key.encode() + (b"" if agent is None else agent.read_bytes()))
-    return waiting / f"{digest.hexdigest()[:32]}.npz"
+def _means_of(asked: Asked, tick: Callable[[int], None]) -> PolicyMeans:
+    part = reduce_episodes(asked, _mean_statistics, tick)
+    results, units = part.reduction.results(), reported_components(part.head)
+    cost = results.pop(("cost",))
+    return PolicyMeans(cost, {component: values for (component, *_), values in results.items()}, units)
 
 
-def _write_means(
-    path: Path, cost: numpy.ndarray, squares: dict[str, numpy.ndarray], units: dict[str, str]
-) -> None:
-    arrays: dict[str, Any] = {f"squares_{name}": values for name, values in squares.items()}
-    with whole_file(path) as partial, partial.open("wb") as file:
-        numpy.savez(file, cost=cost, units=json.dumps(units), **arrays)
+def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
+    """Declare the mean cost of every episode, and the mean square of every component that is shown."""
+    yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+    first, last = windows_of(run)["all"]
+    for component in shown_components(list(reported_components(run))):
+        squares = squared_errors(run, component, groups_of(run))[:, first - 1 : last]
+        yield Statistic((component, "mean_square"), squares.mean(axis=1), sample=ALL)
 
 
-def _read_means(path: Path) -> Means | None:
-    """Return cost, squares by component, and units; None if they are not there yet."""
-    if not path.exists():
-        return None
-    with numpy.load(path, allow_pickle=False) as kept:
-        squares = {name.removeprefix("squares_"): kept[name] for name in kept if name.startswith("squares_")}
-        return kept["cost"], squares, json.loads(str(kept["units"]))
-
-
-def compare(
-    runs: Sequence[SeedRun], means: EpisodeMeans, scenario: str, seed: int, split: str
-) -> list[Comparison]:
+def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison]:
     """Every number of the tables, from the episodes' means.
 
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
     """
-    id = task_class(runs[0].run.environment).id
-    paper, reference = paper_of(id), baselines_of(id).score_reference
+    runs, id = study.runs, study.problem.id
+    paper, reference = paper_of(id), study.problem.baselines.score_reference
     episodes = len(means.cost[paper])
     bootstrap = Bootstrap(episodes)
     cost = {name: bootstrap.means(values) for name, values in means.cost.items()}
@@ -328,7 +347,7 @@ def compare(
         """Keep an estimate, or the interval of a statistic and its resamples."""
         estimate = values if isinstance(values, Estimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
-        where = (id, scenario, split, seed, episodes)
+        where = (id, scenario, study.split, study.seed, episodes)
         what = (policy, statistic, against, metric, component)
         found.append(Comparison(*where, *what, value, low, high, means.units.get(component, "1")))
 
@@ -340,7 +359,13 @@ def compare(
     opponents = [name for name in cost if name not in trained]
     for name in cost:
         statistic = "run" if name in trained else "opponent"
-        add(name, statistic, paper, "relative_cost_difference", cost[name] / cost[paper] - 1.0)
+        add(
+            name,
+            statistic,
+            paper,
+            "relative_cost_difference",
+            bootstrap.relative_difference(cost[name], cost[paper]),
+        )
         if reference in cost:
             add(
                 name,
@@ -435,15 +460,10 @@ def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison])
 
 
 def compare_scenarios(
-    runs: Sequence[SeedRun],
-    opponents: Sequence[str],
+    study: Study,
     scenarios: Sequence[str],
-    episodes: int,
-    seed: int,
-    split: str,
     progress: Callable[[int], None] = lambda done: None,
-    trust: bool = False,
-    waiting: Path | None = None,
+    store: Store | None = None,
     workers: Workers | None = None,
 ) -> tuple[list[Comparison], list[Grid]]:
     """Evaluate runs and opponents in every scenario; return all numbers, and the tables of them.
@@ -453,12 +473,10 @@ def compare_scenarios(
     records: list[Comparison] = []
     grids: list[Grid] = []
     for scenario in scenarios:
-        means = episode_means(
-            runs, opponents, scenario, episodes, seed, split, progress, trust, waiting, workers
-        )
-        comparisons = compare(runs, means, scenario, seed, split)
+        means = episode_means(study, scenario, progress, store, workers)
+        comparisons = compare(study, means, scenario)
         records += comparisons
-        grids += comparison_grids(runs, comparisons)
+        grids += comparison_grids(study.runs, comparisons)
     return records, grids
 
 

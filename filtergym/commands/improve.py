@@ -16,6 +16,7 @@ from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
 from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
+from ..evaluation.store import UNFINISHED, Store
 from ..reports import standing
 from ..reports.tables import tuned_table
 from .terminal import (
@@ -65,7 +66,7 @@ def tune_policy(
             progress=lambda steps: bar.update(line, advance=steps),
             backend=backend,
             workers=workers,
-            waiting=table.with_name(f"{table.stem}.{policy}.unfinished"),
+            store=Store(table.with_name(UNFINISHED)),
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)

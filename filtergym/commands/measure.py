@@ -30,6 +30,7 @@ from ..evaluation.metrics import flight_records
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
+from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
 from ..names import asked_of, competitors_of, find_competitor, is_learned, tidy_records
 from ..offline import default_policies, write_datasets
@@ -40,7 +41,7 @@ from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
 from ..reports.tables import datasets_table, flights_table, recorded_table, results_tables
-from ..reports.waiting import UNFINISHED, kept_in, remove
+from ..reports.work import work_of
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -241,7 +242,7 @@ def evaluate_policies(
         strict=strict,
         keywords=keywords,
     )
-    curves, kept = None, []
+    curves, store = None, Store(None if out is None else out / UNFINISHED)
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task("evaluating", total=measurements)
 
@@ -253,8 +254,8 @@ def evaluate_policies(
             dataset = run_experiment(experiment, makers, tick, workers)
         else:
             asked = asked_of(problem, experiment, names, trust)
-            kept = [None if out is None else kept_in(out / UNFINISHED, one) for one in asked]
-            found = dict(summaries(asked, workers, tick, kept))
+            work = [] if out is None else [work_of(one) for one in asked]
+            found = dict(summaries(asked, workers, tick, store, work))
     if everything:
         records = tidy_records(dataset)
         curves = None if out is None else curves_of(dataset)
@@ -287,7 +288,7 @@ def evaluate_policies(
             if judged:
                 result, made = result_of(dataset, records, curves, learned), settings_of(command_line())
                 write_results(waiting / RESULTS, [result], made)
-        remove(out / UNFINISHED, [place.path for place in kept if place is not None])
+        store.clear()
     for table in tables:
         console.print(table)
     for note in notes_of(dataset):

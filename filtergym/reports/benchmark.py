@@ -14,9 +14,10 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import catalogue, short_name
 from ..evaluation.dataset import groups_of, notes_of
-from ..evaluation.files import writable_file, writable_folder
+from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
+from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import Asked, Summary, combine_summaries, summaries
 from ..names import asked_of
 from .results import (
@@ -29,7 +30,7 @@ from .results import (
     track_of,
     write_results,
 )
-from .waiting import UNFINISHED, kept_in, remove
+from .work import work_of
 
 MEASUREMENTS = 60_000
 """Measurements per policy and cell of the quick benchmark: 500 episodes of 100 scans, and some more."""
@@ -188,7 +189,7 @@ def run_benchmark(
     """
     wanted = cells(full, environments, split)
     settings = settings_of(command)
-    unfinished = writable_folder(folder / UNFINISHED)
+    store = Store(folder / UNFINISHED)
     writable_file(folder / RESULTS)
     tick = started(sum(cell.measurements for cell in wanted))
     results: list[Result | None] = [None] * len(wanted)
@@ -227,15 +228,14 @@ def run_benchmark(
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
-    kept = [kept_in(unfinished, one) for one, _ in asked]
-    for k, summary in summaries([one for one, _ in asked], workers, tick, kept):
+    work = [work_of(one) for one, _ in asked]
+    for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
         one, i = asked[k]
         found[i][one.name] = summary
         settle(i)
     done = [result for result in results if result is not None]
     write_results(folder / RESULTS, done, settings)
-    # Only its own files: the folder may hold what somebody else put there, or a benchmark with another seed.
-    remove(unfinished, [place.path for place in kept if place is not None])
+    store.clear()
     return done
 
 

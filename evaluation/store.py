@@ -1,0 +1,133 @@
+"""The store of unfinished work: after whatever ended a command, the same command goes on with what is missing.
+
+The result of each piece of work is one file. Its name ends with a digest of the content of all that makes the result:
+what was asked for, and the code that answers. What depends on anything else has another name, and is made again.
+
+A file is MessagePack of a declared type. Reading it executes and imports nothing, and gives that type or nothing.
+"""
+
+import hashlib
+import io
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+import numpy
+import xarray
+
+from .code import code_digest
+from .files import whole_file, writable_folder
+
+UNFINISHED = "unfinished"
+"""Folder of a store, beside the results of a command."""
+SUFFIX = ".msgpack"
+DIGITS = 32
+"""Hexadecimal digits of a digest in the name of a file: 128 bits."""
+
+Result = TypeVar("Result")
+
+
+class Work(NamedTuple):
+    """A piece of work, told apart from others by all that its result depends on."""
+
+    name: str
+    """Begins the name of its file. What has the same name is removed together."""
+    content: str
+    """Whatever its result depends on beside the code of the package."""
+
+
+class Store:
+    """Results of pieces of work in a folder.
+
+    Args:
+        folder: made with the first result; None: nothing is kept.
+
+    Raises:
+        ValueError: if the folder cannot be written to.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = None if folder is None else writable_folder(folder)
+        self._names: set[str] = set()
+
+    def _path(self, work: Work | None) -> Path | None:
+        if self.folder is None or work is None:
+            return None
+        name = re.sub(r"[^\w.-]", "_", work.name)  # no path to another folder
+        self._names.add(name)
+        digest = hashlib.sha256(f"{code_digest()} {work.name} {work.content}".encode()).hexdigest()
+        return self.folder / f"{name}.{digest[:DIGITS]}{SUFFIX}"
+
+    def read(self, work: Work | None, kind: type[Result]) -> Result | None:
+        """Return the result of a piece of work; None where there is none.
+
+        Args:
+            work: None: a piece that is never kept, since nobody can say whether what makes it is what it was.
+            kind: type of its results.
+        """
+        path = self._path(work)
+        if path is None or not path.is_file():
+            return None
+        try:
+            return msgspec.msgpack.decode(path.read_bytes(), type=kind, dec_hook=_decoded)
+        except (msgspec.MsgspecError, OSError, ValueError, TypeError, LookupError):
+            return None  # somebody else's, or damaged: it is made again
+
+    def write(self, work: Work | None, result: Any) -> None:
+        """Keep the result of a piece of work: numbers, words, arrays and datasets, in containers of declared types.
+
+        Raises:
+            ValueError: if it cannot be written.
+        """
+        path = self._path(work)
+        if path is not None:
+            content = msgspec.msgpack.encode(result, enc_hook=_encoded)
+            with whole_file(path) as partial:
+                partial.write_bytes(content)
+
+    def result(self, work: Work | None, kind: type[Result], make: Callable[[], Result]) -> Result:
+        """Return the result of a piece of work, which is made and kept where there is none."""
+        found = self.read(work, kind)
+        if found is None:
+            found = make()
+            self.write(work, found)
+        return found
+
+    def clear(self) -> None:
+        """Remove what has the names of the work that was asked for, and the folder if nothing else is in it."""
+        if self.folder is None or not self.folder.is_dir():
+            return
+        own = rf"\.?(.+)\.[0-9a-f]{{{DIGITS}}}{re.escape(SUFFIX)}(\.partial)?"  # a crash leaves partial ones
+        for path in self.folder.iterdir():
+            found = re.fullmatch(own, path.name)
+            if found and found[1] in self._names:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):  # something else is in it
+            self.folder.rmdir()
+
+
+def _encoded(value: Any) -> Any:
+    """Put into plain values what MessagePack has no words for."""
+    if isinstance(value, numpy.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, numpy.generic):
+        return value.item()
+    if isinstance(value, xarray.Dataset):
+        return bytes(value.to_netcdf(engine="scipy", format="NETCDF3_64BIT"))
+    raise NotImplementedError(f"a {type(value).__name__} cannot be kept")
+
+
+def _decoded(kind: type, value: Any) -> Any:
+    """Return what :func:`_encoded` was given."""
+    if kind is numpy.ndarray:
+        dtype, shape, content = value
+        return numpy.frombuffer(content, dtype).reshape(shape).copy()
+    with xarray.open_dataset(io.BytesIO(value), engine="scipy") as read:
+        dataset = read.load()
+    for name, attribute in dataset.attrs.items():
+        if isinstance(attribute, numpy.generic):
+            dataset.attrs[name] = attribute.item()
+    return dataset
