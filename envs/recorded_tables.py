@@ -1,7 +1,8 @@
-"""Tables of what sensors said, one row a measurement, as they come out of a radar, a receiver or a logger.
+"""Tables of what sensors really said, made into recordings.
 
-An environment says which columns it knows and makes measurements of them (:class:`.LogFormat`). What every table has in
-common is here: times, missing values, several recordings in one file, and true values, ``truth_NAME`` for every component of the environment.
+An environment says which columns it knows and makes measurements of them (:class:`.LogFormat`). What every table has
+in common is here: times, missing values, several recordings in one file, and true values, ``truth_NAME`` for every
+component of the environment.
 """
 
 from collections.abc import Iterable, Mapping
