@@ -386,6 +386,7 @@ else:
 """
 
 
+@pytest.mark.slow
 def test_a_cluster_lets_nobody_else_in(clustered):
     """Another process, of another user where there can be one, whatever it says."""
     assert clustered.results(warned_not, [1, 2]) == [1, 2]
@@ -419,6 +420,7 @@ def warned_not(item, tick):
     return item
 
 
+@pytest.mark.slow
 def test_a_cluster_has_the_same_bits_and_loses_nothing(clustered, tmp_path, monkeypatch):
     names = ["imm", "imm-tuned", "known-turn"]
     one = evaluate(ENV, names, episodes=10)
@@ -517,6 +519,7 @@ def test_units_of_a_reproduction_stand_in_their_places(two):
         np.testing.assert_array_equal(values, getattr(other["imm", 1][0], name))
 
 
+@pytest.mark.slow
 def test_training_seeds_trains_the_same_agents(command, tmp_path):
     pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")
