@@ -125,7 +125,9 @@ def random_policy(env, dtype):
         ("UavAutopilot", "gain", {}),
         ("RadarEsmTracking", "evidence", {}),
         # Of ten measurements each; its gradient takes longest to compile.
-        pytest.param("TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, marks=pytest.mark.slow),
+        pytest.param(
+            "TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, marks=pytest.mark.slow
+        ),
     ],
 )
 @pytest.mark.parametrize("largest", [None, 0.01])
