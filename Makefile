@@ -27,15 +27,18 @@ EXTRAS := agents,fast,search,tensorboard,report,render,flights,adapters,offline,
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions
 
-.PHONY: benchmark test coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
+.PHONY: benchmark test test-slow coverage core-tests test-processors test-lowest test-cluster test-extras test-pythons distributions check format docs clean
 
 benchmark: $(VENV)/.core  ## run every environment with its policies (quick)
 	$(BIN)/filtergym benchmark --jobs $(JOBS)
 
-test: $(VENV)/.dev  ## run the whole test suite
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
+test: $(VENV)/.dev  ## run the test suite, without what only whole programs show
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
-coverage: $(VENV)/.dev  ## the same, and show the lines that no test reaches
+test-slow: $(VENV)/.dev  ## run whole programs: pages, recipes, reproductions, a browser, clusters
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+coverage: $(VENV)/.dev  ## run both, and show the lines that no test reaches
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile --cov --cov-report=term
 
 core-tests:  # in an environment of its own, build/$(ENVIRONMENT), without torch

@@ -8,6 +8,7 @@ import os
 import platform
 import subprocess
 import sys
+from pathlib import Path
 
 from numpy._core import _multiarray_umath as umath
 
@@ -31,8 +32,9 @@ SETTINGS = {
     },
 }
 """Environment variables by what they do; of x86 only."""
-CHOSEN = "not TightlyCoupledNavigation or evidence or rewards"
-"""Of the tests that are marked: code of TightlyCoupledNavigation takes long to compile, and one control tells."""
+CHOSEN = "not TightlyCoupledNavigation or ((evidence or rewards) and not gradients)"
+"""Of the tests that are marked: code of TightlyCoupledNavigation takes long to compile, gradients longest, and one
+control tells."""
 
 
 def main() -> None:
@@ -40,7 +42,22 @@ def main() -> None:
     if platform.machine().lower() not in ("x86_64", "amd64"):
         print(f"The settings are of x86 processors, and this one is {platform.machine()}: nothing is tried.")
         return
-    tests = [sys.executable, "-m", "pytest", "-q", "-m", "processors", "-k", CHOSEN, *sys.argv[1:]]
+    # Only the files that hold such tests: to import all of them takes longer than to run these.
+    files = [
+        path for path in Path(__file__).parent.glob("test_*.py") if "mark.processors" in path.read_text()
+    ]
+    tests = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-m",
+        "processors",
+        "-k",
+        CHOSEN,
+        *sys.argv[1:],
+        *sorted(files),
+    ]
     failed = []
     for name, variables in SETTINGS.items():
         print(f"{name}: {' '.join(f'{key}={value!r}' for key, value in variables.items())}", flush=True)

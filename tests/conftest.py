@@ -8,6 +8,7 @@ import functools
 import gc
 import importlib
 import os
+import re
 
 import gymnasium as gym
 import hypothesis
@@ -34,6 +35,25 @@ DECISIONS = 5
 """Length of the short episodes, in decisions."""
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Give whole files to the processes, and all that is of TightlyCoupledNavigation to one of them.
+
+    Its programs take seconds to compile, and a process traces them once.
+    """
+    if config.getvalue("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Scheduling(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            if re.search("tightly_?coupled", nodeid, re.IGNORECASE):
+                return "TightlyCoupledNavigation"
+            return nodeid.split("::", 1)[0]
+
+    return Scheduling(config, log)
+
+
 def pytest_collection_finish(session):
     """Spare the garbage collector what stays to the end, libraries and tests; it would look through it many times."""
     gc.collect()
@@ -44,11 +64,33 @@ def pytest_generate_tests(metafunc):
     """Fill in the catalogue."""
     if "env_id" not in metafunc.fixturenames:
         return
+    paired = metafunc.definition.get_closest_marker("with_controls")
+    if paired:
+        names, cases = paired.args
+        metafunc.parametrize(("env_id", "control", *names), paired_controls(cases))
+        return
     if "control" in metafunc.fixturenames:
         cases = [(id, control) for id, cls in catalogue().items() for control in cls.controls]
         metafunc.parametrize(("env_id", "control"), cases)
     else:
         metafunc.parametrize("env_id", list(catalogue()))
+
+
+def paired_controls(cases):
+    """Every case under the first control of every environment, and the cases in turn under its other controls.
+
+    Args:
+        cases: lists of further parameters of a test.
+
+    Returns:
+        rows ``(env_id, control, *case)`` for ``parametrize``.
+    """
+    rows = []
+    for id, cls in catalogue().items():
+        first, *others = cls.controls
+        rows += [(id, first, *case) for case in cases]
+        rows += [(id, control, *cases[i % len(cases)]) for i, control in enumerate(others)]
+    return rows
 
 
 @pytest.fixture

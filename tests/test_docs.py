@@ -72,6 +72,7 @@ def test_page_names_every_field(id):
             assert stem, f"{field.name} of control {control}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AUDIENCES)
 def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch):
     """One block after the other in an empty folder; a block that names its file becomes it.

@@ -139,6 +139,7 @@ def test_log_is_read(tmp_path, pyins):
     )
 
 
+@pytest.mark.slow
 def test_ins_aligned_by_the_log_follows_the_circle(tmp_path, pyins, monkeypatch):
     """Biases that the standstill and the turns tell apart do not drive it away: left alone, those make 50 m of 20 s."""
     monkeypatch.setattr(drive, "ALIGNMENT", 20.0)

@@ -24,7 +24,7 @@ ALLOWED_WARNINGS = (
 )
 
 
-@pytest.mark.parametrize("detailed_info", [False, True])
+@pytest.mark.with_controls(("detailed_info",), [(False,), (True,)])
 def test_gymnasium_check(env_id, control, detailed_info, short):
     env = gym.make(env_id, control=control, detailed_info=detailed_info, disable_env_checker=True, **short)
     with warnings.catch_warnings(record=True) as caught:
@@ -141,7 +141,7 @@ def test_spawned_processes(env_id, short, random_actions):
 
 
 def test_fields_describe_the_observation(env_id, control):
-    env = TaskEnv(env_id, control=control)
+    env = TaskEnv(env_id, control=control, backend="numpy")
     fields = env.observation_fields
     assert len(fields) == env.observation_space.shape[0]
     assert len({field.name for field in fields}) == len(fields)
@@ -174,7 +174,7 @@ def test_one_scenario_is_for_training(env_id):
 
 
 def test_float64_actions_lose_nothing(env_id, control, short):
-    env = TaskEnv(env_id, control=control, **short)
+    env = TaskEnv(env_id, control=control, backend="numpy", **short)
     if not isinstance(env.action_space, gym.spaces.Box):
         pytest.skip("integers have no precision")
     fine = np.full(env.action_space.shape, 0.3, dtype=np.float64)

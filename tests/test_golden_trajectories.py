@@ -30,6 +30,22 @@ def stored_file(env_id, control):
     return FOLDER / f"{env_id.split('/')[-1]}-{control}.json"
 
 
+@functools.cache
+def stored(env_id, control):
+    """The stored trajectory."""
+    path = stored_file(env_id, control)
+    assert path.exists(), (
+        f"{path.name} is missing: run `python tests/test_golden_trajectories.py` and look at what it wrote"
+    )
+    return json.loads(path.read_text())
+
+
+@functools.cache
+def trajectory_of_stored_actions(env_id, control, backend="numpy"):
+    """Trajectory that the stored actions lead to now."""
+    return trajectory(env_id, control, stored(env_id, control)["actions"], backend)
+
+
 def trajectory(env_id, control, actions, backend="numpy"):
     """Observations and rewards that the actions lead to."""
     env = gym.make(env_id, control=control, backend=backend, disable_env_checker=True)
@@ -47,7 +63,7 @@ def trajectory(env_id, control, actions, backend="numpy"):
 @functools.cache
 def tolerances(env_id, control):
     """What rounding may do to the trajectory, that of the constants which follow from the parameters included."""
-    actions = json.loads(stored_file(env_id, control).read_text())["actions"]
+    actions = stored(env_id, control)["actions"]
     parameters = make_task(env_id, control).parameters
     found = {"observations": [], "rewards": []}
     for repetition in REPETITIONS:
@@ -60,7 +76,7 @@ def tolerances(env_id, control):
             paid.append(reward)
         found["observations"] += list(np.stack(shown, axis=1))
         found["rewards"] += list(np.stack(paid, axis=1))
-    here = trajectory(env_id, control, actions)
+    here = trajectory_of_stored_actions(env_id, control)
     return {name: tolerance(np.array(here[name]), others, time=0) for name, others in found.items()}
 
 
@@ -69,16 +85,12 @@ def tolerances(env_id, control):
 def test_trajectory_is_the_stored_one(env_id, control, backend):
     if backend == "compiled":
         pytest.importorskip("llvmlite")
-    path = stored_file(env_id, control)
-    assert path.exists(), (
-        f"{path.name} is missing: run `python tests/test_golden_trajectories.py` and look at what it wrote"
-    )
-    stored = json.loads(path.read_text())
-    now = trajectory(env_id, control, stored["actions"], backend)
-    assert now["interface"] == stored["interface"]
-    assert now["fields"] == stored["fields"]
+    expected = stored(env_id, control)
+    now = trajectory_of_stored_actions(env_id, control, backend)
+    assert now["interface"] == expected["interface"]
+    assert now["fields"] == expected["fields"]
     for name, allowed in tolerances(env_id, control).items():
-        assert_near(now[name], stored[name], allowed, name)
+        assert_near(now[name], expected[name], allowed, name)
 
 
 def test_no_file_is_left_over():

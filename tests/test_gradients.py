@@ -124,7 +124,10 @@ def random_policy(env, dtype):
         ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}),
         ("UavAutopilot", "gain", {}),
         ("RadarEsmTracking", "evidence", {}),
-        ("TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}),  # of ten measurements each
+        # Of ten measurements each; its gradient takes longest to compile.
+        pytest.param(
+            "TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, marks=pytest.mark.slow
+        ),
     ],
 )
 @pytest.mark.parametrize("largest", [None, 0.01])

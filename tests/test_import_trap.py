@@ -298,6 +298,7 @@ def results_ways(folder, command):
         yield "told of a benchmark", lambda: read_results(folder / "begun" / name)
 
 
+@pytest.mark.slow
 def test_a_name_that_was_read_from_a_file_imports_nothing(folder, command, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "sets"))
     tried, executed = 0, []

@@ -319,6 +319,7 @@ def test_lanes_that_restart_alone_equal_single_environments(control):
 # --- reproduction
 
 
+@pytest.mark.slow
 def test_reproduction_runs_and_judges():
     done = []
     result = paper.reproduce(lambda n=1: done.append(n), 60)

@@ -72,13 +72,10 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
 
 @pytest.mark.parametrize("env", catalogue())
 def test_summaries_tell_what_the_evaluation_does(env):
-    """One after the other: also of those who lack what others have, as bounds, and estimators without a bank."""
+    """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env)
-    names = list(
-        dict.fromkeys(
-            [known.score_paper, *known.estimators, *known.references, *known.bounds, *shipped_agents(env)]
-        )
-    )
+    kinds = ([known.score_paper], known.estimators, known.references, known.bounds, shipped_agents(env))
+    names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
     asked = asked_of(
@@ -391,6 +388,7 @@ else:
 """
 
 
+@pytest.mark.slow
 def test_a_cluster_lets_nobody_else_in(clustered):
     """Another process, of another user where there can be one, whatever it says."""
     assert clustered.results(warned_not, [1, 2]) == [1, 2]
@@ -424,6 +422,7 @@ def warned_not(item, tick):
     return item
 
 
+@pytest.mark.slow
 def test_a_cluster_has_the_same_bits_and_loses_nothing(clustered, tmp_path, monkeypatch):
     names = ["imm", "imm-tuned", "known-turn"]
     one = evaluate(ENV, names, episodes=10)
@@ -523,6 +522,7 @@ def test_units_of_a_reproduction_stand_in_their_places(two):
         np.testing.assert_array_equal(values, getattr(other["imm", 1][0], name))
 
 
+@pytest.mark.slow
 def test_training_seeds_trains_the_same_agents(command, tmp_path):
     pytest.importorskip("torch")
     pytest.importorskip("stable_baselines3")

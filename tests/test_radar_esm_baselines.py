@@ -497,6 +497,7 @@ def reproduced():
     return reproduction.reproduce(done.append, 400), done
 
 
+@pytest.mark.slow
 def test_reproduction_reports_its_progress(reproduced):
     assert sum(reproduced[1]) == pytest.approx(reproduction.STEPS)
 

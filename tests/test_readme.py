@@ -16,6 +16,7 @@ SNIPPETS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer", "index"])
 def test_snippet_runs(snippet, capsys):
     if "stable_baselines3" in snippet:

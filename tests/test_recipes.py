@@ -45,6 +45,7 @@ def shortened(file: Path) -> str:
     return ast.unparse(tree)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_recipe_runs(recipe, tmp_path):
     name = Path(recipe).stem.removeprefix("with_")

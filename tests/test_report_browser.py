@@ -7,7 +7,7 @@ from test_report import SETTINGS, hostile
 
 from filtergym.reports.html_report import report_html
 
-pytestmark = pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())]
 FIGURES = ["ranking", "rmse", "exceeded", "consistency", "steering", "track"]
 WAIT = 60.0
 """Seconds that nobody should need."""

@@ -250,6 +250,7 @@ def test_a_window_moves_with_the_turn() -> None:
     assert claims.compared(ours, theirs, later=1).turn[0].value == pytest.approx(0.0)
 
 
+@pytest.mark.slow
 def test_everything_reports_its_progress(results: SimpleNamespace) -> None:
     assert sum(results.done) == pytest.approx(paper.STEPS)
 

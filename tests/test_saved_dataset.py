@@ -146,6 +146,7 @@ def test_a_component_of_two_groups_is_refused():
 # --- the page
 
 
+@pytest.mark.slow
 def test_examples_of_the_page(tmp_path, monkeypatch, capsys):
     """What is written by a command is read by xarray alone, and drawn."""
     page = (Path(__file__).parent.parent / "docs" / "evaluation.md").read_text(encoding="utf-8")

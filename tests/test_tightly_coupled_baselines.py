@@ -450,6 +450,7 @@ def fake_run(episodes, steps, motion, lost):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
     def simulate(scenario, filters, **keywords):
         motion = keywords.get("leg_steps", (1000,))[0] + 1

@@ -171,6 +171,7 @@ LIBRARIES = (
 """That the commands, what they use, or their processes would import; some are not installed."""
 
 
+@pytest.mark.slow
 def test_a_file_of_ones_own_is_no_library(tmp_path):
     """Not even where the library is missing; what is named is found, in every process, and what it imports, too."""
     for name in LIBRARIES:

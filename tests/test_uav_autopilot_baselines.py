@@ -420,6 +420,7 @@ def test_lost_loops_are_counted_and_every_number_stays_finite() -> None:
 # ---------------------------------------------------------------- the reproduction
 
 
+@pytest.mark.slow
 def test_reproduction_with_few_runs_tells_its_progress() -> None:
     done: list[float] = []
     result = paper.reproduce(done.append, 20)

@@ -55,7 +55,7 @@ def assert_same_info(one, other):
             np.testing.assert_array_equal(one[name][lane], values[lane], err_msg=name)
 
 
-@pytest.mark.parametrize(("count", "mode"), COMPANY)
+@pytest.mark.with_controls(("count", "mode"), COMPANY)
 def test_equals_a_vector_of_single_environments(env_id, control, mode, count, short, random_actions):
     keywords = {"control": control, "detailed_info": True, **short}
     ours, theirs = native(env_id, count, mode, **keywords), synchronous(env_id, count, mode, **keywords)
@@ -237,8 +237,8 @@ BAD_MASKS = [
 
 
 @pytest.mark.parametrize("mask", BAD_MASKS)
-def test_bad_reset_mask(env_id, mask):
-    env = native(env_id, 2)
+def test_bad_reset_mask(mask):
+    env = native("filtergym/ManeuveringTarget-v0", 2)
     env.reset(seed=0)
     with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": mask})
@@ -265,8 +265,7 @@ def scribble(value):
             value[...] = ~value if value.dtype == bool else 77
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("count", [3, 8])
+@pytest.mark.with_controls(("count", "mode"), [(count, mode) for count in (3, 8) for mode in MODES])
 def test_nothing_returned_or_given_is_shared(env_id, control, mode, count, short, random_actions):
     # A caller may keep and overwrite whatever it gets, and reuse the arrays that it gives.
     clean, abused = (
