@@ -21,6 +21,7 @@ from typing import Any
 import gymnasium
 import numpy
 
+from .failures import own_line
 from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from .plausibility import check_recording
@@ -123,7 +124,9 @@ def imported(module: str, refusal: str) -> ModuleType:
         with on_path(_SEARCHED):
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
-        raise ValueError(f"{refusal}: {type(error).__name__}: {error}") from error
+        # A ValueError says all that there is to say.
+        line = "" if isinstance(error, ValueError) else own_line(error)
+        raise ValueError(f"{refusal}: {type(error).__name__}: {error}{line}") from error
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
     FOUND_IN.extend(
         folder
@@ -141,11 +144,16 @@ def import_task(id: str) -> type[Task]:
     Raises:
         ValueError: if there is none, or its module cannot be imported.
     """
-    if isinstance(id, str):
-        module, colon, own = id.partition(":")
-        if colon:
-            imported(module, f"cannot import {module!r}, which registers environment {own!r}")
-    return task_class(id)
+    if not isinstance(id, str) or ":" not in id:
+        return task_class(id)
+    module, _, own = id.partition(":")
+    imported(module, f"cannot import {module!r}, which registers environment {own!r}")
+    try:
+        return task_class(own)
+    except ValueError as error:
+        raise ValueError(
+            f"{error}; {module!r} was imported, and does not register it with filtergym.register_task"
+        ) from error
 
 
 def task_class(id: str) -> type[Task]:

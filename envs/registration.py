@@ -2,14 +2,14 @@
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, get_origin
 
 import gymnasium
 import numpy
 
-from ..compiler.functions import mapped
 from .catalogue import ADDED, catalogue, nearest, register
+from .failures import explain_errors
 from .task import Episode, Task
 
 ID = re.compile(r"[\w-]+/[\w.-]+-v\d+")
@@ -44,7 +44,7 @@ def _check_contract(cls: Any) -> None:
         raise ValueError(f"an environment is a subclass of filtergym.envs.task.Task, got {cls!r}")
     name = cls.__name__
     declared = [n for n, hint in Task.__annotations__.items() if get_origin(hint) is ClassVar]
-    missing = [attribute for attribute in declared if not hasattr(cls, attribute)]
+    missing = [n for n in declared if not hasattr(cls, n) and n != "controls"]  # the names of its banks
     if missing:
         raise ValueError(f"{name} lacks the class attributes {', '.join(missing)} of a task")
     if not ID.fullmatch(cls.id):
@@ -65,7 +65,11 @@ def _check_contract(cls: Any) -> None:
     )
     if not {"horizon", "decision_interval"} <= fields:
         raise ValueError(f"{name}.Parameters needs to be a dataclass with horizon and decision_interval")
-    for scenario in cls.scenarios.values():
+    if cls.actions.keys() - cls.banks.keys():
+        raise nearest(f"control in actions of {name}", min(cls.actions.keys() - cls.banks.keys()), cls.banks)
+    for key, scenario in cls.scenarios.items():
+        if key != scenario.name:
+            raise ValueError(f"scenario {scenario.name!r} of {name} stands in the table as {key!r}")
         unknown = set(scenario.parameters) - fields
         if unknown:
             raise ValueError(
@@ -73,13 +77,13 @@ def _check_contract(cls: Any) -> None:
             )
     expected = [n for n in Task.__annotations__ if n not in declared]
     for control in (*cls.controls, *cls.trained_banks):
-        try:
+        with explain_errors(f"{name} cannot be made with control {control!r}"):
             task = cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters), control)
-        except Exception as error:  # whatever a constructor stumbles over
-            raise ValueError(f"{name} cannot be made with control {control!r}: {error!r}") from error
         missing = [attribute for attribute in expected if not hasattr(task, attribute)]
         if missing:
-            raise ValueError(f"{_named(task)} lacks the attributes {', '.join(missing)} of a task")
+            raise ValueError(
+                f"{_named(task)} needs {', '.join(missing)}: attributes of the class, or set by its set_up"
+            )
         _check_action(task)
         _check_episodes(task)
 
@@ -117,10 +121,8 @@ def _check_episodes(task: Task) -> None:
         return ask("measure", task.measure, episode, row)
 
     def ask(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        try:
+        with explain_errors(f"{_named(task)} fails in {what}"):
             return function(*arguments)
-        except Exception as error:  # whatever somebody's code stumbles over
-            raise ValueError(f"{_named(task)} fails in {what}: {error!r}") from error
 
     def check(what: str, values: Any, shape: tuple[int, ...] | None = None, finite: bool = True) -> None:
         numbers = isinstance(values, numpy.ndarray) and values.dtype.kind in "fiub"
@@ -139,7 +141,8 @@ def _check_episodes(task: Task) -> None:
             raise ValueError(f"{_named(task)}: {what} must be finite")
 
     uniforms, normals = random.random((noise.uniforms, WIDTH)), numpy.zeros((noise.initial_normals, WIDTH))
-    episode = measure(ask("begin", task.begin, uniforms, normals))
+    start = ask("begin", task.begin, uniforms, normals)
+    episode = measure(start)
     for block in task.bank.blocks:
         values = ask(f"block {block.name!r}", block.value, episode.filter, episode.measurement)
         check(f"block {block.name!r}", values)
@@ -174,7 +177,25 @@ def _check_episodes(task: Task) -> None:
     for name, values in ask("context", task.context, episode).items():
         check(f"context {name!r}", values)
     episode = measure(episode)  # with what the bank gives back
-    mapped(lambda values: check("what an episode consists of", values, finite=False), tuple(episode))
+    before = dict([*_leaves("truth", start.truth), *_leaves("filter's state", start.filter)])
+    for part in ("truth", "measurement", "filter's state"):
+        for name, values in _leaves(part, getattr(episode, part.partition("'")[0])):
+            check(name, values, finite=False)
+            first = numpy.shape(before.get(name, values))
+            if first != values.shape:
+                raise ValueError(
+                    f"{_named(task)}: {name} must keep its shape, got {first} at the start of the track and "
+                    f"{values.shape} after two measurements"
+                )
+
+
+def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
+    """Arrays of nested tuples, and whatever stands in their place, with names such as "load of the truth"."""
+    if isinstance(part, tuple):
+        for field, value in zip(getattr(part, "_fields", range(len(part))), part, strict=True):
+            yield from _leaves(f"{field} of the {name}", value)
+    elif part is not None:
+        yield name, part
 
 
 def _named(task: Task) -> str:

@@ -5,11 +5,8 @@ world, and keeps its memory to itself: it may be anything.
 """
 
 import math
-import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -18,25 +15,13 @@ import numpy
 from ..compiler.functions import mapped
 from ..compiler.namespace import NotTraceable
 from ..envs.compiled import warn_of
+from ..envs.failures import explain_errors
 from ..envs.filter import Filter, Input
 from ..envs.observation import Array
 from ..envs.task import Task, named_arrays
 from ..filters.small_matrices import cholesky
 from .competitors import Kind, Likelihood, check_competitor, made
 from .dataset import FAULTS
-
-
-@contextmanager
-def explain_errors(what: str) -> Iterator[None]:
-    """Turn what a user's code raises into one sentence with the line that raised it."""
-    try:
-        yield
-    except Exception as error:
-        frames = traceback.extract_tb(error.__traceback__)
-        # The last line outside installed libraries: one of their own says less.
-        own = [f for f in frames[1:] if "site-packages" not in f.filename] or frames
-        line = f"{Path(own[-1].filename).name}, line {own[-1].lineno}"
-        raise ValueError(f"{what}: {type(error).__name__}: {error} ({line})") from error
 
 
 def chosen_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
@@ -268,41 +253,64 @@ FILTERS: dict[Kind, Callable[..., Filter]] = {
 
 
 class _InPython:
-    """What competes, asked in Python: its memory stays here.
+    """What competes, asked in Python: its memory stays here, and what it raises is explained.
 
     Args:
         own: the estimator, reference or bound.
+        task: that it is made for.
+        name: what it is and its name, in errors.
     """
 
-    def __init__(self, own: Any) -> None:
-        self.own, self.memory = own, None
+    def __init__(self, own: Any, task: Task, name: str) -> None:
+        self.own, self.task, self.name = own, task, name
+        self.memory, self.step = None, 0
         self.knows = getattr(own, "knows", "")
 
     def start(self, initial: Any, second: Any) -> None:
         """Keep the memory."""
-        self.memory = self.own.start(initial, second)
+        with explain_errors(f"{self.name} failed at the start of the track"):
+            self.memory = self.own.start(initial, second)
 
     def update(self, *given: Any) -> Any:
-        """Answer, with nothing in place of the memory."""
-        answer = list(self.own.update(*given[:-1], self.memory))
+        """Answer, with nothing in place of the memory.
+
+        Raises:
+            ValueError: if the mean, or what is computed of it, is not of all components: it would be broadcast.
+        """
+        self.step += 1
+        with explain_errors(f"{self.name} failed at measurement {self.step}"):
+            answer = list(self.own.update(*given[:-1], self.memory))
         place = min(2, len(answer) - 1)
         self.memory, answer[place] = answer[place], None
+        C, width = len(self.task.components), given[0][0].shape[-1]
+        for word, values, shape in zip(
+            ("mean", "covariance"), answer[:place], ((C, width), (C, C, width)), strict=False
+        ):
+            self._check_shape(word, values, shape)
         return tuple(answer)
+
+    def _check_shape(self, word: str, array: Any, shape: tuple[int, ...]) -> None:
+        if array.shape != shape:
+            components = ", ".join(c.name for c in self.task.components)
+            raise ValueError(
+                f"{self.name}: the {word} at measurement {self.step} must have shape {shape}, "
+                f"{len(self.task.components)} components ({components}) of {shape[-1]} episodes, got {array.shape}"
+            )
 
 
 class _CheckedInPython(_InPython):
-    """A user's estimator: what it returns is checked, what it raises is explained.
+    """A user's estimator: what it returns is checked, too.
 
     Args:
         own: the estimator.
         task: that it is made for.
-        name: in errors.
+        name: what it is and its name, in errors.
         count: number of episodes; lanes beyond are given the last of them.
     """
 
     def __init__(self, own: Any, task: Task, name: str, count: int) -> None:
-        super().__init__(own)
-        self.task, self.name, self.count, self.step = task, name, count, 0
+        super().__init__(own, task, name)
+        self.count = count
 
     def _filled(self, part: Any) -> Any:
         width = part[0].shape[-1]
@@ -310,14 +318,13 @@ class _CheckedInPython(_InPython):
 
     def start(self, initial: Any, second: Any) -> None:
         """Keep the memory; an array of the initial estimate may be changed in place."""
-        with explain_errors(f"estimator {self.name!r} failed at the start of the track"):
-            super().start(self._filled(initial), second)
+        super().start(self._filled(initial), second)
 
     def update(self, *given: Any) -> Any:
         """Answer, without the memory."""
         self.step += 1
         width = given[0][0].shape[-1]
-        with explain_errors(f"estimator {self.name!r} failed at measurement {self.step}"):
+        with explain_errors(f"{self.name} failed at measurement {self.step}"):
             answer = self.own.update(self._filled(given[0]), self.memory)
             if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
                 count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
@@ -341,7 +348,7 @@ class _CheckedInPython(_InPython):
 
     def _numbers(self, word: str, values: Any, shape: tuple[int, ...]) -> numpy.ndarray:
         """Return what was answered as float64, or raise ValueError if it has another shape."""
-        where = f"estimator {self.name!r}: the {word} at measurement {self.step}"
+        where = f"{self.name}: the {word} at measurement {self.step}"
         try:
             given = numpy.asanyarray(values)
             # What float64 has no room for would vanish in it: masks, imaginary parts, words.
@@ -351,12 +358,7 @@ class _CheckedInPython(_InPython):
             array = numpy.asarray(given, dtype=numpy.float64)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{where} is no array: {error}") from None
-        if array.shape != shape:
-            components = ", ".join(c.name for c in self.task.components)
-            raise ValueError(
-                f"{where} must have shape {shape}, {len(self.task.components)} components ({components}) of "
-                f"{shape[-1]} episodes, got {array.shape}"
-            )
+        self._check_shape(word, array, shape)
         return array
 
 
@@ -397,7 +399,7 @@ def put_in_loop(task: Task, competitor: Any, kind: Kind, name: str, count: int) 
     Raises:
         ValueError: if it cannot be made, or has not the methods of its kind.
     """
-    with explain_errors(f"estimator {name!r} cannot be made") if kind == "estimator" else nullcontext():
+    with explain_errors(f"{kind} {name!r} cannot be made"):
         own = made(competitor, task)
     check_competitor(name, own, kind)
     if _can_be_traced(competitor, own):
@@ -406,6 +408,8 @@ def put_in_loop(task: Task, competitor: Any, kind: Kind, name: str, count: int) 
         except NotTraceable as error:
             warn_of(f"{name!r} of {task.id}", error)
     looped = task.with_filter(_Maker(kind, None))
-    asked = _CheckedInPython(own, task, name, count) if kind == "estimator" else _InPython(own)
+    shown = f"{kind} {name!r}"
+    estimates = kind == "estimator"
+    asked = _CheckedInPython(own, task, shown, count) if estimates else _InPython(own, task, shown)
     looped.filter = FILTERS[kind](task, asked, True)
     return looped

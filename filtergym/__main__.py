@@ -21,6 +21,7 @@ from .commands import improve, measure, report
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
+from .envs.failures import own_line
 
 Commands = dict[str, Callable[..., None]]
 GROUPS: dict[str, Commands] = {
@@ -112,7 +113,7 @@ def main(program: Callable[[], Any] = application, name: str = "filtergym") -> N
         if isinstance(error, MemoryError):
             text = f"Error: not enough memory, ask for less at once: {error}"
         elif not isinstance(error, ValueError | OSError | ImportError | gymnasium.error.Error):
-            text, code = f"Error: unexpected {type(error).__name__}: {error}; {REPORT}", 1
+            text, code = f"Error: unexpected {type(error).__name__}: {error}{own_line(error)}; {REPORT}", 1
         _print_error(text, "red")
         sys.exit(code)
 
