@@ -14,10 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
-from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.problem import problem_of
-from filtergym.baselines.tuning import tuned_names
-from filtergym.envs.catalogue import make_task, task_class
+from filtergym.baselines.problem import Problem
+from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
@@ -170,7 +168,7 @@ def _algorithm(run: TrainingRun) -> str:
 def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
     """Picture of every run's validations, 1 or 2 columns of a paper wide; a dot marks its best agent."""
     first = runs[0].run
-    paper = paper_of(first.environment)
+    paper = first.problem.paper
     for member in runs:
         entries = member.run.validation
         if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
@@ -184,12 +182,12 @@ def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
     return draw_learning_curves(curves, title, paper, columns=columns)
 
 
-def default_opponents(id: str) -> list[str]:
+def default_opponents(problem: Problem) -> list[str]:
     """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
-    known = baselines_of(id)
+    known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
-    tuned = tuned_names(id)
-    return list(dict.fromkeys([paper_of(id), *known.compared, *untuned, *tuned, *known.references]))
+    names = [problem.paper, *known.compared, *untuned, *problem.tuned, *known.references]
+    return list(dict.fromkeys(names))
 
 
 def episode_means(
@@ -212,14 +210,13 @@ def episode_means(
     Raises:
         ValueError: for unknown names, and for bounds, which have no cost.
     """
-    id = runs[0].run.environment
-    problem = problem_of(id)
+    problem = runs[0].run.problem
     policies: dict[str, tuple[Any, str | None]] = {}
     for member in runs:
         maker = find_competitor(problem, str(member.agent), trust)
         # A learned estimator has a filter of its own, and steers nothing.
         policies[member.name] = maker, member.run.control if kind_of(maker) == "policy" else None
-    for name in dict.fromkeys([paper_of(id), *opponents]):
+    for name in dict.fromkeys([problem.paper, *opponents]):
         policies[name] = find_competitor(problem, name, trust), None
         if kind_of(policies[name][0]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
@@ -227,10 +224,10 @@ def episode_means(
     found: dict[str, Means | None] = {}
     missing: list[tuple[str, Path | None]] = []
     work: list[Asked] = []
-    horizon = make_task(id, None, scenario).horizon
+    horizon = make_task(problem.id, None, scenario).horizon
     for name, (maker, control) in policies.items():
-        code = made_by(problem, paper_of(id) if name in agents else name)
-        key = json.dumps([code, id, scenario, episodes, seed, split, name])
+        code = made_by(problem, problem.paper if name in agents else name)
+        key = json.dumps([code, problem.name, scenario, episodes, seed, split, name])
         kept = None if waiting is None or code is None else _kept_file(waiting, key, agents.get(name))
         found[name] = None if kept is None else _read_means(kept)
         if found[name] is None:
@@ -306,8 +303,8 @@ def compare(
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
     """
-    id = task_class(runs[0].run.environment).id
-    paper, reference = paper_of(id), baselines_of(id).score_reference
+    problem = runs[0].run.problem
+    paper, reference = problem.paper, problem.baselines.score_reference
     episodes = len(means.cost[paper])
     bootstrap = Bootstrap(episodes)
     cost = {name: bootstrap.means(values) for name, values in means.cost.items()}
@@ -328,7 +325,7 @@ def compare(
         """Keep an estimate, or the interval of a statistic and its resamples."""
         estimate = values if isinstance(values, Estimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
-        where = (id, scenario, split, seed, episodes)
+        where = (problem.id, scenario, split, seed, episodes)
         what = (policy, statistic, against, metric, component)
         found.append(Comparison(*where, *what, value, low, high, means.units.get(component, "1")))
 
@@ -376,14 +373,14 @@ def compare(
 def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison]) -> list[Grid]:
     """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
     first = comparisons[0]
-    paper = paper_of(first.environment)
+    problem = runs[0].run.problem
+    paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
     units = {c.component: c.unit for c in comparisons if c.metric == "rmse"}
     errors = [f"RMSE {name.replace('_', ' ')}, {unit}" for name, unit in units.items()]
     scored = {c.against for c in comparisons if c.metric == "score"}
     policies = {c.policy: c.statistic for c in comparisons if c.metric == "rmse"}
     opponents = [name for name, statistic in policies.items() if statistic == "opponent"]
-    references = baselines_of(first.environment).references
     algorithms = dict.fromkeys(member.algorithm for member in runs)
     steps = {member.name: f"{member.run.best['steps']:,}" for member in runs if member.run.best}
 

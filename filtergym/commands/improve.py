@@ -12,7 +12,8 @@ from ..agents.export import export_run
 from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
 from ..agents.training_run import TrainingRun, best_agent
 from ..baselines.problem import problem_of
-from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
+from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
+from ..baselines.tuning import Search, tune
 from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
@@ -56,16 +57,12 @@ def tune_policy(
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
-            problem.id,
+            problem,
             policy,
-            tunable[policy],
-            budget,
-            scenario,
-            seed,
-            progress=lambda steps: bar.update(line, advance=steps),
-            backend=backend,
-            workers=workers,
-            waiting=table.with_name(f"{table.stem}.{policy}.unfinished"),
+            Search(budget, scenario, seed, backend=backend),
+            lambda steps: bar.update(line, advance=steps),
+            workers,
+            table.with_name(f"{table.stem}.{policy}.unfinished"),
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)

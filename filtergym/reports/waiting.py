@@ -8,7 +8,6 @@ from pathlib import Path
 from ..agents.learned_policy import pretrained_path
 from ..agents.named_policies import shipped_agents
 from ..baselines.problem import Problem, problem_of
-from ..baselines.tuning import stored_values
 from ..envs.catalogue import short_name
 from ..evaluation.code import code_digest
 from ..evaluation.summary import Asked, Kept
@@ -70,7 +69,7 @@ def made_by(problem: Problem, name: str) -> str | None:
 def _meaning(problem: Problem, name: str) -> str | None:
     """Say what a name stands for, in words that change with it."""
     if name in problem.tuned:
-        return json.dumps(stored_values(problem.id, name.removesuffix("-tuned"))[0])
+        return json.dumps(problem.tuned_values.values(name.removesuffix("-tuned"))[0])
     if name in shipped_agents(problem.id):
         return hashlib.sha256(pretrained_path(problem.id, name).read_bytes()).hexdigest()
     return name if name in problem.baselines.names else None
