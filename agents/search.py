@@ -64,9 +64,7 @@ class Search:
             ValueError: for what :func:`~.training_run.new_run` refuses.
         """
         overrides = merged(self.options.overrides, chosen)
-        return new_run(
-            self.problem, replace(self.options, steps=self.steps, seed=seed, overrides=overrides)
-        )
+        return new_run(self.problem, replace(self.options, steps=self.steps, seed=seed, overrides=overrides))
 
     def as_json(self) -> dict[str, Any]:
         """Return all that it depends on, as a file holds it."""
@@ -293,7 +291,8 @@ def write_best(search: Search, folder: Path, study: optuna.Study) -> None:
     section = {"n_envs": run.envs, "n_timesteps": run.steps, **values, "env_kwargs": of_environment}
     seeds = ", ".join(map(str, search.seeds))
     text = (
-        f"# Hyperparameters of {search.options.algorithm}: trial {best.number}, the best of {len(ended_trials(study))}.\n"
+        f"# Hyperparameters of {search.options.algorithm}: trial {best.number}, the best of "
+        f"{len(ended_trials(study))}.\n"
         f"# Lowest validation cost, mean over the training seeds {seeds}: {best.value:.6g}\n"
     )
     own = {search.problem.id: section}

@@ -109,9 +109,7 @@ class Problem:
         experiment = Experiment(self.name, *arguments, **fields)
         return replace(experiment, paper=known.score_paper, reference=known.score_reference)
 
-    def evaluate(
-        self, competitors: Mapping[str, Any], *arguments: Any, **keywords: Any
-    ) -> xarray.Dataset:
+    def evaluate(self, competitors: Mapping[str, Any], *arguments: Any, **keywords: Any) -> xarray.Dataset:
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:

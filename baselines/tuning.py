@@ -242,9 +242,7 @@ def tune(
         cost, values = untuned, dict(tunable.start)
     kept = {name: rounded(value) for name, value in values.items()}
     met.forget()
-    return Tuned(
-        problem.id, policy, chosen.name, kept, cost, untuned, generations.spent * steps, search.seed
-    )
+    return Tuned(problem.id, policy, chosen.name, kept, cost, untuned, generations.spent * steps, search.seed)
 
 
 def _words(problem: Problem, policy: str, search: Search, scenario: Scenario) -> list[Any]:

@@ -20,6 +20,7 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
+from filtergym.baselines.tuned_values import TunedValues
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
@@ -91,8 +92,8 @@ def test_summaries_tell_what_the_evaluation_does(env):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(evaluation, records, curves, shipped_agents(env))
-    whole = benchmark.result_of(dataset, records, expected, shipped_agents(env))
+    result = benchmark.result_of(problem_of(env), evaluation, records, curves, shipped_agents(env))
+    whole = benchmark.result_of(problem_of(env), dataset, records, expected, shipped_agents(env))
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
@@ -197,7 +198,7 @@ def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, mo
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
         other = asked._replace(experiment=replace(asked.experiment, **changed))
         assert summary.read_summary(*waiting.kept_in(tmp_path, other)) is None
-    monkeypatch.setattr(waiting, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
+    monkeypatch.setattr(TunedValues, "values", lambda self, name: ({"gain": 1.0}, ""))
     assert summary.read_summary(*waiting.kept_in(tmp_path, asked)) is None
     assert waiting.kept_in(tmp_path, asked._replace(name="mine.py:Mine")) is None
 
@@ -229,14 +230,16 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
     list(summaries([asked], Workers(), None, [waiting.kept_in(tmp_path, asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
-    tunable, costs = baselines_of(ENV).tunable["fixed-best"], tmp_path / "costs.jsonl"
+    costs = tmp_path / "costs.jsonl"
 
     def interrupted(steps):
         raise KeyboardInterrupt
 
     def search():
         with suppress(KeyboardInterrupt):
-            tuning.tune(ENV, "fixed-best", tunable, 20_000, None, 0, 8, interrupted, waiting=costs)
+            tuning.tune(
+                problem_of(ENV), "fixed-best", tuning.Search(20_000, episodes=8), interrupted, waiting=costs
+            )
         return len(calls)
 
     assert (search(), search()) == (1, 1)
@@ -443,18 +446,18 @@ def test_a_cluster_without_its_packages_is_one_sentence(command, monkeypatch):
 
 
 def test_tuning_finds_the_same_values(two):
-    from filtergym.baselines.tuning import tune
+    from filtergym.baselines.tuning import Search, tune
 
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 40 * 100
-    asked = (ENV, "fixed-best", tunable, budget, None, 0, 40)
+    asked = (problem_of(ENV), "fixed-best", Search(budget, episodes=40))
     assert tune(*asked) == tune(*asked, workers=two)
 
 
 def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
-    asked = (ENV, "fixed-best", tunable, budget, None, 0, 8)
+    asked = (problem_of(ENV), "fixed-best", tuning.Search(budget, episodes=8))
     whole = tuning.tune(*asked)
     calls, own = [], tuning.mean_cost
 

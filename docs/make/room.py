@@ -28,9 +28,7 @@ def room_policies(problem: Problem) -> list[str]:
     return [name for name in (*problem.names, *shipped_agents(problem.id)) if name != "random"]
 
 
-def measure_room(
-    problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]
-) -> list[Record]:
+def measure_room(problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
     """Evaluate everything that the room table shows, on the test split of the default scenario."""
     makers = competitors_of(problem, room_policies(problem))
     dataset = problem.evaluate(makers, None, episodes, seed, progress=progress)
@@ -71,8 +69,8 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
             ]
         )
     note = (
-        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. ANEES is the "
-        f"mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
+        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. ANEES is "
+        f"the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
         f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
         f"95 % bootstrap intervals. Made by `{command}`."
     )

@@ -285,7 +285,10 @@ def evaluate_policies(
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
             if judged:
-                result, made = result_of(problem, dataset, records, curves, learned), settings_of(command_line())
+                result, made = (
+                    result_of(problem, dataset, records, curves, learned),
+                    settings_of(command_line()),
+                )
                 write_results(waiting / RESULTS, [result], made)
         remove(out / UNFINISHED, [place.path for place in kept if place is not None])
     for table in tables:

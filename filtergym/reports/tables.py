@@ -113,6 +113,7 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
 
     Args:
         records: tidy records of one environment and scenario.
+        knows: what references and bounds know, by their names.
         width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
             own, so that no number is cut.
     """
