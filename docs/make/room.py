@@ -69,8 +69,9 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
             ]
         )
     note = (
-        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. ANEES is "
-        f"the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
+        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. "
+        f"ANEES is the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a "
+        "factor of two.\n\n"
         f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
         f"95 % bootstrap intervals. Made by `{command}`."
     )
