@@ -563,7 +563,7 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
     monkeypatch.setattr(Problem, "tuned", tuned)
     run = train(small_run("bptt", 400), tmp_path)
-    run.problem = Problem(task_class(ID), few)
+    run.problem = dataclasses.replace(problem_of(ID), baselines=few)
     opponents = standing.Opponents(run)
     names = [*few.policies, *few.estimators, *tuned, "known-turn"]
     agent = training_run.best_agent(tmp_path)

@@ -212,7 +212,7 @@ def test_settings_reach_environment_and_algorithm():
 def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
     """Stable-Baselines3's SAC writes into policy_kwargs."""
     small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
-    asked = functools.partial(new_run, ID, "sac", "gain", 20, 2, overrides=small)
+    asked = functools.partial(new_run, problem_of(ID), RunOptions("sac", "gain", 20, 2, overrides=small))
     trained(opened_run(tmp_path, asked(), False), tmp_path)
     opened_run(tmp_path, asked(), True)
     assert load_run(tmp_path).hyperparameters == asked().hyperparameters
@@ -315,8 +315,7 @@ def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
 def test_training_on_a_mixture(algorithm, tmp_path):
     mixture = {"random": 0.75, "cruise": 0.25}
     asked = functools.partial(
-        new_run, ID, algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm],
-        keywords={"horizon": 20},
+        new_run, problem_of(ID), RunOptions(algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm], keywords={"horizon": 20})
     )  # fmt: skip
     run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
     assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
