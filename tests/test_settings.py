@@ -2,9 +2,9 @@
 
 import csv
 import dataclasses
-import functools
 import itertools
 import shlex
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -212,7 +212,11 @@ def test_settings_reach_environment_and_algorithm():
 def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
     """Stable-Baselines3's SAC writes into policy_kwargs."""
     small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
-    asked = functools.partial(new_run, problem_of(ID), RunOptions("sac", "gain", 20, 2, overrides=small))
+    options = RunOptions("sac", "gain", 20, 2, overrides=small)
+
+    def asked(**more):
+        return new_run(problem_of(ID), replace(options, **more))
+
     trained(opened_run(tmp_path, asked(), False), tmp_path)
     opened_run(tmp_path, asked(), True)
     assert load_run(tmp_path).hyperparameters == asked().hyperparameters
@@ -314,9 +318,18 @@ def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
 @pytest.mark.usefixtures("all_training_scenarios")
 def test_training_on_a_mixture(algorithm, tmp_path):
     mixture = {"random": 0.75, "cruise": 0.25}
-    asked = functools.partial(
-        new_run, problem_of(ID), RunOptions(algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm], keywords={"horizon": 20})
-    )  # fmt: skip
+    options = RunOptions(
+        algorithm,
+        "gain",
+        envs=4,
+        scenario="random:3,cruise:1",
+        overrides=SMALL[algorithm],
+        keywords={"horizon": 20},
+    )
+
+    def asked(**more):
+        return new_run(problem_of(ID), replace(options, **more))
+
     run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
     assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
     costs = [
