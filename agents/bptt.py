@@ -23,7 +23,7 @@ import numpy
 import torch
 
 from ..envs.backend import host_array
-from ..envs.catalogue import find_mixture, make_task, task_class
+from ..envs.catalogue import find_mixture
 from ..envs.environment import TaskVectorEnv
 from ..envs.task import Task
 from ..evaluation.seeds import episode_seeds
@@ -33,14 +33,13 @@ from .learned_policy import LearnedPolicy, write_arrays
 from .settings import ESTIMATORS
 from .training_run import (
     Bookkeeping,
+    Session,
+    Trainee,
     TrainingRun,
-    Validated,
     curves_beside,
     interruption,
     logger_in,
     schedule,
-    task_keywords,
-    validation_interval,
 )
 from .unrolled import Unrolled
 
@@ -193,15 +192,15 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
         scenario=run.scenario,
         reward=_descended(run),
         autoreset_mode="Disabled",
-        **task_keywords(run),
+        **run.task_keywords,
     )
-    mixture = find_mixture(task_class(run.environment), run.scenario)
+    mixture = find_mixture(run.problem.task, run.scenario)
     if mixture is not None:
         if run.backend == "compiled":
             raise ValueError(
                 f"algorithm {run.algorithm!r} learns mixtures of scenarios on torch only: leave out the backend"
             )
-        tasks = [make_task(run.environment, run.control, name, **task_keywords(run)) for name in mixture]
+        tasks = [run.make_task(name) for name in mixture]
         if len({task.horizon for task in tasks}) > 1:
             raise ValueError(
                 f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: "
@@ -220,33 +219,103 @@ def _descended(run: TrainingRun) -> str:
     return "cost" if kind == "relative" else kind
 
 
-def _saved_generators(env: TaskVectorEnv) -> str:
-    return json.dumps([generator.bit_generator.state for generator in env.fleet.generators])
+class Descent:
+    """The network of a run, what trains it, and how far it is.
+
+    Args:
+        run: what is trained; it is told what computes the steps.
+
+    Raises:
+        ValueError: for a control with discrete actions.
+    """
+
+    def __init__(self, run: TrainingRun) -> None:
+        space = run.make_task().action_space
+        if not isinstance(space, gymnasium.spaces.Box):
+            raise ValueError(
+                f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} "
+                f"has {space}: choose dqn or ppo, or another control"
+            )
+        self.run, self.values = run, run.hyperparameters
+        torch.manual_seed(run.seed)
+        self.env = _environment(run)
+        run.backend = self.env.backend
+        self.env.reset(seed=episode_seeds("train", run.seed, run.envs))
+        first_action = self.values.get("first_action")
+        self.policy = RecurrentPolicy(
+            len(self.env.task.fields), space, self.values["hidden_size"], first_action
+        )
+        self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
+        self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
+        self.steps_done = 0
+
+    def flight(self) -> Callable[[Callable[[], None]], float]:
+        """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
+        env, policy, truncation = self.env, self.policy, self.values["truncation"]
+        gate, largest = Gate(env.task) if self.run.gated else None, self.values.get("max_action_grad")
+        if env.backend == "compiled":
+            return Unrolled(env, policy, truncation, _descended(self.run), gate, largest).descend_episodes
+        return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
+
+    def update(self) -> float:
+        """Descend the gradient that has been gathered; return its norm."""
+        norm = torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.values["max_grad_norm"])
+        self.optimiser.step()
+        self.optimiser.zero_grad()
+        return float(norm)
+
+    def slow_down(self) -> None:
+        """Set the learning rate to that of the share of the run that is done."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate(1.0 - self.steps_done / self.run.steps)
+
+    def trainee(self) -> Trainee:
+        """Return the agent as the bookkeeping takes it."""
+        run, policy = self.run, self.policy
+
+        def agent(task: Task) -> LearnedPolicy:
+            return as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated)
+
+        def save_agent(place: Path) -> None:
+            write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
+
+        steered = EstimatorMaker(run.control, agent) if run.algorithm in ESTIMATORS else agent
+        return Trainee(steered, self.save_checkpoint, save_agent)
+
+    def save_checkpoint(self, folder: Path) -> None:
+        """Write everything that later steps depend on."""
+        generators = [generator.bit_generator.state for generator in self.env.fleet.generators]
+        kept = {
+            "policy": self.policy.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generators": json.dumps(generators),
+            "steps": self.steps_done,
+        }
+        # Through memory: on a full disk torch raises something of its own.
+        written = io.BytesIO()
+        torch.save(kept, written)
+        (folder / "checkpoint.pt").write_bytes(written.getvalue())
+
+    def load_checkpoint(self, folder: Path) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            ValueError: if it cannot be read.
+        """
+        try:
+            # weights_only: nothing in the file is executed.
+            kept = torch.load(folder / "checkpoint.pt", weights_only=True)
+            self.policy.load_state_dict(kept["policy"])
+            self.optimiser.load_state_dict(kept["optimiser"])
+            states = json.loads(kept["generators"])
+            for generator, state in zip(self.env.fleet.generators, states, strict=True):
+                generator.bit_generator.state = state
+            self.steps_done = int(kept["steps"])
+        except Exception as error:  # torch raises whatever a corrupt file makes it stumble over
+            raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
 
 
-def _load(folder: Path, policy: RecurrentPolicy, optimiser: torch.optim.Adam, env: TaskVectorEnv) -> int:
-    """Go on from a checkpoint; returns the environment steps done."""
-    try:
-        # weights_only: nothing in the file is executed.
-        kept = torch.load(folder / "checkpoint.pt", weights_only=True)
-        policy.load_state_dict(kept["policy"])
-        optimiser.load_state_dict(kept["optimiser"])
-        for generator, state in zip(env.fleet.generators, json.loads(kept["generators"]), strict=True):
-            generator.bit_generator.state = state
-    except Exception as error:  # torch raises whatever a corrupt file makes it stumble over
-        raise ValueError(f"cannot read the checkpoint in {folder}: {error}") from error
-    return int(kept["steps"])
-
-
-def train_bptt(
-    run: TrainingRun,
-    folder: Path,
-    resume: bool = False,
-    interval: int | None = None,
-    progress: Callable[[int], None] = lambda steps: None,
-    report: Callable[[str], None] = lambda line: None,
-    validated: Callable[[Validated], bool] = lambda entry: False,
-) -> TrainingRun:
+def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
     """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
     Arguments as in :func:`.sb3_training.train_sb3`.
@@ -254,90 +323,33 @@ def train_bptt(
     Raises:
         ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
     """
-    if resume and run.finished:
+    if session.resume and run.finished:
         return run
-    interval = validation_interval(run, interval)
     began = time.monotonic()
-    space = make_task(run.environment, run.control, **task_keywords(run)).action_space
-    if not isinstance(space, gymnasium.spaces.Box):
-        raise ValueError(
-            f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} has "
-            f"{space}: choose dqn or ppo, or another control"
-        )
-    values = run.hyperparameters
-    torch.manual_seed(run.seed)
-    env = _environment(run)
-    run.backend = env.backend
-    env.reset(seed=episode_seeds("train", run.seed, run.envs))
-    policy = RecurrentPolicy(len(env.task.fields), space, values["hidden_size"], values.get("first_action"))
-    learning_rate = schedule("learning_rate", values["learning_rate"])
-    optimiser = torch.optim.Adam(policy.parameters(), lr=learning_rate(1.0))
-    steps_done = 0
-    if resume:
-        steps_done = _load(folder / "checkpoint", policy, optimiser, env)
+    descent = Descent(run)
+    if session.resume:
+        descent.load_checkpoint(session.folder / "checkpoint")
     else:
-        measure_normalisation(env, policy)
-
-    largest = values.get("max_action_grad")
-    gate = Gate(env.task) if run.gated else None
-    if env.backend == "compiled":
-        fly = Unrolled(env, policy, values["truncation"], _descended(run), gate, largest).descend_episodes
-    else:
-        fly = functools.partial(
-            descend_episodes, env, policy, values["truncation"], gate=gate, largest=largest
-        )
+        measure_normalisation(descent.env, descent.policy)
+    fly = descent.flight()
+    logger = logger_in(session.folder / "log", descent.steps_done)
 
     def descend() -> None:
-        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), values["max_grad_norm"])
-        logger.record_mean("train/gradient_norm", float(norm))
-        optimiser.step()
-        optimiser.zero_grad()
+        logger.record_mean("train/gradient_norm", descent.update())
 
-    def save_checkpoint(place: Path) -> None:
-        kept = {
-            "policy": policy.state_dict(),
-            "optimiser": optimiser.state_dict(),
-            "generators": _saved_generators(env),
-            "steps": steps_done,
-        }
-        # Through memory: on a full disk torch raises something of its own.
-        written = io.BytesIO()
-        torch.save(kept, written)
-        (place / "checkpoint.pt").write_bytes(written.getvalue())
-
-    def agent(task: Task) -> LearnedPolicy:
-        return as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated)
-
-    def save_agent(place: Path) -> None:
-        write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")
-
-    logger = logger_in(folder / "log", steps_done)
-    per_iteration = run.envs * env.last_decision
+    per_iteration = run.envs * descent.env.last_decision
     with interruption() as stop:
-        books = Bookkeeping(
-            run,
-            folder,
-            interval,
-            save_checkpoint,
-            save_agent,
-            agent if run.algorithm not in ESTIMATORS else EstimatorMaker(run.control, agent),
-            stop,
-            report,
-            curves_beside(logger),
-            validated,
-            began,
-        )
+        books = Bookkeeping(run, session, descent.trainee(), stop, curves_beside(logger), began)
         stopping = False
-        while steps_done < run.steps and not stopping:
-            for group in optimiser.param_groups:
-                group["lr"] = learning_rate(1.0 - steps_done / run.steps)
+        while descent.steps_done < run.steps and not stopping:
+            descent.slow_down()
             cost = fly(descend)
-            steps_done += per_iteration
+            descent.steps_done += per_iteration
             logger.record("train/cost", cost)
-            logger.dump(steps_done)
-            progress(steps_done)
-            stopping = books.safe_point(steps_done)
-        if not stopping and run.steps_done < steps_done:
-            books.safe_point(steps_done, last=True)
+            logger.dump(descent.steps_done)
+            session.progress(descent.steps_done)
+            stopping = books.safe_point(descent.steps_done)
+        if not stopping and run.steps_done < descent.steps_done:
+            books.safe_point(descent.steps_done, last=True)
     logger.close()
     return run

@@ -36,10 +36,10 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
         else:
             from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
 
-            agent = zipped_model(run.environment, source, run.control, trust)
+            agent = zipped_model(run.problem.task, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
-        costs = TrainingEpisodes(run, CHECK_EPISODES).costs(stored_policy(run.environment, file))
+        costs = TrainingEpisodes(run, CHECK_EPISODES).costs(stored_policy(run.problem.task, file))
         run.exported = {"episodes": CHECK_EPISODES, "cost": float(costs.mean())}
         save_run(run, file.with_suffix(".json"))
     return run

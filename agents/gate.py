@@ -12,7 +12,7 @@ import gymnasium
 import numpy
 
 from ..baselines.alarm import Alarm, InnovationAlarm
-from ..baselines.catalogue import baselines_of
+from ..baselines.problem import Problem
 from ..envs.task import Task
 from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, kind_of, made, shown_as
 from .residual import ResidualPolicy, policy_to_correct
@@ -72,7 +72,7 @@ class Gate:
     def __init__(
         self, task: Task, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
-        alarm = alarm or baselines_of(task.id).alarm or InnovationAlarm
+        alarm = alarm or Problem.of(type(task)).baselines.alarm or InnovationAlarm
         self.alarm: Alarm = made(alarm, task)
         self.fallback: Any = check_competitor("fallback", made(fallback or PaperAction, task), "policy")
         own = getattr(self.fallback, "control", task.control)

@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy
 
-from ..envs.catalogue import make_task, short_name, task_class
+from ..envs.catalogue import short_name
 from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
 from ..evaluation.stored import fits
 from .gate import as_trained
 from .learned_estimator import EstimatorMaker
-from .training_run import task_keywords
+from .training_run import TrainingRun
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 ACTIVATIONS: dict[str, Callable[[numpy.ndarray], numpy.ndarray]] = {
@@ -138,17 +138,17 @@ class LearnedPolicy(Policy):
 
 
 def write_arrays(
-    path: Path, arrays: Mapping[str, numpy.ndarray], run: Any, output: str, activation: str = "tanh"
+    path: Path, arrays: Mapping[str, numpy.ndarray], run: TrainingRun, output: str, activation: str = "tanh"
 ) -> None:
     """Write a learned policy and the record of the run that it comes from."""
     from safetensors.numpy import save
 
-    fields = [field.name for field in make_task(run.environment, run.control, **task_keywords(run)).fields]
+    task = run.make_task()
     header = {
-        "environment": task_class(run.environment).id,
+        "environment": task.id,
         "control": run.control,
-        "interface": str(task_class(run.environment).interface),
-        "fields": json.dumps(fields),
+        "interface": str(task.interface),
+        "fields": json.dumps([field.name for field in task.fields]),
         "output": output,
         "activation": activation,
         "run": json.dumps(asdict(run)),
@@ -257,20 +257,18 @@ class _Stored:
         return as_trained(task, network, *self.around)
 
 
-def stored_policy(id: str, path: Path) -> _Stored | EstimatorMaker:
-    """Load a learned policy or estimator from a file: what makes it for a task.
+def stored_policy(cls: type[Task], path: Path) -> _Stored | EstimatorMaker:
+    """Load a learned policy or estimator of an environment from a file: what makes it for a task.
 
     Raises:
         ValueError: if the file is not one, or it is of another environment.
     """
     stored = _Stored(path)
-    if stored.header["environment"] != task_class(id).id:
-        raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {task_class(id).id}")
-    return (
-        EstimatorMaker(stored.control, stored) if stored.control in task_class(id).trained_banks else stored
-    )
+    if stored.header["environment"] != cls.id:
+        raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {cls.id}")
+    return EstimatorMaker(stored.control, stored) if stored.control in cls.trained_banks else stored
 
 
 def pretrained_path(id: str, name: str) -> Path:
-    """File of a shipped agent, whether or not there is one."""
+    """File of an agent that is shipped for a Gymnasium id, whether or not there is one."""
     return PRETRAINED / short_name(id) / f"{name}.safetensors"

@@ -3,22 +3,22 @@
 from pathlib import Path
 from typing import Any
 
-from ..envs.catalogue import task_class
+from ..envs.task import Task
 from .gate import PolicyMaker, as_trained
 from .learned_policy import pretrained_path, stored_policy
 from .training_run import TrainingRun, best_agent, load_run
 
 
 def shipped_agents(id: str) -> list[str]:
-    """Names of the agents that are shipped for an environment."""
+    """Names of the agents that are shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
 
 
-def learned_policy(id: str, name: str, trust: bool = False) -> Any:
+def learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     """Return what makes a learned policy for a task, or None if the name means nothing here.
 
     Args:
-        id: environment id.
+        cls: the environment.
         name: of a shipped agent (``ppo``, ``bptt``); or a file: ``.safetensors``, or the ``.zip`` of a
             Stable-Baselines3 model, which can execute code while it is loaded; or the folder of a training run, which
             means its best agent.
@@ -27,23 +27,23 @@ def learned_policy(id: str, name: str, trust: bool = False) -> Any:
     Raises:
         ValueError: if the file or folder is not what its name says, or takes ``trust``.
     """
-    if name in shipped_agents(id):
-        return stored_policy(id, pretrained_path(id, name))
+    if name in shipped_agents(cls.id):
+        return stored_policy(cls, pretrained_path(cls.id, name))
     path = Path(name)
     if path.is_dir():
-        return _agent_of_run(id, path, trust)
+        return _agent_of_run(cls, path, trust)
     if name.endswith(".safetensors"):
-        return stored_policy(id, path)
+        return stored_policy(cls, path)
     if not name.endswith(".zip"):
         return None
-    model = zipped_model(id, path, None, trust)
+    model = zipped_model(cls, path, None, trust)
     # Beside the model of a run that is more than its network lies what it is.
     return (
         _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
     )
 
 
-def zipped_model(id: str, path: Path, control: str | None, trust: bool) -> Any:
+def zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
     """Load a model of Stable-Baselines3, the network alone.
 
     Raises:
@@ -53,24 +53,24 @@ def zipped_model(id: str, path: Path, control: str | None, trust: bool) -> Any:
         from .sb3_policy import load_sb3_policy
     except ImportError as error:
         raise ValueError(f"policy '{path}' needs more packages: pip install 'filtergym[agents]'") from error
-    return load_sb3_policy(path, task_class(id).id, control, trust=trust)
+    return load_sb3_policy(path, cls.id, control, trust=trust)
 
 
-def _agent_of_run(id: str, folder: Path, trust: bool) -> Any:
+def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
     """Load the best agent of a run, of ``filtergym train`` or of rl-zoo3: as plain arrays where there are any."""
     if not (folder / "run.json").exists():
         # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
         for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
             if (folder / f"{name}.zip").is_file():
-                return zipped_model(id, folder / f"{name}.zip", None, trust)
+                return zipped_model(cls, folder / f"{name}.zip", None, trust)
     run = load_run(folder, trust)
     agent = best_agent(folder)
     if agent.suffix == ".safetensors":
-        return stored_policy(id, agent)
+        return stored_policy(cls, agent)
     own = run.environment.rpartition(":")[2]
-    if own != task_class(id).id:
-        raise ValueError(f"{folder} holds a run of {own}, not of {task_class(id).id}")
-    return _as_recorded(zipped_model(id, agent, run.control, trust), run)
+    if own != cls.id:
+        raise ValueError(f"{folder} holds a run of {own}, not of {cls.id}")
+    return _as_recorded(zipped_model(cls, agent, run.control, trust), run)
 
 
 def _as_recorded(model: Any, run: TrainingRun) -> Any:

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..baselines.problem import problem_of
+from ..baselines.problem import Problem
 from ..envs.environment import TaskEnv
 from ..envs.task import Task
 from ..evaluation.competitors import Policy, kind_of, made, shown_as
@@ -37,7 +37,7 @@ def policy_to_correct(task: Task, name: str) -> Any:
     Raises:
         ValueError: for an unknown name, what does not act, acts under parameters of its own, or cannot be corrected.
     """
-    maker = problem_of(task.id).competitor(name)
+    maker = Problem.of(type(task)).competitor(name)
     if kind_of(maker) != "policy":
         raise ValueError(f"{name!r} is of kind {kind_of(maker)} and has no actions that could be corrected")
     if getattr(maker, "task_keywords", {}):

@@ -27,7 +27,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from ..envs.catalogue import make_task
 from ..envs.task import Task
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
@@ -38,16 +37,15 @@ from .residual import policy_to_correct
 from .sb3_policy import Sb3Policy
 from .training_run import (
     Bookkeeping,
+    Session,
+    Trainee,
     TrainingRun,
-    Validated,
     check_trust,
     curves_beside,
     interruption,
     logger_in,
     save_run,
     schedule,
-    task_keywords,
-    validation_interval,
 )
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -182,7 +180,7 @@ def load_checkpoint(
 
 def check_algorithm(run: TrainingRun) -> None:
     """Raise ValueError if the algorithm does not fit the control's action space."""
-    space = make_task(run.environment, run.control, **task_keywords(run)).action_space
+    space = run.make_task().action_space
     if not isinstance(space, SPACES[run.algorithm]):
         fitting = [name for name, kinds in SPACES.items() if isinstance(space, kinds)]
         raise ValueError(
@@ -191,38 +189,8 @@ def check_algorithm(run: TrainingRun) -> None:
         )
 
 
-def train_sb3(
-    run: TrainingRun,
-    folder: Path,
-    resume: bool = False,
-    interval: int | None = None,
-    progress: Callable[[int], None] = lambda steps: None,
-    report: Callable[[str], None] = lambda line: None,
-    validated: Callable[[Validated], bool] = lambda entry: False,
-    *,
-    trust: bool = False,
-) -> TrainingRun:
-    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
-
-    Args:
-        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
-        folder: of the run; exists.
-        resume: go on from ``folder/checkpoint``.
-        interval: environment steps between two validations; default: a twentieth of the run.
-        progress: told of all environment steps done so far.
-        report: told of every validation in words.
-        validated: told of every validation; returns whether to stop, with a checkpoint.
-        trust: load the checkpoint, which can execute code; resuming takes it.
-
-    Raises:
-        ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
-            read.
-    """
-    if resume and run.finished:
-        return run
-    interval = validation_interval(run, interval)
-    began = time.monotonic()
-    check_algorithm(run)
+def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormalize | None]:
+    """Make the model of a run that begins, with its environments and their normalisation."""
     # A copy all the way down: Stable-Baselines3 writes into policy_kwargs.
     values = copy.deepcopy(run.hyperparameters)
     for name in ("learning_rate", "clip_range"):
@@ -231,41 +199,53 @@ def train_sb3(
     values.pop("env_kwargs", None)
     normalize = values.pop("normalize", False)
     normalisation: VecNormalize | None = None
-    if resume:
-        model, adapted, normalisation = load_checkpoint(run, folder / "checkpoint", trust)
+    adapted = training_environment(run)
+    env: Any = adapted
+    if normalize:
+        # A Q-value of minus hundreds learns slowly; a discounted return of order one does not.
+        env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
+    model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
+    adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
+    return model, adapted, normalisation
+
+
+def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
+    """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
+
+    Args:
+        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
+        session: how it is trained.
+
+    Raises:
+        ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
+            read.
+    """
+    if session.resume and run.finished:
+        return run
+    began = time.monotonic()
+    check_algorithm(run)
+    if session.resume:
+        model, env, normalisation = load_checkpoint(run, session.folder / "checkpoint", session.trust)
     else:
-        adapted = training_environment(run)
-        env: Any = adapted
-        if normalize:
-            # A Q-value of minus hundreds learns slowly; a discounted return of order one does not.
-            env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
-        model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
-        adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
-    logger = logger_in(folder / "log", model.num_timesteps)
+        model, env, normalisation = begin_model(run)
+    logger = logger_in(session.folder / "log", model.num_timesteps)
     model.set_logger(logger)
     policy = Sb3Policy(model, normalisation, run.control)
+    trainee = Trainee(
+        PolicyMaker(
+            functools.partial(as_kept, policy, run.algorithm),
+            lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
+            run.control,
+        ),
+        lambda place: save_checkpoint(model, env, normalisation, place),
+        lambda place: save_agent(policy, run, place),
+    )
     with interruption() as stop:
-        books = Bookkeeping(
-            run,
-            folder,
-            interval,
-            lambda place: save_checkpoint(model, adapted, normalisation, place),
-            lambda place: save_agent(policy, run, place),
-            PolicyMaker(
-                functools.partial(as_kept, policy, run.algorithm),
-                lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
-                run.control,
-            ),
-            stop,
-            report,
-            curves_beside(logger),
-            validated,
-            began,
-        )
-        trainer = _Trainer(books, progress)
+        books = Bookkeeping(run, session, trainee, stop, curves_beside(logger), began)
+        trainer = _Trainer(books, session.progress)
         remaining = run.steps - model.num_timesteps
         if remaining > 0:
-            model.learn(remaining, callback=trainer, reset_num_timesteps=not resume)
+            model.learn(remaining, callback=trainer, reset_num_timesteps=not session.resume)
         if not trainer.stopping:
             books.safe_point(model.num_timesteps, last=True)
     return run

@@ -18,7 +18,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,12 @@ import optuna
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
-from ..envs.catalogue import task_class
+from ..baselines.problem import Problem
 from ..envs.parameters import check_integer
 from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merged, read_section
-from .training_run import FILES, TrainingRun, Validated, load_run, new_run, opened_run
+from .training_run import FILES, RunOptions, Session, TrainingRun, Validated, load_run, new_run, opened_run
 
 VALIDATIONS = 5
 """Of each run, after which a trial may be pruned."""
@@ -45,18 +45,13 @@ RANGE = {"low", "high", "log", "prefix"}
 class Search:
     """What is searched, all of which a search that is resumed must agree with."""
 
-    environment: str
-    algorithm: str
-    control: str | None
-    scenario: str | None
+    problem: Problem
+    options: RunOptions
+    """Of every run; its hyperparameters stay as they are."""
     steps: int
     """Environment steps of each run."""
     seeds: tuple[int, ...]
     """Of the runs of each trial."""
-    keywords: Mapping[str, Any]
-    """Of the environment."""
-    overrides: Mapping[str, Any]
-    """Hyperparameters that stay as they are."""
     space: Mapping[str, Any]
     """Hyperparameters that are searched."""
     sampling: int
@@ -68,16 +63,26 @@ class Search:
         Raises:
             ValueError: for what :func:`~.training_run.new_run` refuses.
         """
-        return new_run(
-            self.environment,
-            self.algorithm,
-            self.control,
-            self.steps,
-            seed=seed,
-            scenario=self.scenario,
-            overrides=merged(self.overrides, chosen),
-            keywords=self.keywords,
-        )
+        overrides = merged(self.options.overrides, chosen)
+        return new_run(self.problem, replace(self.options, steps=self.steps, seed=seed, overrides=overrides))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all that it depends on, as a file holds it."""
+        options = self.options
+        values = {
+            "environment": self.problem.name,
+            "algorithm": options.algorithm,
+            "control": options.control,
+            "scenario": options.scenario,
+            "steps": self.steps,
+            "seeds": self.seeds,
+            "keywords": dict(options.keywords),
+            "overrides": dict(options.overrides),
+            "space": dict(self.space),
+            "sampling": self.sampling,
+        }
+        found: dict[str, Any] = json.loads(json.dumps(values))
+        return found
 
 
 def read_space(id: str, algorithm: str, path: Path | None = None) -> dict[str, Any]:
@@ -147,7 +152,7 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
     storage = optuna.storages.JournalStorage(JournalFileBackend(str(folder / "journal.log")))
     pruner = optuna.pruners.MedianPruner(n_startup_trials=STARTUP_TRIALS)
     study = optuna.create_study(study_name="filtergym", storage=storage, pruner=pruner, load_if_exists=True)
-    asked = {**json.loads(json.dumps(asdict(search))), "code": code_digest()}
+    asked = {**search.as_json(), "code": code_digest()}
     has = study.user_attrs.get("search", asked)
     for name, wanted in asked.items():
         if has.get(name) != wanted:
@@ -167,7 +172,7 @@ def search_hyperparameters(
     search: Search,
     folder: Path,
     trials: int,
-    train: Callable[..., TrainingRun],
+    train: Callable[[TrainingRun, Session], TrainingRun],
     progress: Callable[[int], None] = lambda trials: None,
     report: Callable[[str], None] = lambda line: None,
 ) -> optuna.Study:
@@ -230,7 +235,7 @@ def _costs(
     folder: Path,
     trial: optuna.Trial,
     chosen: Mapping[str, Any],
-    train: Callable[..., TrainingRun],
+    train: Callable[[TrainingRun, Session], TrainingRun],
 ) -> list[float]:
     """Train the runs of a trial; return the lowest validation cost of each, of fewer if somebody wished to stop.
 
@@ -257,7 +262,7 @@ def _costs(
                 behind = entry["steps"] < search.steps and trial.should_prune()
             return behind
 
-        train(run, place, interval=max(1, search.steps // VALIDATIONS), validated=validated)
+        train(run, Session(place, validate_every=max(1, search.steps // VALIDATIONS), validated=validated))
         # Nobody resumes it, and replay buffers are large.
         shutil.rmtree(place / "checkpoint", ignore_errors=True)
         if behind:
@@ -286,8 +291,9 @@ def write_best(search: Search, folder: Path, study: optuna.Study) -> None:
     section = {"n_envs": run.envs, "n_timesteps": run.steps, **values, "env_kwargs": of_environment}
     seeds = ", ".join(map(str, search.seeds))
     text = (
-        f"# Hyperparameters of {search.algorithm}: trial {best.number}, the best of {len(ended_trials(study))}.\n"
+        f"# Hyperparameters of {search.options.algorithm}: trial {best.number}, the best of "
+        f"{len(ended_trials(study))}.\n"
         f"# Lowest validation cost, mean over the training seeds {seeds}: {best.value:.6g}\n"
     )
-    own = {task_class(search.environment).id: section}
+    own = {search.problem.id: section}
     write_text(folder / "best.yml", text + yaml.safe_dump(own, sort_keys=False))

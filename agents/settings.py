@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..envs.catalogue import nearest, parameter_names, task_class
+from ..envs.catalogue import nearest, parameter_names
+from ..envs.task import Task
 
 SCIENTIFIC = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 """Numbers such as 1e-3, which YAML 1.1 takes for words."""
@@ -143,9 +144,9 @@ def read_config(path: Path, id: str) -> tuple[dict[str, Any], dict[str, Any]]:
     return env, algo
 
 
-def check_keywords(id: str, algorithm: str, keywords: Mapping[str, Any]) -> None:
+def check_keywords(cls: type[Task], algorithm: str, keywords: Mapping[str, Any]) -> None:
     """Raise ValueError for a keyword of the environment that there is not, or that training cannot take."""
-    known = [*parameter_names(task_class(id)), *SETTABLE]
+    known = [*parameter_names(cls), *SETTABLE]
     for name in keywords:
         if name not in known:
             raise nearest("setting", f"env.{name}", [f"env.{other}" for other in known])

@@ -5,6 +5,7 @@ one, from which ``--resume`` goes on, with the ``run.json`` of its time), ``best
 validation cost) and the log.
 """
 
+import functools
 import importlib.metadata
 import importlib.util
 import json
@@ -13,16 +14,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy
 
-from ..baselines.problem import problem_of
+from ..baselines.problem import Problem, problem_of
 from ..envs.backend import task_on
 from ..envs.catalogue import (
     catalogue,
@@ -115,6 +116,21 @@ class TrainingRun:
     beat_paper: Passed | None = None
     """The first validation whose cost is below that of the paper's algorithm with its whole interval."""
 
+    @functools.cached_property
+    def problem(self) -> Problem:
+        """Of its environment."""
+        return problem_of(self.environment)
+
+    @property
+    def task_keywords(self) -> dict[str, Any]:
+        """Parameters of the task, without what concerns training only, such as the reward."""
+        known = parameter_names(self.problem.task)
+        return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
+
+    def make_task(self, scenario: str | None = None) -> Task:
+        """Make the task that is trained on, in one of its scenarios."""
+        return make_task(self.problem.id, self.control, scenario, **self.task_keywords)
+
     @property
     def finished(self) -> bool:
         """Whether all steps asked for are done."""
@@ -126,92 +142,120 @@ class TrainingRun:
         return min(self.validation, key=lambda entry: entry["cost"], default=None)
 
 
-def new_run(
-    environment: str,
-    algorithm: str,
-    control: str | None = None,
-    steps: int | None = None,
-    envs: int | None = None,
-    seed: int = 0,
-    scenario: Any = None,
-    overrides: Mapping[str, Any] | None = None,
-    backend: str = "auto",
-    keywords: Mapping[str, Any] | None = None,
-    config: Path | None = None,
-    residual_to: str = "",
-    gated: bool = False,
-) -> TrainingRun:
-    """Describe a run; what is not given comes from the algorithm's hyperparameters.
+@dataclass(frozen=True)
+class RunOptions:
+    """What somebody asks of a run; what is left out comes from the algorithm's hyperparameters."""
+
+    algorithm: str
+    """One of ``FILES``."""
+    control: str | None = None
+    """What the agent steers; None: that of the settings, or the environment's first."""
+    steps: int | None = None
+    """Environment steps in all."""
+    envs: int | None = None
+    """Environments side by side."""
+    seed: int = 0
+    """Of the episodes and the network."""
+    scenario: Any = None
+    """A training scenario, or a mixture of such."""
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    """Hyperparameters that go before those of the files."""
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    """Of the environment, parameters, ``reward`` or ``dtype``, likewise."""
+    config: Path | None = None
+    """File of settings, see :func:`.settings.read_config`; it goes before the file that is shipped."""
+    backend: str = "auto"
+    """What computes the steps."""
+    residual_to: str = ""
+    """Name of a policy of the environment's own to whose actions the agent's are added; the default control is then
+    that policy's."""
+    gated: bool = False
+    """Let the agent act only where something is wrong, see :mod:`.gate`."""
+
+
+def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
+    """Describe a run.
 
     Args:
-        environment: id.
-        algorithm: one of ``FILES``.
-        control: what the agent steers; default: that of the settings, or the environment's first.
-        steps: environment steps in all.
-        envs: environments side by side.
-        seed: of the episodes and the network.
-        scenario: a training scenario, or a mixture of such.
-        overrides: hyperparameters that go before those of the files.
-        backend: what computes the steps.
-        keywords: of the environment, parameters, ``reward`` or ``dtype``, likewise.
-        config: file of settings, see :func:`.settings.read_config`; it goes before the file that is shipped.
-        residual_to: name of a policy of the environment's own to whose actions the agent's are added; the default
-            control is then that policy's.
-        gated: let the agent act only where something is wrong, see :mod:`.gate`.
+        problem: that is trained on.
+        options: what is asked of the run.
 
     Raises:
         ValueError: for an unknown name, a value out of its limits, a scenario that is held out, or an agent that cannot
             be around that policy or inside the gate.
     """
-    cls = task_class(environment)
+    cls, algorithm = problem.task, options.algorithm
     if algorithm not in FILES:
         raise nearest("algorithm", algorithm, FILES)
-    shipped = stored_hyperparameters(cls.id, algorithm)
-    own_keywords, own_values = ({}, {}) if config is None else read_config(config, cls.id)
-    own_keywords, own_values = merged(own_keywords, keywords or {}), merged(own_values, overrides or {})
-    values = merged(shipped, own_values)
-    check_keywords(cls.id, algorithm, own_keywords)
-    if own_values:
-        check_hyperparameters(algorithm, values, shipped)
+    values, own_keywords = _merged_settings(problem, options)
     of_environment = merged(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
-    if residual_to and control is None and "control" not in own_keywords:
+    control = options.control
+    if options.residual_to and control is None and "control" not in own_keywords:
         # Before the file that is shipped, which knows nothing of that policy.
-        control = getattr(problem_of(cls.id).competitor(residual_to), "control", None)
+        control = getattr(problem.competitor(options.residual_to), "control", None)
     control = named["control"] if control is None else control
     controls = controls_of(cls, algorithm)
     if control is not None and control not in controls:
         raise nearest("control", control, controls)
-    backend = backend if backend != "auto" or named["backend"] is None else named["backend"]
-    flown = training_scenarios(cls, named["scenario"] if scenario is None else scenario)
-    parameters = {name: value for name, value in of_environment.items() if name in parameter_names(cls)}
-    for name in flown:
-        task = make_task(cls.id, control, name, **parameters)  # says what is wrong with a value
-    if residual_to or gated:
-        _check_around(algorithm, task, len(flown), residual_to, gated)
-    for name, known in (("reward", REWARDS), ("dtype", DTYPES)):
-        if name in of_environment and of_environment[name] not in known:
-            raise nearest(name, of_environment[name], known)
+    backend = options.backend
+    if backend == "auto" and named["backend"] is not None:
+        backend = named["backend"]
+    flown = training_scenarios(cls, named["scenario"] if options.scenario is None else options.scenario)
+    _check_environment(problem, options, control, flown, of_environment)
     if of_environment or "env_kwargs" in values:
         values["env_kwargs"] = of_environment
-    default_envs, default_steps = values.pop("n_envs"), values.pop("n_timesteps")
-    envs = check_integer("envs", _without_point(default_envs) if envs is None else envs, 1)
-    steps = check_integer("steps", _without_point(default_steps) if steps is None else steps, 1)
-    seed = check_integer("seed", seed, 0)
+    default_envs, default_steps = (_without_point(values.pop(name)) for name in ("n_envs", "n_timesteps"))
+    envs = check_integer("envs", default_envs if options.envs is None else options.envs, 1)
+    steps = check_integer("steps", default_steps if options.steps is None else options.steps, 1)
     return TrainingRun(
-        importable_name(cls),
+        problem.name,
         control or controls[0],
         in_words(flown),
         algorithm,
-        seed,
+        check_integer("seed", options.seed, 0),
         envs,
         steps,
         values,
         backend,
         interface=cls.interface,
-        residual_to=residual_to,
-        gated=gated,
+        residual_to=options.residual_to,
+        gated=options.gated,
     )
+
+
+def _merged_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return hyperparameters, and the keywords of the environment that do not come from the file that is shipped.
+
+    Raises:
+        ValueError: for one that there is not.
+    """
+    shipped = stored_hyperparameters(problem.id, options.algorithm)
+    keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
+    keywords, values = merged(keywords, options.keywords), merged(values, options.overrides)
+    check_keywords(problem.task, options.algorithm, keywords)
+    every = merged(shipped, values)
+    if values:
+        check_hyperparameters(options.algorithm, every, shipped)
+    return every, keywords
+
+
+def _check_environment(
+    problem: Problem,
+    options: RunOptions,
+    control: str | None,
+    scenarios: Mapping[str, float],
+    keywords: Mapping[str, Any],
+) -> None:
+    """Raise ValueError if the environment of a run cannot be made."""
+    known = parameter_names(problem.task)
+    parameters = {name: value for name, value in keywords.items() if name in known}
+    tasks = [make_task(problem.id, control, name, **parameters) for name in scenarios]
+    if options.residual_to or options.gated:
+        _check_around(options, tasks)
+    for name, words in (("reward", REWARDS), ("dtype", DTYPES)):
+        if name in keywords and keywords[name] not in words:
+            raise nearest(name, keywords[name], words)
 
 
 def _without_point(value: Any) -> Any:
@@ -219,13 +263,14 @@ def _without_point(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, gated: bool) -> None:
+def _check_around(options: RunOptions, tasks: Sequence[Task]) -> None:
     """Raise ValueError if an agent cannot correct that policy, or act inside the gate."""
-    if scenarios > 1:
+    algorithm, residual_to = options.algorithm, options.residual_to
+    if len(tasks) > 1:
         raise ValueError(
             "a policy to correct and a gate are made for the parameters of one scenario: train on one, not on a mixture"
         )
-    if (residual_to or gated) and algorithm in ESTIMATORS:
+    if algorithm in ESTIMATORS:
         raise ValueError(
             f"algorithm {algorithm!r} trains an estimator, which corrects no policy and has no gate"
         )
@@ -233,9 +278,9 @@ def _check_around(algorithm: str, task: Task, scenarios: int, residual_to: str, 
         raise ValueError(
             "algorithm 'bptt' has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or sac"
         )
-    corrected = policy_to_correct(task, residual_to) if residual_to else None
-    if gated:
-        Gate(task, corrected)
+    corrected = policy_to_correct(tasks[0], residual_to) if residual_to else None
+    if options.gated:
+        Gate(tasks[0], corrected)
 
 
 def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
@@ -276,12 +321,6 @@ def in_words(weights: Mapping[str, float]) -> str:
     if len(weights) == 1:
         return next(iter(weights))
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
-
-
-def task_keywords(run: TrainingRun) -> dict[str, Any]:
-    """Parameters of the task that a run trains with, without what concerns training only, such as the reward."""
-    known = parameter_names(task_class(run.environment))
-    return {n: value for n, value in run.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
 
 def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
@@ -483,7 +522,7 @@ def _settings_in_words(run: TrainingRun) -> Iterator[str]:
         elif own != shipped:
             yield "--set " + shlex.quote(f"{path}={json.dumps(own)}")
 
-    shipped = stored_hyperparameters(task_class(run.environment).id, run.algorithm)
+    shipped = stored_hyperparameters(run.problem.id, run.algorithm)
     values = dict(run.hyperparameters)
     yield from differing("env", values.pop("env_kwargs", {}), shipped.pop("env_kwargs", {}))
     yield from differing("algo", values, shipped)
@@ -506,8 +545,8 @@ class TrainingEpisodes:
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
-        self.id, self.keywords, self.backend = run.environment, task_keywords(run), backend
-        self.weights = find_mixture(task_class(run.environment), run.scenario) or {run.scenario: 1.0}
+        self.id, self.keywords, self.backend = run.problem.id, run.task_keywords, backend
+        self.weights = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
         self.seeds = episode_seeds("validation", 0, episodes)
         self._tasks: dict[tuple[str | None, str, str], Task] = {}
 
@@ -565,7 +604,7 @@ class Validation:
 
     def __init__(self, run: TrainingRun) -> None:
         self.run = run
-        problem = problem_of(run.environment)
+        problem = run.problem
         self.paper = problem.baselines.score_paper
         self.bootstrap = Bootstrap(VALIDATION_EPISODES)
         self.episodes = TrainingEpisodes(run, VALIDATION_EPISODES, validation_backend(run))
@@ -655,13 +694,56 @@ def interruption() -> Iterator[Callable[[], bool]]:
         restore()
 
 
-def validation_interval(run: TrainingRun, asked: int | None) -> int:
-    """Return the environment steps between two validations; default: a twentieth of the run.
+def _tell_nobody(news: Any) -> None:
+    """Do nothing."""
+
+
+def _go_on(entry: Validated) -> bool:
+    """Do not stop, whatever a validation says."""
+    return False
+
+
+@dataclass(frozen=True)
+class Session:
+    """How a run is trained, from its beginning or from where it stopped.
 
     Raises:
-        ValueError: for none.
+        ValueError: for less than one environment step between validations.
     """
-    return max(1, run.steps // 20) if asked is None else check_integer("validate_every", asked, 1)
+
+    folder: Path
+    """Of the run; exists."""
+    resume: bool = False
+    """Go on from the folder's checkpoint."""
+    validate_every: int | None = None
+    """Environment steps between two validations; None: a twentieth of the run."""
+    trust: bool = False
+    """Load the checkpoint even if it can execute code; resuming a model of Stable-Baselines3 takes it."""
+    progress: Callable[[int], None] = _tell_nobody
+    """Told of all environment steps done so far."""
+    report: Callable[[str], None] = _tell_nobody
+    """Told of every validation in words."""
+    validated: Callable[[Validated], bool] = _go_on
+    """Told of every validation; returns whether to stop, with a checkpoint."""
+
+    def __post_init__(self) -> None:
+        if self.validate_every is not None:
+            check_integer("validate_every", self.validate_every, 1)
+
+    def steps_between_validations(self, run: TrainingRun) -> int:
+        """Return the environment steps between two validations of a run."""
+        return max(1, run.steps // 20) if self.validate_every is None else self.validate_every
+
+
+class Trainee(NamedTuple):
+    """An agent while it is trained."""
+
+    policy: Any
+    """For an evaluation."""
+    save_checkpoint: Callable[[Path], None]
+    """Writes all that training goes on from into an empty folder."""
+    save_agent: Callable[[Path], None]
+    """Writes the agent alone into an empty folder."""
 
 
 class Bookkeeping:
@@ -669,38 +751,29 @@ class Bookkeeping:
 
     Args:
         run: the record, kept up to date.
-        folder: of the run.
-        interval: environment steps between two validations, each followed by a checkpoint.
-        save_checkpoint: writes one into an empty folder.
-        save_agent: writes the agent alone into an empty folder.
-        policy: the agent as a policy for an evaluation.
+        session: how it is trained; every validation is followed by a checkpoint.
+        trainee: the agent.
         stop: whether somebody wishes to stop.
-        report: told of every validation in words.
         log: writes numbers by name at so many environment steps.
-        validated: told of every validation; returns whether to stop.
         began: when the run began to make its environments, of ``time.monotonic``.
     """
 
     def __init__(
         self,
         run: TrainingRun,
-        folder: Path,
-        interval: int,
-        save_checkpoint: Callable[[Path], None],
-        save_agent: Callable[[Path], None],
-        policy: Any,
+        session: Session,
+        trainee: Trainee,
         stop: Callable[[], bool],
-        report: Callable[[str], None],
         log: Callable[[int, Mapping[str, float]], None] = lambda steps, values: None,
-        validated: Callable[[Validated], bool] = lambda entry: False,
         began: float | None = None,
     ) -> None:
         self.began = time.monotonic() if began is None else began
-        self.log, self.validated = log, validated
-        self.run, self.folder, self.interval, self.policy, self.stop = run, folder, interval, policy, stop
-        self.save_checkpoint, self.save_agent, self.report = save_checkpoint, save_agent, report
+        self.run, self.stop, self.log = run, stop, log
+        self.folder, self.interval = session.folder, session.steps_between_validations(run)
+        self.report, self.validated = session.report, session.validated
+        self.policy, self.save_checkpoint, self.save_agent = trainee
         self.validation = Validation(run)
-        self.due = run.steps_done + interval
+        self.due = run.steps_done + self.interval
         self.seconds_before = run.seconds
 
     def safe_point(self, steps_done: int, last: bool = False) -> bool:

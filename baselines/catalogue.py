@@ -34,32 +34,16 @@ def _by_environment() -> dict[str, ModuleType]:
 
 
 def package_of(id: str) -> ModuleType | None:
-    """Return the package that holds an environment's baselines; None where there is none."""
-    return _by_environment().get(task_class(id).id)
+    """Return the package that holds the baselines of a Gymnasium id; None where there is none."""
+    return _by_environment().get(id)
 
 
 def baselines_of(id: str) -> Baselines:
-    """Return what an environment is compared with; only random actions where nothing is known."""
-    id = task_class(id).id
+    """Return what the environment of a Gymnasium id is compared with; only random actions where nothing is known."""
     package = package_of(id)
     if package is not None:
         return package.BASELINES
     return ADDED.get(id) or Baselines(id, {"random": RandomPolicy})
-
-
-def paper_of(id: str) -> str:
-    """Name of the policy that is the paper's algorithm.
-
-    Raises:
-        ValueError: if the environment's baselines name none, so that nothing can be measured against it.
-    """
-    name = baselines_of(id).score_paper
-    if not name:
-        raise ValueError(
-            f"{task_class(id).id} has no paper's algorithm to compare with: register it with baselines whose "
-            "score_paper names one"
-        )
-    return name
 
 
 def add_baselines(table: Baselines) -> None:

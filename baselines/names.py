@@ -1,11 +1,10 @@
-"""Evaluation of an environment's own competitors by their names."""
+"""Evaluation of an environment's own competitors by their names: a door for papers, pages and tests."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import xarray
 
-from ..evaluation import evaluate as evaluation
 from .problem import problem_of
 
 
@@ -27,10 +26,7 @@ def evaluate(
         competitors = [competitors]
     named = competitors if isinstance(competitors, Mapping) else {name: name for name in competitors}
     problem = problem_of(id)
-    known = problem.baselines
     objects = {
         name: problem.competitor(entry) if isinstance(entry, str) else entry for name, entry in named.items()
     }
-    return evaluation.evaluate(
-        id, objects, *arguments, paper=known.score_paper, reference=known.score_reference, **keywords
-    )
+    return problem.evaluate(objects, *arguments, **keywords)

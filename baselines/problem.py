@@ -1,14 +1,19 @@
 """What belongs to an environment, found once where its id is given and handed down as one object."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib.resources import files
+from types import ModuleType
 from typing import Any
 
-from ..envs.catalogue import import_task, importable_name, nearest, task_class
+import xarray
+
+from ..envs.catalogue import import_task, importable_name, nearest, short_name, task_class
 from ..envs.task import Task
-from ..evaluation.evaluate import Experiment
-from .catalogue import baselines_of
+from ..evaluation.evaluate import Experiment, evaluate
+from .catalogue import baselines_of, package_of
 from .table import Baselines
-from .tuning import tuned_names, tuned_policy
+from .tuned_values import TunedValues, table_path
 
 
 @dataclass(frozen=True)
@@ -17,6 +22,13 @@ class Problem:
 
     task: type[Task]
     baselines: Baselines
+    shipped: ModuleType | None = None
+    """Package of its baselines; None of a user's environment."""
+
+    @classmethod
+    def of(cls, task: type[Task]) -> "Problem":
+        """Return the problem of a task's class."""
+        return cls(task, baselines_of(task.id), package_of(task.id))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return problem_of, (self.name,)
@@ -32,9 +44,40 @@ class Problem:
         return importable_name(self.task)
 
     @property
+    def short_name(self) -> str:
+        """Name for its files, and where an id is too long."""
+        return short_name(self.id)
+
+    @property
+    def paper(self) -> str:
+        """Name of the policy that is the paper's algorithm.
+
+        Raises:
+            ValueError: if the baselines name none, so that nothing can be measured against it.
+        """
+        if not self.baselines.score_paper:
+            raise ValueError(
+                f"{self.id} has no paper's algorithm to compare with: register it with baselines whose "
+                "score_paper names one"
+            )
+        return self.baselines.score_paper
+
+    @property
+    def knows(self) -> dict[str, str]:
+        """What its references and bounds are told beyond the measurements, by their names."""
+        told = {**self.baselines.references, **self.baselines.bounds}
+        return {name: maker.knows for name, maker in told.items()}
+
+    @property
+    def tuned_values(self) -> TunedValues:
+        """What is stored of its policies and estimators that were tuned."""
+        shipped = [] if self.shipped is None else [files(self.shipped) / "tuned.json"]
+        return TunedValues(self.id, self.baselines.tunable, [table_path(self.id), *shipped])
+
+    @property
     def tuned(self) -> list[str]:
         """Names of policies with tuned values."""
-        return tuned_names(self.id)
+        return self.tuned_values.names()
 
     @property
     def names(self) -> list[str]:
@@ -52,7 +95,7 @@ class Problem:
             if name in table:
                 return table[name]
         if name.endswith("-tuned"):
-            return tuned_policy(self.id, name.removesuffix("-tuned"))
+            return self.tuned_values.competitor(name.removesuffix("-tuned"))
         raise nearest("policy", name, self.names)
 
     def experiment(self, *arguments: Any, **fields: Any) -> Experiment:
@@ -66,6 +109,18 @@ class Problem:
         experiment = Experiment(self.name, *arguments, **fields)
         return replace(experiment, paper=known.score_paper, reference=known.score_reference)
 
+    def evaluate(self, competitors: Mapping[str, Any], *arguments: Any, **keywords: Any) -> xarray.Dataset:
+        """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
+
+        Args:
+            competitors: by their names, as of :func:`.evaluation.evaluate.evaluate`.
+            *arguments: what follows them there.
+            **keywords: likewise.
+        """
+        known = self.baselines
+        told = {"paper": known.score_paper, "reference": known.score_reference}
+        return evaluate(self.name, competitors, *arguments, **told, **keywords)
+
 
 def problem_of(id: str) -> Problem:
     """Return the problem of an environment id, and import nothing.
@@ -73,8 +128,7 @@ def problem_of(id: str) -> Problem:
     Raises:
         ValueError: for an unknown environment.
     """
-    cls = task_class(id)
-    return Problem(cls, baselines_of(cls.id))
+    return Problem.of(task_class(id))
 
 
 def import_problem(id: str) -> Problem:
@@ -83,4 +137,4 @@ def import_problem(id: str) -> Problem:
     Raises:
         ValueError: for an unknown environment, or if its module cannot be imported.
     """
-    return problem_of(import_task(id).id)
+    return Problem.of(import_task(id))

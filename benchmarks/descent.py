@@ -20,8 +20,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import torch
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes
-from filtergym.agents.training_run import TrainingRun, new_run
+from filtergym.agents.training_run import RunOptions, TrainingRun, new_run
 from filtergym.agents.unrolled import Unrolled
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
 from filtergym.envs.environment import TaskVectorEnv
 from rich.console import Console
@@ -96,7 +97,7 @@ def main() -> None:
     torch.set_num_threads(1)
     table = Table("environment", "control", "torch, ms", "compiled, ms", "faster", "gradients differ by")
     for id in [arguments.environment] if arguments.environment else sorted(catalogue()):
-        run = new_run(id, "bptt")
+        run = new_run(problem_of(id), RunOptions("bptt"))
         theirs, ours = (gradients(run, backend) for backend in BACKENDS)
         slow, fast = update_times(run, arguments.repeat)
         difference = float((theirs - ours).abs().max() / theirs.abs().max())

@@ -10,8 +10,7 @@ import argparse
 
 import numpy
 from filtergym.agents.named_policies import shipped_agents
-from filtergym.baselines.catalogue import paper_of
-from filtergym.envs.catalogue import short_name, task_class
+from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.bootstrap import Bootstrap
 
 import filtergym
@@ -26,13 +25,13 @@ def costs(id: str, names: list[str], scenario: str, episodes: int, split: str) -
     return data["cost"].mean("time").values
 
 
-def rows(id: str, agents: list[str], episodes: int, split: str) -> list[str]:
+def rows(problem: Problem, agents: list[str], episodes: int, split: str) -> list[str]:
     """A row for each agent."""
     worst: dict[str, tuple[list[float], str]] = {}
     lost, flown = dict.fromkeys(agents, 0), 0
-    scenarios = task_class(id).scenarios
+    scenarios = problem.task.scenarios
     for scenario in scenarios:
-        paper, *others = costs(id, [paper_of(id), *agents], scenario, episodes, split)
+        paper, *others = costs(problem.id, [problem.paper, *agents], scenario, episodes, split)
         bootstrap = Bootstrap(episodes)
         beyond = numpy.quantile(paper, 0.99)
         for name, cost in zip(agents, others, strict=True):
@@ -44,7 +43,7 @@ def rows(id: str, agents: list[str], episodes: int, split: str) -> list[str]:
             lost[name] += int(((cost > LOST * paper) & (cost > beyond)).sum())
         flown += episodes
     return [
-        f"| {short_name(id).removesuffix('-v0')} | `{name}` | `{worst[name][1]}` | "
+        f"| {problem.short_name.removesuffix('-v0')} | `{name}` | `{worst[name][1]}` | "
         + "{:+.1f} [{:+.1f}, {:+.1f}]".format(*(100.0 * x for x in worst[name][0]))
         + f" | {lost[name]} of {flown} |"
         for name in agents
@@ -64,5 +63,7 @@ if __name__ == "__main__":
         + "|"
     )
     for id in asked.environment:
-        for line in rows(id, asked.policy or list(shipped_agents(id)), asked.episodes, asked.split):
+        problem = problem_of(id)
+        agents = asked.policy or shipped_agents(problem.id)
+        for line in rows(problem, agents, asked.episodes, asked.split):
             print(line, flush=True)

@@ -43,10 +43,10 @@ import numpy
 from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
-from filtergym.agents.training_run import FILES, Bookkeeping, new_run
+from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Session, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
-from filtergym.baselines.tuning import mean_cost
+from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTED
@@ -93,7 +93,7 @@ def algorithms(id: str) -> list[str]:
 
     def fits(name: str) -> bool:
         try:
-            new_run(id, name)
+            new_run(problem_of(id), RunOptions(name))
         except ValueError:
             return False
         return True
@@ -198,7 +198,7 @@ def training_units(id: str, algorithm: str, folder: Path) -> Units:
 
     torch.set_num_threads(1)
     folder.mkdir(parents=True)
-    run = new_run(id, algorithm)
+    run = new_run(problem_of(id), RunOptions(algorithm))
     steps, values = run.steps, run.hyperparameters
     task = make_task(id, run.control)
     per_update = run.envs * int(values.get("n_steps", task.horizon // task.decision_interval))
@@ -229,7 +229,7 @@ def training_units(id: str, algorithm: str, folder: Path) -> Units:
     train = train_bptt if algorithm in THROUGH_THE_FILTER else train_sb3
     began = time.process_time()
     with mock.patch.object(Bookkeeping, "safe_point", timed):
-        train(run, folder, interval=interval, progress=progress)
+        train(run, Session(folder, validate_every=interval, progress=progress))
     ended = time.process_time()
     [(done, at, saved)] = stamp
     decision = (ended - at - (sum(saving) - saved)) / (run.steps_done - done)
@@ -244,8 +244,8 @@ def tuning_seconds(id: str, name: str, kept: dict[str, Any]) -> float:
     seeds = episode_seeds("train", 0, CANDIDATE)
     # Each candidate has other values, and so may have to be compiled.
     middle = {value: 0.5 * (low + high) for value, (low, high) in tunable.limits.items()}
-    mean_cost(id, scenario, tunable, tunable.start, seeds)
-    seconds = spent(lambda: mean_cost(id, scenario, tunable, middle, seeds))[1]
+    mean_cost(Candidate(problem_of(id), scenario, tunable, tunable.start, seeds))
+    seconds = spent(lambda: mean_cost(Candidate(problem_of(id), scenario, tunable, middle, seeds)))[1]
     task = make_task(id, tunable.control, find_scenario(catalogue()[id], scenario).name)
     candidates = kept["environment_steps"] / (CANDIDATE * (task.horizon // task.decision_interval))
     return (candidates + 8.0) * seconds

@@ -203,8 +203,8 @@ def importable_name(cls: type[Task]) -> str:
 
 
 def short_name(id: str) -> str:
-    """Name of an environment for its files, and where an id is too long."""
-    return task_class(id).id.removeprefix("filtergym/").replace("/", "-")
+    """Name of a Gymnasium id for files, and where the id is too long."""
+    return id.removeprefix("filtergym/").replace("/", "-")
 
 
 def parameter_names(cls: type[Task]) -> list[str]:

@@ -9,7 +9,6 @@ import xarray
 
 from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
-from .baselines import names as baselines
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.catalogue import imported, make_task, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
@@ -45,9 +44,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
     """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
-    id = problem.id
     if isinstance(name, Path):
-        found = learned_policy(id, str(name.absolute()), trust)
+        found = learned_policy(problem.task, str(name.absolute()), trust)
         if found is None:
             raise ValueError(
                 f"cannot load policy {str(name)!r}: it is neither a .safetensors, a .zip, nor a folder"
@@ -56,16 +54,16 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return gated(inner, find_competitor(problem, inner, trust))
-    if name in problem.names:
+    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned):
         return problem.competitor(name)
-    learned = learned_policy(id, name, trust)
+    learned = learned_policy(problem.task, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
         return problem.competitor(name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise nearest("policy", name, [*problem.names, *shipped_agents(id)])
+        raise nearest("policy", name, [*problem.names, *shipped_agents(problem.id)])
     holder = imported(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
@@ -120,8 +118,9 @@ def evaluate(
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
             an estimator that does not answer with mean and covariance.
     """
-    objects = competitors_of(import_problem(env), competitors, trust)
-    return baselines.evaluate(env, objects, scenario, episodes, seed, split, control, progress, **keywords)
+    problem = import_problem(env)
+    objects = competitors_of(problem, competitors, trust)
+    return problem.evaluate(objects, scenario, episodes, seed, split, control, progress, **keywords)
 
 
 def competitors_of(
@@ -137,8 +136,8 @@ def competitors_of(
             f"competitors are a name, a sequence of names, or a mapping from names to policies, got {competitors!r}"
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
-    for name in {*problem.names, *shipped_agents(problem.id)} & named.keys():
-        if named[name] not in (name, find_competitor(problem, name)):
+    for name, entry in named.items():
+        if entry != name and _is_taken(problem, name) and entry != find_competitor(problem, name):
             raise ValueError(
                 f"{name!r} is the name of what {problem.id} has already: call your own something else"
             )
@@ -148,6 +147,11 @@ def competitors_of(
         else with_normalisation(entry)
         for name, entry in named.items()
     }
+
+
+def _is_taken(problem: Problem, name: str) -> bool:
+    """Whether a name is that of a competitor of the environment."""
+    return name in problem.names or name in shipped_agents(problem.id)
 
 
 def asked_of(

@@ -19,7 +19,6 @@ import numpy
 from . import __version__
 from .agents.training_run import training_scenarios
 from .baselines.problem import import_problem
-from .baselines.tuning import best_tuned_policy
 from .envs.catalogue import check_names, find_scenario, import_task
 from .evaluation.files import whole_files
 from .evaluation.rollout import Progress
@@ -58,7 +57,7 @@ def default_policies(env: str, control: str | None = None) -> list[str]:
     """
     problem = import_problem(env)
     paper = problem.baselines.score_paper
-    names = [paper, best_tuned_policy(problem.id, control), RANDOM]
+    names = [paper, problem.tuned_values.best_policy(control), RANDOM]
     own = getattr(problem.competitor(paper), "control", None) if paper else None
     if own is not None and control not in (None, own):
         names.remove(paper)

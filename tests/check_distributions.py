@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium
 import numpy
 from filtergym.agents.named_policies import shipped_agents
-from filtergym.baselines.tuning import tuned_names
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
 
 import filtergym
@@ -47,7 +47,7 @@ def check_installed() -> None:
         env = gymnasium.make(id)
         env.reset(seed=0)
         assert numpy.isfinite(env.step(env.action_space.sample())[1]), id
-        agents, tuned = shipped_agents(id), tuned_names(id)
+        agents, tuned = shipped_agents(id), problem_of(id).tuned
         results = filtergym.evaluate(id, [*agents, *tuned], episodes=2)
         assert numpy.isfinite(results["error"]).all(), id
 

@@ -10,6 +10,7 @@ import pytest
 from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, make_task, task_class
 from filtergym.envs.observation import Block
 from filtergym.envs.task import named_arrays
@@ -179,7 +180,7 @@ def test_policy_of_another_environment_is_refused(stored):
     assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
     path = stored(environment="filtergym/Other-v0")
     with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
-        stored_policy(ID, path)
+        stored_policy(problem_of(ID).task, path)
     fields = [field.name for field in make_task(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))
     with pytest.raises(ValueError, match=r"was trained on other fields .* has no field 'range': choose from"):

@@ -1,7 +1,6 @@
 """Training runs: what they refuse, that a resumed one equals one that never stopped, and what they export."""
 
 import dataclasses
-import functools
 import json
 import os
 import shutil
@@ -11,8 +10,8 @@ import gymnasium
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.problem import Problem
-from filtergym.envs.catalogue import make_task, task_class
+from filtergym.baselines.problem import Problem, problem_of
+from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 
 from filtergym import evaluate
@@ -32,7 +31,7 @@ from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_head
 from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
 from filtergym.agents.sb3_training import train_sb3
-from filtergym.agents.training_run import load_run, new_run, resumed_run
+from filtergym.agents.training_run import RunOptions, Session, Trainee, load_run, new_run, resumed_run
 from sb3_contrib import RecurrentPPO
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -57,13 +56,15 @@ def few_validation_episodes(monkeypatch):
 
 def small_run(algorithm, steps, envs=4, **keywords):
     control = keywords.pop("control", CONTROL.get(algorithm, "gain"))
-    return new_run(ID, algorithm, control, steps, envs, overrides=SMALL[algorithm], **keywords)
+    return new_run(
+        problem_of(ID), RunOptions(algorithm, control, steps, envs, overrides=SMALL[algorithm], **keywords)
+    )
 
 
 def train(run, folder, **keywords):
     folder.mkdir(exist_ok=True)
-    trainer = train_bptt if run.algorithm in THROUGH_THE_FILTER else functools.partial(train_sb3, trust=True)
-    return trainer(run, folder, interval=keywords.pop("interval", 10**9), **keywords)
+    trainer = train_bptt if run.algorithm in THROUGH_THE_FILTER else train_sb3
+    return trainer(run, Session(folder, **{"validate_every": 10**9, "trust": True, **keywords}))
 
 
 def weights(algorithm, folder):
@@ -291,7 +292,7 @@ def test_held_out_scenario_is_refused():
 
 def test_unknown_algorithm():
     with pytest.raises(ValueError, match="unknown algorithm 'pop': did you mean 'ppo'"):
-        new_run(ID, "pop")
+        new_run(problem_of(ID), RunOptions("pop"))
 
 
 @pytest.mark.parametrize(
@@ -498,7 +499,7 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
     run = small_run("ppo", 100)
     save_agent = lambda _: saved.append(run.steps_done)  # noqa: E731
     books = training_run.Bookkeeping(
-        run, tmp_path, 10, lambda _: None, save_agent, None, lambda: False, lambda _: None
+        run, Session(tmp_path, validate_every=10), Trainee(None, lambda _: None, save_agent), lambda: False
     )
     costs = iter([3.0, 5.0, 2.0, 2.0, 4.0])
     books.validation.score = lambda _: {
@@ -514,7 +515,10 @@ def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):
 def test_when_the_paper_was_beaten_is_noted(tmp_path):
     lines, run = [], small_run("ppo", 100)
     books = training_run.Bookkeeping(
-        run, tmp_path, 10, lambda _: None, lambda _: None, None, lambda: False, lines.append
+        run,
+        Session(tmp_path, validate_every=10, report=lines.append),
+        Trainee(None, lambda _: None, lambda _: None),
+        lambda: False,
     )
     # The mean alone below the paper's is not enough; what comes later does not matter.
     highs = iter([0.3, 0.1, -0.1, 0.2, -0.2])
@@ -542,7 +546,7 @@ def test_a_run_can_be_stopped_by_what_it_tells(tmp_path):
         told.append(entry["steps"])
         return len(told) == 2
 
-    run = train(small_run("bptt", 4000), tmp_path, interval=400, validated=validated)
+    run = train(small_run("bptt", 4000), tmp_path, validate_every=400, validated=validated)
     assert told == [400, 800]
     assert (run.steps_done, load_run(tmp_path).steps_done, run.finished) == (800, 800, False)
 
@@ -558,8 +562,8 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
     )
     tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
     monkeypatch.setattr(Problem, "tuned", tuned)
-    monkeypatch.setattr(standing, "problem_of", lambda id: Problem(task_class(id), few))
     run = train(small_run("bptt", 400), tmp_path)
+    run.problem = dataclasses.replace(problem_of(ID), baselines=few)
     opponents = standing.Opponents(run)
     names = [*few.policies, *few.estimators, *tuned, "known-turn"]
     agent = training_run.best_agent(tmp_path)

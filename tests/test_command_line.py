@@ -336,8 +336,9 @@ def test_comparison_shows_what_the_records_say(tmp_path, make_page, monkeypatch)
     records = result.records
     write_results(tmp_path / "results.json", [result], settings_of("filtergym benchmark"))
     found = comparison.read_benchmark([tmp_path / "results.json"])
-    assert found == {ENV: records}
-    cost, error, typical, consistent = comparison.compare_environment(records).grids
+    [measured] = found
+    assert (measured.problem.id, measured.records) == (ENV, records)
+    cost, error, typical, consistent = comparison.compare_environment(measured).grids
     classical = sorted(["imm-tuned", "adaptive-rearm"], key=lambda name: mean_cost(records, name))
     # What is looked for first comes first: on a narrow screen the rest is scrolled to.
     first = ["`ppo` (learned)", *(f"`{name}`" for name in classical)]

@@ -8,7 +8,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.baselines.tuning import tune
+from filtergym.baselines.problem import problem_of
+from filtergym.baselines.tuning import Search, tune
 from filtergym.envs import compiled as compiled_tasks
 from filtergym.envs.backend import task_on
 from filtergym.envs.catalogue import catalogue, make_task
@@ -321,6 +322,8 @@ def test_evaluation_and_tuning_say_the_same_on_both_backends():
     id = "filtergym/ManeuveringTarget-v0"
     tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["imm"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
-    found = [tune(id, "imm", tunable, budget, episodes=8, backend=b) for b in ("compiled", "numpy")]
+    found = [
+        tune(problem_of(id), "imm", Search(budget, episodes=8, backend=b)) for b in ("compiled", "numpy")
+    ]
     assert found[0].values == pytest.approx(found[1].values, rel=1e-5)
     assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)

@@ -117,7 +117,7 @@ def test_who_is_best(dataset, found):
     assert behind.component == "bptt"
     expected = float(cost.sel(policy="ppo") / cost.sel(policy="bptt")) - 1.0
     assert behind.value == pytest.approx(expected, rel=1e-12)
-    sentence = ranking_sentence(records)
+    sentence = ranking_sentence(records, "imm")
     assert sentence.startswith("On `random` `bptt` (learned) costs least: -")
     classical = next(name for name in names if name not in ("bptt", "ppo"))
     assert f"The strongest classical competitor, `{classical}` (" in sentence

@@ -11,6 +11,7 @@ import command_line
 import pytest
 from environment_page import environment_tables, put_tables
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, make_task, parameter_names
 from pages import insert_between_markers
 
@@ -39,7 +40,7 @@ def test_tables_of_the_page_are_those_of_the_code(id, tmp_path):
     """If not: ``python docs/make page ID --into docs/environments/PAGE.md``."""
     copy = tmp_path / "page.md"
     copy.write_text(page(id), encoding="utf-8")
-    assert put_tables(id, copy) == list(environment_tables(id))
+    assert put_tables(problem_of(id), copy) == list(environment_tables(problem_of(id)))
     assert copy.read_text(encoding="utf-8") == page(id)
 
 

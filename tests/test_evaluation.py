@@ -9,7 +9,9 @@ import pytest
 import xarray
 from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.tuning import mean_cost, merged_table, stored_values, tune
+from filtergym.baselines.problem import problem_of
+from filtergym.baselines.tuned_values import merged_table
+from filtergym.baselines.tuning import Candidate, Search, mean_cost, tune
 from filtergym.evaluation.competitors import Policy
 from filtergym.evaluation.dataset import windows_of
 from filtergym.evaluation.seeds import episode_seeds
@@ -122,13 +124,15 @@ def test_a_class_of_ones_own_and_its_mistakes():
 def test_tuning_improves_on_fresh_episodes_and_is_repeatable():
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 20 * 32 * 100
-    first = tune(ENV, "fixed-best", tunable, budget, seed=1, episodes=32)
-    again = tune(ENV, "fixed-best", tunable, budget, seed=1, episodes=32)
+    first = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32))
+    again = tune(problem_of(ENV), "fixed-best", Search(budget, seed=1, episodes=32))
     assert first == again
     assert first.environment_steps <= budget
     assert first.cost < first.untuned_cost
     seeds = episode_seeds("validation", 1, 128)
-    assert mean_cost(ENV, "random", tunable, tunable.start, seeds) == pytest.approx(first.untuned_cost)
+    assert mean_cost(Candidate(problem_of(ENV), "random", tunable, tunable.start, seeds)) == pytest.approx(
+        first.untuned_cost
+    )
 
 
 def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
@@ -137,26 +141,26 @@ def test_a_winner_that_fresh_episodes_do_not_confirm_is_not_kept(monkeypatch):
     train = episode_seeds("train", 0, 8)
     (name,) = tunable.start
 
-    def flattered(id, scenario, tunable, values, seeds, backend, workers):
-        return -values[name] if seeds == train else 1.0 + abs(values[name] - tunable.start[name])
+    def flattered(candidate, workers):
+        value = candidate.values[name]
+        return -value if candidate.seeds == train else 1.0 + abs(value - tunable.start[name])
 
     monkeypatch.setattr(tuning, "mean_cost", flattered)
-    outcome = tune(ENV, "fixed-best", tunable, 20 * 8 * 100, episodes=8)
+    outcome = tune(problem_of(ENV), "fixed-best", Search(20 * 8 * 100, episodes=8))
     assert outcome.values == pytest.approx(tunable.start, rel=1e-5)
     assert outcome.cost == outcome.untuned_cost == 1.0
 
 
 def test_tuning_refuses_held_out_scenarios_and_small_budgets():
-    tunable = baselines_of(ENV).tunable["imm"]
     with pytest.raises(ValueError, match="held out"):
-        tune(ENV, "imm", tunable, 10**6, scenario="atc")
+        tune(problem_of(ENV), "imm", Search(10**6, scenario="atc"))
     with pytest.raises(ValueError, match="at least"):
-        tune(ENV, "imm", tunable, 1000)
+        tune(problem_of(ENV), "imm", Search(1000))
 
 
 def test_shipped_values_are_used_unless_there_are_ones_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    values, place = stored_values(ENV, "imm")
+    values, place = problem_of(ENV).tuned_values.values("imm")
     assert "tuned" in place
     dataset = evaluate(ENV, ["imm", "imm-tuned"], episodes=4)
     assert not np.allclose(*dataset["cost"].values)
@@ -167,11 +171,11 @@ def test_shipped_values_are_used_unless_there_are_ones_own(tmp_path, monkeypatch
     # Not closer: 1 - 0.9 is not the 0.1 of the untuned transition matrix.
     np.testing.assert_allclose(*dataset["cost"].values, rtol=1e-9)
     with pytest.raises(ValueError, match="filtergym tune"):
-        stored_values(ENV, "hard-imm")
+        problem_of(ENV).tuned_values.values("hard-imm")
 
 
 def test_merging_keeps_the_other_policies():
-    outcome = tune(ENV, "fixed-best", baselines_of(ENV).tunable["fixed-best"], 20 * 8 * 100, episodes=8)
+    outcome = tune(problem_of(ENV), "fixed-best", Search(20 * 8 * 100, episodes=8))
     table = json.loads(merged_table('{"imm": {"values": {}}}', outcome, "a command"))
     assert set(table) == {"imm", "fixed-best"}
     assert math.isfinite(table["fixed-best"]["validation_cost"])

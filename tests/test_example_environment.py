@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from environment_page import environment_tables
 from filtergym.baselines import catalogue as baselines
+from filtergym.baselines.problem import problem_of
 from filtergym.envs import registration
 from filtergym.envs.catalogue import make_task
 from gymnasium.utils.env_checker import check_env
@@ -81,7 +82,7 @@ def test_torch(example):
 
 
 def test_tables_of_its_page(example):
-    tables = environment_tables(ID)
+    tables = environment_tables(problem_of(ID))
     assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in tables["fields"]
     assert "Limits of its true factor" in tables["parameters"]
     assert "Knows the factor on the gusts at every moment." in tables["policies"]

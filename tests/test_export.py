@@ -37,7 +37,7 @@ def tables(dataset):
     nasty.add_row(Text("*", style="bold"), NASTY, end_section=True)
     nasty.add_row("", "")
     return {
-        "results": results_tables(records, 150)[0],
+        "results": results_tables(records, {}, 150)[0],
         "recorded": recorded_table(tidy_records(flights)),
         "flights": flights_table(flights, flight_records(flights), tidy_records(flights)),
         "grid": Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]]).__rich__(),

@@ -8,7 +8,17 @@ from dataclasses import replace
 
 import pytest
 from filtergym.agents import training_run
-from filtergym.agents.training_run import Bookkeeping, best_agent, load_run, new_run, resumed_run
+from filtergym.agents.training_run import (
+    Bookkeeping,
+    RunOptions,
+    Session,
+    Trainee,
+    best_agent,
+    load_run,
+    new_run,
+    resumed_run,
+)
+from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.files import found_folder, settle_folder, whole_files, whole_folder, write_text
 
 STEPS = ("open", "replace", "rename", "mkdir", "unlink", "rmdir")
@@ -151,7 +161,7 @@ def test_a_run_is_resumed_after_a_fault_at_any_step(points, kind, monkeypatch, t
     pytest.importorskip("yaml")
     monkeypatch.setattr(training_run, "Validation", _Costs)
 
-    wanted = new_run("ManeuveringTarget", "bptt", steps=1000, envs=2)
+    wanted = new_run(problem_of("ManeuveringTarget"), RunOptions("bptt", steps=1000, envs=2))
 
     def asked():
         return replace(wanted, validation=[])
@@ -160,7 +170,7 @@ def test_a_run_is_resumed_after_a_fault_at_any_step(points, kind, monkeypatch, t
         def save(place):
             (place / "agent.safetensors").write_text(str(run.steps_done))
 
-        return Bookkeeping(run, folder, 100, save, save, None, lambda: False, lambda line: None)
+        return Bookkeeping(run, Session(folder, validate_every=100), Trainee(None, save, save), lambda: False)
 
     def prepare(at):
         folder = tmp_path / str(at)

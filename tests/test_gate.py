@@ -15,6 +15,7 @@ from filtergym.agents.gate import Gate, Gated, PaperAction
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_ratio, shift_ratio
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import problem_of
 from filtergym.envs import registration
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.competitors import ConstantPolicy, Policy
@@ -295,9 +296,12 @@ def small(monkeypatch, tmp_path):
 
     def train(folder, steps, resume=False, progress=lambda done: None, **around):
         network = {"n_steps": 30, "batch_size": 60, "n_epochs": 2, "policy_kwargs": {"net_arch": [8]}}
-        asked = training_run.new_run(ID, "ppo", None, steps, 4, overrides=network, **around)
+        asked = training_run.new_run(
+            problem_of(ID), training_run.RunOptions("ppo", None, steps, 4, overrides=network, **around)
+        )
         run = training_run.opened_run(tmp_path / folder, asked, resume)
-        return train_sb3(run, tmp_path / folder, resume, 10**9, progress, trust=True), tmp_path / folder
+        session = training_run.Session(tmp_path / folder, resume, 10**9, True, progress)
+        return train_sb3(run, session), tmp_path / folder
 
     return train
 
@@ -366,10 +370,10 @@ def test_resumed_run_inside_a_gate_equals_one_that_never_stopped(small):
 )
 def test_training_around_what_cannot_be(algorithm, around, message):
     pytest.importorskip("sb3_contrib")
-    from filtergym.agents.training_run import new_run
+    from filtergym.agents.training_run import RunOptions, new_run
 
     with pytest.raises(ValueError, match=message):
-        new_run(ID, algorithm, **around)
+        new_run(problem_of(ID), RunOptions(algorithm, **around))
 
 
 def test_gradient_through_the_gate_is_that_of_torch():

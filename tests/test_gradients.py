@@ -4,6 +4,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from filtergym.baselines.problem import problem_of
 from filtergym.envs import backend
 from filtergym.envs.environment import TaskVectorEnv
 
@@ -14,7 +15,7 @@ import array_api_compat.torch as torch_namespace
 import torch
 from filtergym.agents import bptt
 from filtergym.agents.bptt import RecurrentPolicy, descend_episodes, train_bptt
-from filtergym.agents.training_run import new_run
+from filtergym.agents.training_run import RunOptions, Session, new_run
 from filtergym.agents.unrolled import Unrolled
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Function
@@ -180,9 +181,12 @@ def test_without_llvmlite_training_learns_the_same_through_torch(tmp_path, monke
         through_torch = Mock(side_effect=descend_episodes)
         monkeypatch.setattr(bptt, "descend_episodes", through_torch)
         overrides = {"hidden_size": 4, "truncation": 40}
-        run = new_run("filtergym/ManeuveringTarget-v0", "bptt", "gain", 400, 4, overrides=overrides)
+        run = new_run(
+            problem_of("filtergym/ManeuveringTarget-v0"),
+            RunOptions("bptt", "gain", 400, 4, overrides=overrides),
+        )
         monkeypatch.setattr("filtergym.agents.training_run.VALIDATION_EPISODES", 16)
-        train_bptt(run, folder, interval=10**9)
+        train_bptt(run, Session(folder, validate_every=10**9))
         assert through_torch.called is not there
         learned[there] = torch.load(folder / "checkpoint" / "checkpoint.pt", weights_only=True)["policy"]
     for name, tensor in learned[True].items():

@@ -16,7 +16,7 @@ import pytest
 import xarray
 from filtergym.agents.learned_policy import PRETRAINED, read_header
 from filtergym.agents.training_run import load_run
-from filtergym.baselines.tuning import stored_values
+from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.store import Store, Work
 from filtergym.evaluation.summary import Summary
 
@@ -249,7 +249,7 @@ def settings_ways(folder, command):
         yield "list, tuned", lambda: command("list", ENV)
         yield "evaluate, tuned", lambda: command("evaluate", ENV, "--policy", "imm-tuned", *SHORT)
         yield "tune", lambda: command("tune", ENV, "--policy", "imm", "--budget", 1)
-        yield "stored_values", lambda: stored_values(ENV, "imm")
+        yield "stored_values", lambda: problem_of(ENV).tuned_values.values("imm")
     shutil.rmtree(folder / "tuned")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy, stored_policy, write_arrays
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.draws import Draws
 from filtergym.envs.maneuvering_target import kalman_net as radar
@@ -166,17 +167,17 @@ def test_the_estimator_is_the_policy_in_its_bank(id):
 
 @pytest.fixture
 def stored(tmp_path):
-    from filtergym.agents.training_run import new_run
+    from filtergym.agents.training_run import RunOptions, new_run
 
     task = make_task(RADAR, NAME)
     path = tmp_path / "net.safetensors"
-    write_arrays(path, network(task, 0.3).arrays, new_run(RADAR, NAME), "tanh")
+    write_arrays(path, network(task, 0.3).arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
     return path
 
 
 def test_a_file_is_an_estimator(stored, command):
     pytest.importorskip("stable_baselines3")
-    assert kind_of(stored_policy(RADAR, stored)) == "estimator"
+    assert kind_of(stored_policy(problem_of(RADAR).task, stored)) == "estimator"
     code, out, _ = command("evaluate", RADAR, "--policy", stored, "--policy", "imm", "--episodes", 2)
     assert code == 0
     assert "(est" in out

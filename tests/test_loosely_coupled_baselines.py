@@ -9,7 +9,7 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedEstimator
 from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
-from filtergym.baselines.tuning import stored_values
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.schedules import within
 from filtergym.evaluation.rollout import rollout
@@ -290,7 +290,7 @@ def test_records_name_the_position(axes):
 
 def test_tuned_values_are_shipped_and_better_on_other_episodes():
     for name in KNOWN.tunable:
-        assert set(stored_values(ID, name)[0]) == set(KNOWN.tunable[name].limits)
+        assert set(problem_of(ID).tuned_values.values(name)[0]) == set(KNOWN.tunable[name].limits)
     dataset = evaluate(ID, ["best-constant", "best-constant-tuned"], "random", episodes=500, seed=3)
     cost = dataset["cost"].mean(["time", "episode"])
     assert cost.sel(policy="best-constant-tuned") < cost.sel(policy="best-constant")

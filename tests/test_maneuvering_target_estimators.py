@@ -15,7 +15,8 @@ from filtergym.baselines.maneuvering_target.estimators import (
     KalmanTurnInteractingMultipleModel,
     UnscentedTurn,
 )
-from filtergym.baselines.tuning import mean_cost, tuned_names
+from filtergym.baselines.problem import problem_of
+from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
@@ -276,15 +277,15 @@ def test_untuned_values_are_those_in_force():
         untuned = tunable.apply(tunable.start)[1]
         same = type("Untuned", (), {"control": None, "apply": lambda values, maker=maker: ({}, maker)})
         # Logarithms of the values, there and back; an IMM amplifies that.
-        expected = mean_cost(ID, "random", same, {}, seeds)
-        assert mean_cost(ID, "random", tunable, tunable.start, seeds) == pytest.approx(expected, rel=1e-9), (
-            name
-        )
+        expected = mean_cost(Candidate(problem_of(ID), "random", same, {}, seeds))
+        assert mean_cost(Candidate(problem_of(ID), "random", tunable, tunable.start, seeds)) == pytest.approx(
+            expected, rel=1e-9
+        ), name
         assert isinstance(untuned(make_task(ID, None, "random")), maker)
 
 
 def test_tuned_imm_with_a_turn_beats_the_others_on_fresh_flights():
-    others = [name for name in tuned_names(ID) if name != "kalman-imm-turn-tuned"]
+    others = [name for name in problem_of(ID).tuned if name != "kalman-imm-turn-tuned"]
     cost = evaluate(ID, ["kalman-imm-turn-tuned", *others], "random", episodes=300, seed=1).cost
     costs = cost.mean(("episode", "time")).values
     assert costs[0] < 0.95 * costs[1:].min()

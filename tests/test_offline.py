@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.baselines.tuning import best_tuned_policy
+from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.transitions import member, transitions_of
@@ -50,7 +50,11 @@ def in_a_loop_of_ones_own(id, policy, seed, **keywords):
 
 @pytest.mark.parametrize("which", ["paper", "tuned", "random"])
 def test_transitions_are_those_of_a_single_environment(env_id, short, which):
-    name = {"paper": baselines_of(env_id).score_paper, "tuned": best_tuned_policy(env_id), "random": "random"}
+    name = {
+        "paper": baselines_of(env_id).score_paper,
+        "tuned": problem_of(env_id).tuned_values.best_policy(),
+        "random": "random",
+    }
     policy = make_policy(env_id, name[which], **short)
     found = transitions_of(env_id, policy, SEEDS)
     assert [episode.seed for episode in found] == SEEDS
@@ -97,11 +101,11 @@ def test_actions_are_brought_into_their_space():
 
 
 def test_the_best_tuned_policy_acts_and_cost_least(env_id):
-    name = best_tuned_policy(env_id)
+    name = problem_of(env_id).tuned_values.best_policy()
     assert kind_of(competitor(env_id, name)) == "policy"
-    assert best_tuned_policy(ENV) == "adaptive-rearm-tuned"  # 6.58 against 7.76 and more
-    assert best_tuned_policy(ENV, "weights") == "imm-tuned"
-    assert best_tuned_policy(ENV, "evidence") is None
+    assert problem_of(ENV).tuned_values.best_policy() == "adaptive-rearm-tuned"  # 6.58 against 7.76 and more
+    assert problem_of(ENV).tuned_values.best_policy("weights") == "imm-tuned"
+    assert problem_of(ENV).tuned_values.best_policy("evidence") is None
 
 
 def test_data_sets_are_loaded_back_by_minari(env_id, short, minari):
@@ -111,7 +115,7 @@ def test_data_sets_are_loaded_back_by_minari(env_id, short, minari):
     assert sorted(minari.list_local_datasets()) == sorted(entry.name for entry in written)
     assert [entry.policy for entry in written] == [
         baselines_of(env_id).score_paper,
-        best_tuned_policy(env_id),
+        problem_of(env_id).tuned_values.best_policy(),
         "random",
     ]
     for entry in written:

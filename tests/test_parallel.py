@@ -20,6 +20,7 @@ from filtergym.agents.named_policies import shipped_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
+from filtergym.baselines.tuned_values import TunedValues
 from filtergym.envs import registration
 from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.evaluation import code, parallel, summary
@@ -89,8 +90,8 @@ def test_summaries_tell_what_the_evaluation_does(env):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(evaluation, records, curves, shipped_agents(env))
-    whole = benchmark.result_of(dataset, records, expected, shipped_agents(env))
+    result = benchmark.result_of(problem_of(env), evaluation, records, curves, shipped_agents(env))
+    whole = benchmark.result_of(problem_of(env), dataset, records, expected, shipped_agents(env))
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
@@ -196,7 +197,7 @@ def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, mo
     assert read(asked).contender.measures == found.contender.measures
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
         assert read(asked._replace(experiment=replace(asked.experiment, **changed))) is None
-    monkeypatch.setattr(work, "stored_values", lambda id, name: ({"gain": 1.0}, ""))
+    monkeypatch.setattr(TunedValues, "values", lambda self, name: ({"gain": 1.0}, ""))
     assert read(asked) is None
     assert work.work_of(asked._replace(name="mine.py:Mine")) is None
     store.clear()
@@ -231,14 +232,15 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
     list(summaries([asked], Workers(), None, store, [work.work_of(asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
-    tunable = baselines_of(ENV).tunable["fixed-best"]
 
     def interrupted(steps):
         raise KeyboardInterrupt
 
     def search():
         with suppress(KeyboardInterrupt):
-            tuning.tune(ENV, "fixed-best", tunable, 20_000, None, 0, 8, interrupted, store=store)
+            tuning.tune(
+                problem_of(ENV), "fixed-best", tuning.Search(20_000, episodes=8), interrupted, store=store
+            )
         return len(calls)
 
     assert (search(), search()) == (1, 1)
@@ -447,18 +449,18 @@ def test_a_cluster_without_its_packages_is_one_sentence(command, monkeypatch):
 
 
 def test_tuning_finds_the_same_values(two):
-    from filtergym.baselines.tuning import tune
+    from filtergym.baselines.tuning import Search, tune
 
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 40 * 100
-    asked = (ENV, "fixed-best", tunable, budget, None, 0, 40)
+    asked = (problem_of(ENV), "fixed-best", Search(budget, episodes=40))
     assert tune(*asked) == tune(*asked, workers=two)
 
 
 def test_tuning_goes_on_where_it_ended(tmp_path, monkeypatch):
     tunable = baselines_of(ENV).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
-    asked = (ENV, "fixed-best", tunable, budget, None, 0, 8)
+    asked = (problem_of(ENV), "fixed-best", tuning.Search(budget, episodes=8))
     whole = tuning.tune(*asked)
     calls, own = [], tuning.mean_cost
 

@@ -304,12 +304,13 @@ def test_references_are_refused_on_recordings(recordings):
 
 def test_training_and_tuning_refuse_recordings(recordings):
     from filtergym.agents.training_run import training_scenarios
-    from filtergym.baselines.tuning import tune
+    from filtergym.baselines.problem import problem_of
+    from filtergym.baselines.tuning import Search, tune
 
     with pytest.raises(ValueError, match="held out"):
         training_scenarios(task_class(TARGET), recordings[TARGET])
     with pytest.raises(ValueError, match="held out"):
-        tune(TARGET, "imm", None, 1000, recordings[TARGET])
+        tune(problem_of(TARGET), "imm", Search(1000, recordings[TARGET]))
 
 
 # --- estimates

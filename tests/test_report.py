@@ -179,7 +179,7 @@ def test_headline_fits_a_narrow_terminal(result, command_console):
 
 @pytest.mark.parametrize("width", [80, 120, 200])
 def test_no_number_is_cut_at_any_width(width, result, command_console):
-    tables = results_tables(result.records, width)
+    tables = results_tables(result.records, result.knows, width)
     text = command_console(width, *tables)
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= width

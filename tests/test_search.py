@@ -1,6 +1,7 @@
 """Searches for hyperparameters: what they draw, that a resumed one equals a whole one, and what they leave."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -18,7 +19,8 @@ from filtergym.agents.search import (
     search_hyperparameters,
     suggested,
 )
-from filtergym.agents.training_run import load_run, new_run, save_run
+from filtergym.agents.training_run import RunOptions, load_run, new_run, save_run
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, make_task
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -27,7 +29,9 @@ SPACE = {"learning_rate": {"low": 1e-4, "high": 1e-2, "log": True, "prefix": "li
 
 def search(**changed):
     asked = {"steps": 1000, "seeds": (0, 1), "keywords": {}, "overrides": {}, "space": SPACE, "sampling": 3}
-    return Search(ID, "bptt", "gain", None, **(asked | changed))
+    asked |= changed
+    of_run = {name: asked.pop(name) for name in ("keywords", "overrides")}
+    return Search(problem_of(ID), RunOptions("bptt", "gain", **of_run), **asked)
 
 
 def cost_of(run):
@@ -35,13 +39,13 @@ def cost_of(run):
     return 1.0 + 100.0 * abs(rate - 0.003) + run.seed
 
 
-def pretended(run, folder, interval, validated):
+def pretended(run, session):
     """Training whose validation cost depends on its hyperparameters and its seed only, lowest in the middle."""
-    for steps in range(interval, run.steps + 1, interval):
+    for steps in range(session.validate_every, run.steps + 1, session.validate_every):
         run.steps_done = steps
-        if validated({"steps": steps, "cost": cost_of(run) + 0.1 * abs(steps - 600) / 1000}):
+        if session.validated({"steps": steps, "cost": cost_of(run) + 0.1 * abs(steps - 600) / 1000}):
             break
-    save_run(run, folder / "run.json")
+    save_run(run, session.folder / "run.json")
     return run
 
 
@@ -54,13 +58,13 @@ def test_a_resumed_search_equals_one_that_never_stopped(how, tmp_path):
     whole = search_hyperparameters(search(), tmp_path / "whole", 14, pretended)
     runs = []
 
-    def interrupted(run, folder, **keywords):
+    def interrupted(run, session):
         runs.append(run)
         if len(runs) == 6:  # the second seed of a trial
             if how == "crash":
                 raise KeyboardInterrupt
             return run  # unfinished, as after Ctrl-C
-        return pretended(run, folder, **keywords)
+        return pretended(run, session)
 
     folder = tmp_path / "parts"
     try:
@@ -82,7 +86,7 @@ def test_a_trial_is_worth_its_lowest_costs_and_the_best_is_written(tmp_path):
         assert trial.value == pytest.approx(sum(map(cost_of, each)) / 2, rel=1e-12)
         assert each[0].hyperparameters["hidden_size"] == json.loads(trial.params["hidden_size"])
     best = load_run(run_folder(tmp_path, study.best_trial.number, 0))
-    trained = new_run(ID, "bptt", config=tmp_path / "best.yml")
+    trained = new_run(problem_of(ID), RunOptions("bptt", config=tmp_path / "best.yml"))
     for name in ("control", "scenario", "envs", "steps", "hyperparameters"):
         assert getattr(trained, name) == getattr(best, name)
 
@@ -90,14 +94,14 @@ def test_a_trial_is_worth_its_lowest_costs_and_the_best_is_written(tmp_path):
 def test_trials_that_fall_behind_are_pruned(tmp_path):
     told = []
 
-    def train(run, folder, interval, validated):
+    def train(run, session):
         told.append([])
 
         def keep(entry):
             told[-1].append(entry["steps"])
-            return validated(entry)
+            return session.validated(entry)
 
-        return pretended(run, folder, interval, keep)
+        return pretended(run, replace(session, validated=keep))
 
     study = search_hyperparameters(search(seeds=(0,)), tmp_path, 20, train)
     states = [trial.state.name for trial in ended_trials(study)]
@@ -110,11 +114,11 @@ def test_trials_that_fall_behind_are_pruned(tmp_path):
 def test_what_cannot_be_trained_with_is_no_reason_to_stop_but_at_the_beginning(tmp_path):
     calls = []
 
-    def train(run, folder, **keywords):
+    def train(run, session):
         calls.append(run)
         if len(calls) in failing:
             raise ValueError("actions must be finite")
-        return pretended(run, folder, **keywords)
+        return pretended(run, session)
 
     failing, lines = {3}, []
     study = search_hyperparameters(search(seeds=(0,)), tmp_path / "later", 4, train, report=lines.append)
@@ -150,7 +154,7 @@ def test_shipped_spaces_are_of_settings_that_there_are(algorithm):
         shown = catalogue().get(id, catalogue()[ID]).id
         for _ in range(4):
             chosen = suggested(study.ask(), space)
-            run = new_run(shown, algorithm, overrides=chosen)
+            run = new_run(problem_of(shown), RunOptions(algorithm, overrides=chosen))
             rollout = run.envs * chosen.get("n_steps", 0)
             assert rollout % chosen.get("batch_size", 1) == 0
     if algorithm == "bptt":

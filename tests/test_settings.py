@@ -2,9 +2,9 @@
 
 import csv
 import dataclasses
-import functools
 import itertools
 import shlex
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -24,6 +24,8 @@ from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
 from filtergym.agents.settings import merged, parsed_settings, read_config
 from filtergym.agents.training_run import (
+    RunOptions,
+    Session,
     TrainingEpisodes,
     load_run,
     new_run,
@@ -53,8 +55,8 @@ def all_training_scenarios(monkeypatch):
 
 def trained(run, folder, **keywords):
     folder.mkdir(exist_ok=True)
-    trainer = train_bptt if run.algorithm == "bptt" else functools.partial(train_sb3, trust=True)
-    return trainer(run, folder, interval=10**9, **keywords)
+    trainer = train_bptt if run.algorithm == "bptt" else train_sb3
+    return trainer(run, Session(folder, **{"validate_every": 10**9, "trust": True, **keywords}))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +114,7 @@ def test_shipped_then_config_then_settings_then_options(text, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text(text)
     shipped = stored_hyperparameters(ID, "ppo")
-    run = new_run(ID, "ppo", config=config)
+    run = new_run(problem_of(ID), RunOptions("ppo", config=config))
     assert run.envs == 4
     assert run.hyperparameters["gamma"] == 0.9
     assert run.hyperparameters["gae_lambda"] == shipped["gae_lambda"]
@@ -125,10 +127,13 @@ def test_shipped_then_config_then_settings_then_options(text, tmp_path):
         {"gamma": 0.8, "n_envs": 6},
         {"range_sigma": 60.0, "reward": "cost", "control": "mode"},
     )
-    run = new_run(ID, "ppo", config=config, overrides=overrides, keywords=keywords)
+    run = new_run(problem_of(ID), RunOptions("ppo", config=config, overrides=overrides, keywords=keywords))
     assert (run.envs, run.hyperparameters["gamma"], run.control) == (6, 0.8, "mode")
     assert run.hyperparameters["env_kwargs"] == {"range_sigma": 60.0, "reward": "cost"}
-    run = new_run(ID, "ppo", "gain", envs=7, config=config, overrides=overrides, keywords=keywords)
+    run = new_run(
+        problem_of(ID),
+        RunOptions("ppo", "gain", envs=7, config=config, overrides=overrides, keywords=keywords),
+    )
     assert (run.envs, run.control) == (7, "gain")
 
 
@@ -157,9 +162,9 @@ def test_wrong_configs_are_told(text, message, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text(text)
     with pytest.raises(ValueError, match=message):
-        new_run(ID, "ppo", config=config)
+        new_run(problem_of(ID), RunOptions("ppo", config=config))
     with pytest.raises(ValueError, match="cannot read settings"):
-        new_run(ID, "ppo", config=tmp_path / "none.yml")
+        new_run(problem_of(ID), RunOptions("ppo", config=tmp_path / "none.yml"))
 
 
 @pytest.mark.parametrize(
@@ -187,19 +192,19 @@ def test_wrong_configs_are_told(text, message, tmp_path):
 )
 def test_wrong_settings_are_told(algorithm, keywords, overrides, message):
     with pytest.raises(ValueError, match=message):
-        new_run(ID, algorithm, keywords=keywords, overrides=overrides)
+        new_run(problem_of(ID), RunOptions(algorithm, keywords=keywords, overrides=overrides))
 
 
 def test_shipped_hyperparameters_pass_the_check_of_settings():
     for algorithm in training_run.FILES:
         # A learned estimator steers a filter of its own, and no control.
         control = {"dqn": "mode", "kalman-net": "kalman-net"}.get(algorithm, "gain")
-        new_run(ID, algorithm, control, overrides={"learning_rate": 1e-4})
+        new_run(problem_of(ID), RunOptions(algorithm, control, overrides={"learning_rate": 1e-4}))
 
 
 def test_settings_reach_environment_and_algorithm():
     keywords = {"range_sigma": 60.0, "reward": "log-likelihood", "dtype": "float32"}
-    env = training_environment(new_run(ID, "ppo", envs=2, keywords=keywords)).env
+    env = training_environment(new_run(problem_of(ID), RunOptions("ppo", envs=2, keywords=keywords))).env
     assert env.task.parameters.range_sigma == 60.0
     assert (env.reward_kind, env.options.dtype) == ("log-likelihood", "float32")
 
@@ -207,7 +212,11 @@ def test_settings_reach_environment_and_algorithm():
 def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
     """Stable-Baselines3's SAC writes into policy_kwargs."""
     small = {"learning_starts": 8, "buffer_size": 50, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}}
-    asked = functools.partial(new_run, ID, "sac", "gain", 20, 2, overrides=small)
+    options = RunOptions("sac", "gain", 20, 2, overrides=small)
+
+    def asked(**more):
+        return new_run(problem_of(ID), replace(options, **more))
+
     trained(opened_run(tmp_path, asked(), False), tmp_path)
     opened_run(tmp_path, asked(), True)
     assert load_run(tmp_path).hyperparameters == asked().hyperparameters
@@ -216,7 +225,9 @@ def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm, tmp_path):
     keywords = {"range_sigma": 60.0, "horizon": 40, "reward": "log-likelihood"}
-    run = new_run(ID, algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
+    run = new_run(
+        problem_of(ID), RunOptions(algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
+    )
     run = trained(opened_run(tmp_path, run, False), tmp_path)
     kept = load_run(tmp_path)
     assert kept.hyperparameters["env_kwargs"] == keywords
@@ -226,14 +237,19 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
     dataset = evaluate(ID, ["imm"], episodes=8, split="validation", range_sigma=60.0, horizon=40)
     assert kept.validation[0]["paper_cost"] == pytest.approx(float(dataset["cost"].mean()), rel=1e-12)
     # The same again goes on, other settings are refused, and none are those of the run.
-    again = new_run(ID, algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords=keywords)
+    again = new_run(
+        problem_of(ID), RunOptions(algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords=keywords)
+    )
     opened_run(tmp_path, again, True)
     other = new_run(
-        ID, algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords={**keywords, "range_sigma": 61.0}
+        problem_of(ID),
+        RunOptions(
+            algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords={**keywords, "range_sigma": 61.0}
+        ),
     )
     with pytest.raises(ValueError, match=r"hyperparameters.env_kwargs.range_sigma 60.0, not 61.0"):
         opened_run(tmp_path, other, True)
-    none = new_run(ID, algorithm, "gain", 480, 4)
+    none = new_run(problem_of(ID), RunOptions(algorithm, "gain", 480, 4))
     run = opened_run(tmp_path, none, True, same=True)
     assert run.hyperparameters == kept.hyperparameters
     assert trained(run, tmp_path, resume=True).steps_done >= 480
@@ -259,9 +275,9 @@ def rows(folder):
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 def test_validations_are_curves_in_the_log(algorithm, tmp_path):
-    run = new_run(ID, algorithm, "gain", 800, 4, overrides=SMALL[algorithm])
+    run = new_run(problem_of(ID), RunOptions(algorithm, "gain", 800, 4, overrides=SMALL[algorithm]))
     trainer = train_bptt if algorithm == "bptt" else train_sb3
-    trainer(run, tmp_path, interval=300)
+    trainer(run, Session(tmp_path, validate_every=300))
     validated = [row for row in rows(tmp_path / "log") if row.get("validation/cost")]
     assert len(validated) == len(run.validation) > 1
     for row, entry in zip(validated, run.validation, strict=True):
@@ -277,9 +293,9 @@ def test_tensorboard_shows_validations_over_environment_steps(algorithm, tmp_pat
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    run = new_run(ID, algorithm, "gain", 800, 4, overrides=SMALL[algorithm])
+    run = new_run(problem_of(ID), RunOptions(algorithm, "gain", 800, 4, overrides=SMALL[algorithm]))
     trainer = train_bptt if algorithm == "bptt" else train_sb3
-    trainer(run, tmp_path, interval=300)
+    trainer(run, Session(tmp_path, validate_every=300))
     events = EventAccumulator(str(tmp_path / "log"))
     events.Reload()
     shown = [(event.step, event.value) for event in events.Scalars("validation/cost")]
@@ -295,17 +311,25 @@ def test_a_mixture_with_a_scenario_that_is_held_out_is_refused():
         with pytest.raises(
             ValueError, match=r"scenario 'paper' is held out: train on a training scenario \(random\)"
         ):
-            new_run(ID, "ppo", scenario=scenario)
+            new_run(problem_of(ID), RunOptions("ppo", scenario=scenario))
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "bptt"])
 @pytest.mark.usefixtures("all_training_scenarios")
 def test_training_on_a_mixture(algorithm, tmp_path):
     mixture = {"random": 0.75, "cruise": 0.25}
-    asked = functools.partial(
-        new_run, ID, algorithm, "gain", envs=4, scenario="random:3,cruise:1", overrides=SMALL[algorithm],
+    options = RunOptions(
+        algorithm,
+        "gain",
+        envs=4,
+        scenario="random:3,cruise:1",
+        overrides=SMALL[algorithm],
         keywords={"horizon": 20},
-    )  # fmt: skip
+    )
+
+    def asked(**more):
+        return new_run(problem_of(ID), replace(options, **more))
+
     run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
     assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
     costs = [
@@ -320,16 +344,18 @@ def test_training_on_a_mixture(algorithm, tmp_path):
 
 @pytest.mark.usefixtures("all_training_scenarios")
 def test_bptt_learns_mixtures_on_torch_only_and_of_one_length(tmp_path):
-    run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,paper:1", backend="compiled")
+    run = new_run(
+        problem_of(ID), RunOptions("bptt", "gain", 400, 4, scenario="random:1,paper:1", backend="compiled")
+    )
     with pytest.raises(ValueError, match="on torch only"):
-        train_bptt(run, tmp_path)
-    run = new_run(ID, "bptt", "gain", 400, 4, scenario="random:1,cruise:1")
+        train_bptt(run, Session(tmp_path))
+    run = new_run(problem_of(ID), RunOptions("bptt", "gain", 400, 4, scenario="random:1,cruise:1"))
     with pytest.raises(ValueError, match="episodes of one length, not from random:"):
-        train_bptt(run, tmp_path)
+        train_bptt(run, Session(tmp_path))
 
 
 def test_costs_of_a_mixture_are_weighted():
-    run = new_run(ID, "ppo")
+    run = new_run(problem_of(ID), RunOptions("ppo"))
     paper = problem_of(ID).competitor("imm")
     run.scenario = "random:0.25,paper:0.75"
     mixed = TrainingEpisodes(run, 4).costs(paper)

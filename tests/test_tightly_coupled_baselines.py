@@ -5,8 +5,9 @@ import math
 import numpy
 import pytest
 from filtergym.baselines.catalogue import baselines_of
+from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
-from filtergym.baselines.tuning import tune
+from filtergym.baselines.tuning import Search, tune
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
@@ -327,7 +328,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
 def test_tuning_counts_decisions():
     # 16 candidates on 256 episodes of 60 decisions, each 10 measurements.
     with pytest.raises(ValueError, match="give 245760 steps"):
-        tune(ID, "sticky", KNOWN.tunable["sticky"], 245_759)
+        tune(problem_of(ID), "sticky", Search(245_759))
 
 
 # --- metrics

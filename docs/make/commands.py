@@ -10,7 +10,8 @@ import typer
 from command_line import MARKER as COMMANDS_MARKER
 from command_line import command_line_markdown
 from environment_page import environment_tables, put_tables
-from filtergym.envs.catalogue import find_scenario, importable_name, short_name, task_class
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.catalogue import find_scenario
 from filtergym.evaluation.files import whole_files, writable_file
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save
@@ -57,28 +58,27 @@ def comparison_page(
     formats = check_formats(format or ["png"])
     check_columns(columns)
     found = comparison.read_benchmark(records)
-    markers = {id: f"comparison {short_name(id)}" for id in found}
+    names = [own.problem.short_name for own in found]
+    markers = [f"comparison {name}" for name in names]
     overview = "comparison of all"
     if into is not None:
-        check_markers(into, markers.values())
-    compared = {id: comparison.compare_environment(own, columns) for id, own in found.items()}
+        check_markers(into, markers)
+    compared = [comparison.compare_environment(own, columns) for own in found]
     if into is not None:
         texts = {}
         with whole_files(into.parent / "images") as images:
-            for id, own in found.items():
+            for own, tables, name, marker in zip(found, compared, names, markers, strict=True):
                 for suffix in formats:
-                    save(compared[id].figure, images / f"comparison_{short_name(id)}.{suffix}")
-                picture = f"comparison_{short_name(id)}.{formats[0]}"
-                command = f"filtergym benchmark --full --seed {own[0].seed} --split {own[0].split}"
-                texts[markers[id]] = comparison.comparison_markdown(
-                    compared[id], own, f"images/{picture}", command
-                )
+                    save(tables.figure, images / f"comparison_{name}.{suffix}")
+                picture, first = f"images/comparison_{name}.{formats[0]}", own.records[0]
+                command = f"filtergym benchmark --full --seed {first.seed} --split {first.split}"
+                texts[marker] = comparison.comparison_markdown(tables, own, picture, command)
         on_page = set(markers_of(into))
         # Tables over all environments only from records of all that the page shows.
         if overview in on_page and on_page <= {overview, *texts}:
             texts[overview] = comparison.overview_markdown(found)
         insert_between_markers(into, texts)
-    for each in compared.values():
+    for each in compared:
         for grid in each.grids:
             console.print(grid)
     for grid in (comparison.summary(found), comparison.harm(found)):
@@ -95,16 +95,17 @@ def room(
 
     Example: python docs/make room filtergym/ManeuveringTarget-v0
     """
-    cls = task_class(environment)
+    problem = problem_of(environment)
+    paper = problem.paper  # there is no room without it
     if into is not None:
         check_markers(into, [MARKER])  # a page that cannot take the table is refused before the work
     with progress_bar() as bar:
         line = bar.add_task("evaluating", total=None)
-        records = measure_room(cls.id, episodes, seed, lambda done: bar.update(line, advance=done))
+        records = measure_room(problem, episodes, seed, lambda done: bar.update(line, advance=done))
     if into is not None:
-        command = f"{PROGRAM} room {importable_name(cls)} --episodes {episodes} --seed {seed} --into {into}"
-        insert_between_markers(into, {MARKER: room_markdown(records, command)})
-    print_results(records)
+        command = f"{PROGRAM} room {problem.name} --episodes {episodes} --seed {seed} --into {into}"
+        insert_between_markers(into, {MARKER: room_markdown(records, paper, command)})
+    print_results(records, problem.knows)
 
 
 def page(
@@ -117,10 +118,11 @@ def page(
 
     Example: python docs/make page filtergym/ManeuveringTarget-v0
     """
+    problem = problem_of(environment)
     if into is not None:
-        console.print(f"{into}: {', '.join(put_tables(environment, into))}")
+        console.print(f"{into}: {', '.join(put_tables(problem, into))}")
         return
-    for name, table in environment_tables(environment).items():
+    for name, table in environment_tables(problem).items():
         console.print(f"{name}\n\n{table}\n", soft_wrap=True)
 
 
@@ -161,10 +163,10 @@ def seeds(
     if curves is not None:
         check_formats([curves.suffix.removeprefix(".").lower()])
     found = training_seeds.load_runs(runs, trust)
-    cls = task_class(found[0].run.environment)
-    scenarios = [find_scenario(cls, name).name for name in scenario or [cls.default_scenario]]
-    opponents = policy or training_seeds.default_opponents(cls.id)
-    marker = f"seeds {short_name(cls.id)}"
+    problem = found[0].run.problem
+    scenarios = [find_scenario(problem.task, name).name for name in scenario or [None]]
+    opponents = policy or training_seeds.default_opponents(problem)
+    marker = f"seeds {problem.short_name}"
     for file in (out, curves):
         if file is not None:
             writable_file(file)

@@ -1,12 +1,12 @@
 """The comparison page: from the records of a full benchmark to a table and a picture for each environment."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from filtergym.agents.named_policies import shipped_agents
-from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.envs.catalogue import catalogue, nearest, short_name, task_class
+from filtergym.baselines.problem import Problem, problem_of
+from filtergym.envs.catalogue import catalogue, nearest
 from filtergym.evaluation.competitors import RANKED
 from filtergym.evaluation.metrics import Record
 from filtergym.papers.grid import Grid, markdown_table
@@ -21,6 +21,13 @@ STRONGEST = 4
 DIFFERENCE = "relative_cost_difference"
 
 
+class Benchmarked(NamedTuple):
+    """What a benchmark has measured in one environment."""
+
+    problem: Problem
+    records: list[Record]
+
+
 class Comparison(NamedTuple):
     """What the page shows of one environment."""
 
@@ -29,8 +36,8 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def read_benchmark(paths: Sequence[Path]) -> dict[str, list[Record]]:
-    """Read the records of benchmarks, by environment.
+def read_benchmark(paths: Sequence[Path]) -> list[Benchmarked]:
+    """Read the records of benchmarks, those of an environment together.
 
     Raises:
         ValueError: if a file is none, is of something else, or they hold nothing.
@@ -42,7 +49,7 @@ def read_benchmark(paths: Sequence[Path]) -> dict[str, list[Record]]:
         found.setdefault(result.environment, []).extend(result.records)
     if not found:
         raise ValueError(f"{paths[0]} holds no records: make them by filtergym benchmark --full")
-    return found
+    return [Benchmarked(problem_of(id), records) for id, records in found.items()]
 
 
 def check_known(record: Record) -> None:
@@ -54,15 +61,15 @@ def check_known(record: Record) -> None:
         raise nearest("scenario", record.scenario, cls.scenarios)
 
 
-def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
+def compared_policies(problem: Problem, records: Sequence[Record]) -> list[str]:
     """Names that the page shows, of those in the records, in the order of its columns.
 
     Learned agents; what costs least of all others in the training distribution, of any control and kind; the paper's
     algorithm; it and the best constant action, tuned; the reference whose score is 1. The others stand in the records.
     On a narrow screen only the first columns are seen without scrolling.
     """
-    known, cls = baselines_of(id), task_class(id)
-    of_default = [record for record in records if record.scenario == cls.default_scenario]
+    known = problem.baselines
+    of_default = [record for record in records if record.scenario == problem.task.default_scenario]
     classical = [
         place.name
         for place in ranking(of_default or records)
@@ -71,7 +78,7 @@ def compared_policies(id: str, records: Sequence[Record]) -> list[str]:
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
     strongest, paper = classical[:STRONGEST], known.score_paper
-    wanted = dict.fromkeys((*shipped_agents(id), *strongest, paper, *tuned, known.score_reference))
+    wanted = dict.fromkeys((*shipped_agents(problem.id), *strongest, paper, *tuned, known.score_reference))
     return [name for name in wanted if name in present]
 
 
@@ -90,28 +97,24 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
     ]
 
 
-def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
-    """Best of every origin on the training distribution of each environment, and the reference.
-
-    Args:
-        found: records by environment.
-    """
+def summary(found: Sequence[Benchmarked]) -> Grid:
+    """Best of every origin on the training distribution of each environment, and the reference."""
     rows = []
-    for id, every in found.items():
-        known, learned = baselines_of(id), shipped_agents(id)
-        records = [record for record in every if record.scenario == task_class(id).default_scenario]
+    for problem, every in found:
+        reference, learned = problem.baselines.score_reference, shipped_agents(problem.id)
+        records = [record for record in every if record.scenario == problem.task.default_scenario]
         values, kinds = _by_name(records), {record.policy: record.kind for record in records}
         places = [place.name for place in ranking(records)] if records else []
         best: dict[str, str] = {}
         for name in places:
             origin = f"learned {kinds[name]}" if name in learned else "classical"
             best.setdefault(origin, name)
-        if known.score_reference in kinds:
-            best["reference"] = known.score_reference
+        if reference in kinds:
+            best["reference"] = reference
         for origin, name in best.items():
             rows.append(
                 [
-                    short_name(id).removesuffix("-v0"),
+                    problem.short_name.removesuffix("-v0"),
                     f"`{name}`",
                     origin if origin != "classical" or kinds[name] == "policy" else "classical estimator",
                     *_cells(name, records),
@@ -122,15 +125,11 @@ def summary(found: Mapping[str, Sequence[Record]]) -> Grid:
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
 
-def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
-    """The scenario in which each learned agent stands worst against the paper's algorithm.
-
-    Args:
-        found: records by environment.
-    """
+def harm(found: Sequence[Benchmarked]) -> Grid:
+    """The scenario in which each learned agent stands worst against the paper's algorithm."""
     rows = []
-    for id, records in found.items():
-        for name in shipped_agents(id):
+    for problem, records in found:
+        for name in shipped_agents(problem.id):
             own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
             if not own:
                 continue
@@ -138,7 +137,7 @@ def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
             beside = [record for record in records if record.scenario == worst.scenario]
             rows.append(
                 [
-                    short_name(id).removesuffix("-v0"),
+                    problem.short_name.removesuffix("-v0"),
                     f"`{name}`",
                     f"`{worst.scenario}`",
                     *_cells(name, beside),
@@ -150,19 +149,19 @@ def harm(found: Mapping[str, Sequence[Record]]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
 
 
-def compare_environment(records: Sequence[Record], width: int = 2) -> Comparison:
+def compare_environment(measured: Benchmarked, width: int = 2) -> Comparison:
     """Tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
-        records: of the environment.
+        measured: the environment and its records.
         width: of the figure, 1 or 2 columns of a paper.
 
     Raises:
         ValueError: if the paper's algorithm, or what is compared with it, is not among the records.
     """
-    cls = task_class(records[0].environment)
-    known = baselines_of(cls.id)
-    paper, columns = paper_of(cls.id), compared_policies(cls.id, records)
+    problem, records = measured
+    cls, known = problem.task, problem.baselines
+    paper, columns = problem.paper, compared_policies(problem, records)
     if paper not in columns:
         raise ValueError(f"the records of {cls.id} lack the paper's algorithm {paper!r}")
     others = [name for name in columns if name != paper]
@@ -258,7 +257,7 @@ def _two_lines(record: Record | None, scale: float) -> str:
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
-def overview_markdown(found: Mapping[str, Sequence[Record]]) -> str:
+def overview_markdown(found: Sequence[Benchmarked]) -> str:
     """Both tables over all environments."""
     lines: list[str] = []
     for grid in (summary(found), harm(found)):
@@ -266,14 +265,16 @@ def overview_markdown(found: Mapping[str, Sequence[Record]]) -> str:
     return "\n".join(lines[:-1])
 
 
-def comparison_markdown(comparison: Comparison, records: Sequence[Record], picture: str, command: str) -> str:
+def comparison_markdown(comparison: Comparison, measured: Benchmarked, picture: str, command: str) -> str:
     """Tables and picture of one environment, with the command that made the records."""
+    records, paper = measured.records, measured.problem.paper
     first = records[0]
     episodes = sorted({record.episodes for record in records})
     count = str(episodes[0]) if len(episodes) == 1 else f"{episodes[0]} to {episodes[-1]}"
     scenarios = dict.fromkeys(record.scenario for record in records)
     lines: list[str] = [
-        f"* {ranking_sentence([r for r in records if r.scenario == scenario])}" for scenario in scenarios
+        f"* {ranking_sentence([r for r in records if r.scenario == scenario], paper)}"
+        for scenario in scenarios
     ]
     lines.append("")
     for grid in comparison.grids:

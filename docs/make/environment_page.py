@@ -13,8 +13,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import make_task, task_class
+from filtergym.baselines.problem import Problem
+from filtergym.envs.catalogue import make_task
 from filtergym.envs.observation import Block
 from filtergym.envs.parameters import Limits, declared
 from filtergym.envs.task import Task
@@ -143,8 +143,8 @@ def _first_sentence(maker: Any) -> str:
     return " ".join(paragraph.split()).replace("``", "`")
 
 
-def _policies(cls: type[Task]) -> list[str]:
-    known = baselines_of(cls.id)
+def _policies(problem: Problem) -> list[str]:
+    known = problem.baselines
     roles = {known.score_paper: " (score 0)", known.score_reference: " (score 1)"}
     rows = []
     for name, maker in known.policies.items():
@@ -166,23 +166,23 @@ TABLES = {
     "measurement": _measurement,
     "parameters": _parameters,
     "scenarios": _scenarios,
-    "policies": _policies,
 }
+"""Of the task, by the names of their markers; that of the policies stands beside them."""
 
 
-def environment_tables(id: str) -> dict[str, str]:
+def environment_tables(problem: Problem) -> dict[str, str]:
     """Make the tables of an environment, by the names of their markers, in Markdown."""
-    cls = task_class(id)
-    return {name: "\n".join(make(cls)) for name, make in TABLES.items()}
+    tables = {name: make(problem.task) for name, make in TABLES.items()}
+    return {name: "\n".join(lines) for name, lines in {**tables, "policies": _policies(problem)}.items()}
 
 
-def put_tables(id: str, page: Path) -> Sequence[str]:
+def put_tables(problem: Problem, page: Path) -> Sequence[str]:
     """Put those tables into a page that it has markers for, and return their names.
 
     Raises:
         ValueError: if the page does not exist or has none of the markers.
     """
-    tables = environment_tables(id)
+    tables = environment_tables(problem)
     wanted: Iterable[str] = [name for name in tables if name in markers_of(page)]
     if not wanted:
         first = next(iter(tables))

@@ -3,13 +3,11 @@
 from collections.abc import Callable
 
 from filtergym.agents.named_policies import shipped_agents
-from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.tuning import tuned_names
-from filtergym.envs.catalogue import task_class
-from filtergym.evaluation.metrics import Record
+from filtergym.baselines.problem import Problem
+from filtergym.evaluation.metrics import Record, tidy_records
 from filtergym.papers.grid import markdown_table
 
-from filtergym.names import evaluate, tidy_records
+from filtergym.names import competitors_of
 from filtergym.reports.ranking import ranking_sentence
 from filtergym.reports.tables import (
     INCONSISTENT,
@@ -25,30 +23,27 @@ MARKER = "room table"
 """What the markers of a page are called, between which the table stands."""
 
 
-def room_policies(id: str) -> list[str]:
+def room_policies(problem: Problem) -> list[str]:
     """Names in the room table: everything that has a name, but random actions."""
-    paper_of(id)  # there is no room without it
-    known = baselines_of(id)
-    names = [*known.names, *tuned_names(id), *shipped_agents(id)]
-    return [name for name in names if name != "random"]
+    return [name for name in (*problem.names, *shipped_agents(problem.id)) if name != "random"]
 
 
-def measure_room(id: str, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
+def measure_room(problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
     """Evaluate everything that the room table shows, on the test split of the default scenario."""
-    return tidy_records(
-        evaluate(task_class(id).id, room_policies(id), None, episodes, seed, progress=progress)
-    )
+    makers = competitors_of(problem, room_policies(problem))
+    dataset = problem.evaluate(makers, None, episodes, seed, progress=progress)
+    return tidy_records(dataset, problem.baselines.metrics)
 
 
-def room_markdown(records: list[Record], command: str) -> str:
-    """Return the room table as Markdown, with the command that makes it."""
+def room_markdown(records: list[Record], paper: str, command: str) -> str:
+    """Return the room table as Markdown, with the paper's algorithm and the command that makes the table."""
     first = records[0]
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
     units = {r.component: r.unit for r in records if r.metric == "rmse"}
     header = [
         "policy",
-        f"cost against `{paper_of(first.environment)}`, %",  # what a narrow screen shows without scrolling
+        f"cost against `{paper}`, %",  # what a narrow screen shows without scrolling
         "median, %",
         "wins, %",
         "control",
@@ -74,8 +69,9 @@ def room_markdown(records: list[Record], command: str) -> str:
             ]
         )
     note = (
-        f"{ranking_sentence(records)} Lowest cost first; median and wins are of the cost of each episode. ANEES is the "
-        f"mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a factor of two.\n\n"
+        f"{ranking_sentence(records, paper)} Lowest cost first; median and wins are of the cost of each episode. "
+        f"ANEES is the mean NEES over the dimension; {INCONSISTENT} marks a covariance that is off by more than a "
+        "factor of two.\n\n"
         f"Scenario `{first.scenario}`, {first.episodes} episodes of the {first.split} split, "
         f"95 % bootstrap intervals. Made by `{command}`."
     )

@@ -16,9 +16,7 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 from filtergym.agents.training_run import TrainingRun, best_agent, load_run
-from filtergym.baselines.catalogue import baselines_of, paper_of
-from filtergym.baselines.problem import Problem, problem_of
-from filtergym.baselines.tuning import tuned_names
+from filtergym.baselines.problem import Problem
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import CONFIDENCE, Bootstrap, Estimate
 from filtergym.evaluation.code import files_digest
@@ -184,7 +182,7 @@ def _algorithm(run: TrainingRun) -> str:
 def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
     """Picture of every run's validations, 1 or 2 columns of a paper wide; a dot marks its best agent."""
     first = runs[0].run
-    paper = paper_of(first.environment)
+    paper = first.problem.paper
     for member in runs:
         entries = member.run.validation
         if not entries or not all(entry.get("relative_cost_difference") for entry in entries):
@@ -198,12 +196,12 @@ def learning_curves(runs: Sequence[SeedRun], columns: int = 2) -> Any:
     return draw_learning_curves(curves, title, paper, columns=columns)
 
 
-def default_opponents(id: str) -> list[str]:
+def default_opponents(problem: Problem) -> list[str]:
     """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
-    known = baselines_of(id)
+    known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
-    tuned = tuned_names(id)
-    return list(dict.fromkeys([paper_of(id), *known.compared, *untuned, *tuned, *known.references]))
+    names = [problem.paper, *known.compared, *untuned, *problem.tuned, *known.references]
+    return list(dict.fromkeys(names))
 
 
 class Study(NamedTuple):
@@ -221,7 +219,7 @@ class Study(NamedTuple):
     @property
     def problem(self) -> Problem:
         """That all runs are of."""
-        return problem_of(self.runs[0].run.environment)
+        return self.runs[0].run.problem
 
 
 def episode_means(
@@ -274,7 +272,7 @@ def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work
     """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
     problem = study.problem
     makers = {member.name: find_competitor(problem, str(member.agent), study.trust) for member in study.runs}
-    for name in dict.fromkeys([paper_of(problem.id), *study.opponents]):
+    for name in dict.fromkeys([problem.paper, *study.opponents]):
         makers[name] = find_competitor(problem, name, study.trust)
         if kind_of(makers[name]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
@@ -286,7 +284,7 @@ def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work
         # A learned estimator has a filter of its own, and steers nothing.
         control = member.run.control if member and kind_of(maker) == "policy" else None
         experiment = problem.experiment(scenario, study.episodes, study.seed, study.split, control)
-        meaning = meaning_of(problem, paper_of(problem.id) if member else name)
+        meaning = meaning_of(problem, problem.paper if member else name)
         work = None
         if meaning is not None:
             agent = hashlib.sha256(member.agent.read_bytes()).hexdigest() if member else ""
@@ -325,8 +323,8 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
     Intervals are 95 % bootstraps over episodes, in which the median is taken anew in every resample; only
     the mean's interval is over training seeds as well (:func:`spread`).
     """
-    runs, id = study.runs, study.problem.id
-    paper, reference = paper_of(id), study.problem.baselines.score_reference
+    runs, problem = study.runs, study.problem
+    paper, reference = problem.paper, problem.baselines.score_reference
     episodes = len(means.cost[paper])
     bootstrap = Bootstrap(episodes)
     cost = {name: bootstrap.means(values) for name, values in means.cost.items()}
@@ -347,7 +345,7 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
         """Keep an estimate, or the interval of a statistic and its resamples."""
         estimate = values if isinstance(values, Estimate) else bootstrap.interval(values)
         value, low, high = (float(x) if numpy.isfinite(x) else None for x in estimate)
-        where = (id, scenario, study.split, study.seed, episodes)
+        where = (problem.id, scenario, study.split, study.seed, episodes)
         what = (policy, statistic, against, metric, component)
         found.append(Comparison(*where, *what, value, low, high, means.units.get(component, "1")))
 
@@ -401,14 +399,14 @@ def compare(study: Study, means: EpisodeMeans, scenario: str) -> list[Comparison
 def comparison_grids(runs: Sequence[SeedRun], comparisons: Sequence[Comparison]) -> list[Grid]:
     """Tables of one scenario: every run and opponent; the spread of each algorithm; medians and opponents."""
     first = comparisons[0]
-    paper = paper_of(first.environment)
+    problem = runs[0].run.problem
+    paper, references = problem.paper, problem.baselines.references
     found = {(c.policy, c.statistic, c.against, c.metric, c.component): c for c in comparisons}
     units = {c.component: c.unit for c in comparisons if c.metric == "rmse"}
     errors = [f"RMSE {name.replace('_', ' ')}, {unit}" for name, unit in units.items()]
     scored = {c.against for c in comparisons if c.metric == "score"}
     policies = {c.policy: c.statistic for c in comparisons if c.metric == "rmse"}
     opponents = [name for name, statistic in policies.items() if statistic == "opponent"]
-    references = baselines_of(first.environment).references
     algorithms = dict.fromkeys(member.algorithm for member in runs)
     steps = {member.name: f"{member.run.best['steps']:,}" for member in runs if member.run.best}
 

@@ -1,7 +1,7 @@
 """Commands that search for something better: tuned values and trained agents."""
 
-import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -10,9 +10,10 @@ import typer
 from ..agents import training_run
 from ..agents.export import export_run
 from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
-from ..agents.training_run import TrainingRun, best_agent
+from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
 from ..baselines.problem import problem_of
-from ..baselines.tuning import FOLDER, read_table, save_tuned, table_path, tune
+from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
+from ..baselines.tuning import Search, tune
 from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
@@ -31,6 +32,9 @@ from .terminal import (
     progress_bar,
     whole_numbers,
 )
+
+Trainer = Callable[[TrainingRun, Session], TrainingRun]
+"""What trains a run."""
 
 
 def tune_policy(
@@ -57,16 +61,12 @@ def tune_policy(
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
         line = bar.add_task(f"tuning {policy}", total=budget)
         outcome = tune(
-            problem.id,
+            problem,
             policy,
-            tunable[policy],
-            budget,
-            scenario,
-            seed,
-            progress=lambda steps: bar.update(line, advance=steps),
-            backend=backend,
-            workers=workers,
-            store=Store(table.with_name(UNFINISHED)),
+            Search(budget, scenario, seed, backend=backend),
+            lambda steps: bar.update(line, advance=steps),
+            workers,
+            Store(table.with_name(UNFINISHED)),
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
@@ -74,8 +74,8 @@ def tune_policy(
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
-def _trainer(algo: str, trust: bool = False) -> Any:
-    """Return what trains with an algorithm.
+def _trainer(algo: str) -> Trainer:
+    """Return what trains with an algorithm: a run and a session in, the run out.
 
     Raises:
         ValueError: if it needs packages that are not installed.
@@ -86,9 +86,7 @@ def _trainer(algo: str, trust: bool = False) -> Any:
         if algo in THROUGH_THE_FILTER:
             from ..agents.bptt import train_bptt as trainer
         else:
-            from ..agents.sb3_training import train_sb3
-
-            trainer = functools.partial(train_sb3, trust=trust)
+            from ..agents.sb3_training import train_sb3 as trainer
     except ImportError as error:
         raise ValueError(
             f"training needs more packages: pip install 'filtergym[agents]' ({error})"
@@ -101,27 +99,24 @@ class _Training(NamedTuple):
     """A run that is to be trained, or trained on."""
 
     run: TrainingRun
-    folder: Path
-    begun: bool
-    validate_every: int | None
-    trust: bool
+    session: Session
 
 
-def _one_by_one(waiting: Mapping[Path, _Training], trainer: Any, several: bool) -> dict[Path, TrainingRun]:
+def _one_by_one(
+    waiting: Mapping[Path, _Training], trainer: Trainer, several: bool
+) -> dict[Path, TrainingRun]:
     """Train in this process, up to a wish to stop."""
-    for folder, (run, _, begun, validate_every, _) in waiting.items():
+    for folder, (run, session) in waiting.items():
         if several:
             console.print(f"{folder}: seed {run.seed}")
         with progress_bar() as bar:
             line = bar.add_task(f"training {run.algorithm}", total=run.steps)
-            trainer(
-                run,
-                folder,
-                begun,
-                validate_every,
+            told = replace(
+                session,
                 progress=lambda done, bar=bar, line=line: bar.update(line, completed=done),
                 report=lambda text: console.print(text, highlight=False),
             )
+            trainer(run, told)
         _print_done(folder, run)
         if not run.finished:
             break
@@ -141,7 +136,7 @@ def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[P
                 raise ValueError(
                     f"{folder} is not here: the machines of a cluster must share the folder of a run"
                 )
-            found[folder] = training_run.load_run(folder, work[i].trust)
+            found[folder] = training_run.load_run(folder, work[i].session.trust)
             console.print(f"{folder}: seed {found[folder].seed}")
             for text in lines:
                 console.print(text, highlight=False)
@@ -152,10 +147,7 @@ def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[P
 def _trained(training: _Training, tick: Any) -> list[str]:
     """Train in a process of its own; returns what there is to say."""
     lines: list[str] = []
-    run, folder, begun, validate_every, trust = training
-    _trainer(run.algorithm, trust)(
-        run, folder, begun, validate_every, progress=lambda done: None, report=lines.append
-    )
+    _trainer(training.run.algorithm)(training.run, replace(training.session, report=lines.append))
     return lines
 
 
@@ -231,7 +223,7 @@ def train(
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo bptt --seeds 0-4 --out runs/bptt
     """
-    trainer = _trainer(algo, trust)
+    trainer = _trainer(algo)
     if seeds is not None and (seed is not None or resume):
         raise ValueError(
             "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
@@ -242,22 +234,24 @@ def train(
     if reward is not None:
         keywords["reward"] = reward
 
+    problem = problem_of(environment)
+    options = RunOptions(
+        algo,
+        control,
+        steps,
+        envs,
+        seed or 0,
+        scenario,
+        hyperparameters,
+        keywords,
+        config,
+        backend,
+        residual_to,
+        gated,
+    )
+
     def asked(number: int) -> TrainingRun:
-        return training_run.new_run(
-            environment,
-            algo,
-            control,
-            steps,
-            envs,
-            number,
-            scenario,
-            hyperparameters,
-            backend,
-            keywords,
-            config,
-            residual_to,
-            gated,
-        )
+        return training_run.new_run(problem, replace(options, seed=number))
 
     # Every run is opened before any is trained, so that a wrong word costs nothing.
     runs: dict[Path, tuple[TrainingRun, bool]] = {}
@@ -279,7 +273,7 @@ def train(
         if begun and run.finished:
             console.print(f"{folder} is finished: {run.steps_done:,} steps")
         else:
-            waiting[folder] = _Training(run, folder.absolute(), begun, validate_every, trust)
+            waiting[folder] = _Training(run, Session(folder.absolute(), begun, validate_every, trust))
     with Workers(jobs, cluster) as workers:
         done = (
             _one_by_one(waiting, trainer, seeds is not None)
@@ -334,14 +328,10 @@ def search(
         raise nearest("algorithm", algo, training_run.FILES)
     problem = problem_of(environment)
     wanted = searching.Search(
-        problem.name,
-        algo,
-        control,
-        scenario,
+        problem,
+        RunOptions(algo, control, scenario=scenario, overrides=hyperparameters, keywords=keywords),
         steps,
         tuple(whole_numbers("--seeds", seeds)),
-        keywords,
-        hyperparameters,
         searching.read_space(problem.id, algo, space),
         seed,
     )

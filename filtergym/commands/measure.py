@@ -269,7 +269,7 @@ def evaluate_policies(
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
     of_flights = flight_records(dataset) if each else []
     tables = [flights_table(dataset, of_flights, records, console.width)] if of_flights else []
-    tables += results_tables(records, console.width) if judged else [recorded_table(records)]
+    tables += results_tables(records, problem.knows, console.width) if judged else [recorded_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])
     if out is not None and curves is not None:
@@ -286,7 +286,10 @@ def evaluate_policies(
                 for suffix in formats:
                     save(figure, waiting / f"{name}.{suffix}")
             if judged:
-                result, made = result_of(dataset, records, curves, learned), settings_of(command_line())
+                result, made = (
+                    result_of(problem, dataset, records, curves, learned),
+                    settings_of(command_line()),
+                )
                 write_results(waiting / RESULTS, [result], made)
         store.clear()
     for table in tables:
@@ -473,7 +476,7 @@ def benchmark(
 
         def finished(result: Result) -> None:
             if details:
-                print_results(result.records)
+                print_results(result.records, result.knows)
 
         def drawn(cell: Cell, curves: xarray.Dataset) -> None:
             figures = (
@@ -500,7 +503,7 @@ def benchmark(
             workers=workers,
         )
     tables = [headline_table(results)]
-    tables += [table for result in results for table in results_tables(result.records, console.width)]
+    tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
     with whole_files(out) as waiting:
         records_as_csv(waiting / "records.csv", all_records(results))
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))

@@ -1,6 +1,6 @@
 """What several commands print of results, and the report that they make of them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ..evaluation.files import write_text
@@ -14,9 +14,14 @@ from .terminal import console
 REPORT = "report.html"
 
 
-def print_results(records: Sequence[Record]) -> None:
-    """Print the comparison of one environment and scenario, in as many tables as the terminal is narrow."""
-    for table in results_tables(records, console.width):
+def print_results(records: Sequence[Record], knows: Mapping[str, str]) -> None:
+    """Print the comparison of one environment and scenario, in as many tables as the terminal is narrow.
+
+    Args:
+        records: of all competitors.
+        knows: what references and bounds know, by their names.
+    """
+    for table in results_tables(records, knows, console.width):
         console.print(table)
 
 

@@ -12,7 +12,7 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import catalogue, short_name
+from ..envs.catalogue import catalogue
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
@@ -59,7 +59,7 @@ class Cell(NamedTuple):
     @property
     def name(self) -> str:
         """Start of the names of the cell's files."""
-        return f"{short_name(self.environment)}.{self.scenario}"
+        return f"{self.problem.short_name}.{self.scenario}"
 
     @property
     def measurements(self) -> int:
@@ -118,27 +118,29 @@ def cells(full: bool, environments: Sequence[str] = (), split: str = "test") -> 
 
 
 def result_of(
-    dataset: xarray.Dataset, records: list[Record], curves: xarray.Dataset, learned: Sequence[str]
+    problem: Problem,
+    dataset: xarray.Dataset,
+    records: list[Record],
+    curves: xarray.Dataset,
+    learned: Sequence[str],
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
     Args:
+        problem: that was evaluated.
         dataset: the evaluation, of whose variables only those of the track are needed, which ``drawn_episodes`` keeps.
         records: of it, tidy.
         curves: of it; those of what is shown are kept.
         learned: names that stand for something learned, those of competitors among them.
     """
-    id, scenario = dataset.attrs["environment"], dataset.attrs["scenario"]
-    problem = problem_of(id)
-    cls, known = problem.task, problem.baselines
+    cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
     shown = shown_competitors(records, paper, reference, learned)
     components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
-    told = {**known.references, **known.bounds}
     named = cls.scenarios.get(scenario)
     return Result(
-        id,
+        problem.id,
         scenario,
         named.description if named else "",
         scenario == cls.default_scenario,
@@ -146,7 +148,7 @@ def result_of(
         paper if paper in names else "",
         reference if reference in names else "",
         [name for name in names if name in learned],
-        {name: told[name].knows for name in names if name in told},
+        {name: knows[name] for name in names if name in knows},
         notes_of(dataset),
         records,
         thinned(curves.sel(policy=shown)),
@@ -218,7 +220,7 @@ def run_benchmark(
             everyone = [found[i].pop(name) for name in cell.policies]
             records, curves, head = combine_summaries(everyone)
             drawn(cell, curves)
-            results[i] = result_of(head, records, curves, shipped_agents(cell.environment))
+            results[i] = result_of(cell.problem, head, records, curves, shipped_agents(cell.environment))
         while told < len(results) and (due := results[told]) is not None:
             finished(due)
             told += 1

@@ -116,7 +116,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "episodes": first.episodes,
         "split": first.split,
         "seed": first.seed,
-        "sentence": ranking_sentence(result.records, result.learned, result.paper),
+        "sentence": ranking_sentence(result.records, result.paper, result.learned),
         "header": header,
         "rows": rows,
         "figures": _figures(result),

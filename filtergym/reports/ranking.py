@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ..agents.named_policies import shipped_agents
-from ..baselines.catalogue import baselines_of
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .results import Result
@@ -69,18 +68,15 @@ def who_is_best(records: Sequence[Record], learned: Sequence[str] | None = None)
     return f"{where} best"
 
 
-def ranking_sentence(
-    records: Sequence[Record], learned: Sequence[str] | None = None, paper: str | None = None
-) -> str:
+def ranking_sentence(records: Sequence[Record], paper: str, learned: Sequence[str] | None = None) -> str:
     """Say who is best, by how much, and how the strongest of another origin stands to it.
 
     Args:
         records: of the scenario.
+        paper: name of the paper's algorithm.
         learned: as of :func:`ranking`.
-        paper: name of the paper's algorithm; default: the environment's.
     """
     first = records[0]
-    paper = baselines_of(first.environment).score_paper if paper is None else paper
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
     places = ranking(records, learned)
     if not places:

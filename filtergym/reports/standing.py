@@ -14,8 +14,6 @@ from rich.table import Table
 from ..agents import training_run
 from ..agents.named_policies import learned_policy
 from ..agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
-from ..baselines.problem import problem_of
-from ..envs.catalogue import make_task
 from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap, Estimate
 from ..evaluation.competitors import RandomPolicy
@@ -53,7 +51,7 @@ class Opponents:
     """
 
     def __init__(self, run: TrainingRun) -> None:
-        self.problem = problem_of(run.environment)
+        self.problem = run.problem
         known = self.problem.baselines
         self.paper = known.score_paper
         self.episodes = TrainingEpisodes(run, training_run.VALIDATION_EPISODES, validation_backend(run))
@@ -83,7 +81,7 @@ class Opponents:
         names = [n for n, maker in makers.items() if n != self.paper and maker is not RandomPolicy]
         if not names:
             return None
-        horizon = make_task(run.environment, run.control, **training_run.task_keywords(run)).horizon
+        horizon = run.make_task().horizon
         each = len(names) * len(self.episodes.weights) * horizon * known.measurement_seconds
         few = max(FEWEST_SCREENED, int(SCREENING_SECONDS / each))
         screened = {n: self.episodes.means(makers[n], episodes=few)["cost"].mean() for n in names}
@@ -108,7 +106,7 @@ def agent_standing(
     Raises:
         ValueError: if the agent cannot be read, or takes ``trust``.
     """
-    competitor = learned_policy(run.environment, str(agent), trust)
+    competitor = learned_policy(run.problem.task, str(agent), trust)
     return Standing(name, "agent", opponents.measured(competitor), run.beat_paper)
 
 

@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Table
 
-from ..baselines.catalogue import baselines_of
-from ..baselines.tuning import Tuned
+from ..baselines.tuned_values import Tuned
 from ..evaluation.competitors import RANKED
 from ..offline import Written
 
@@ -109,11 +108,12 @@ def ranked(records: Sequence[Any]) -> list[tuple[str, str, str]]:
     return sorted(found, key=place)
 
 
-def results_tables(records: Sequence[Any], width: int) -> list[Table]:
+def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int) -> list[Table]:
     """Compare competitors, lowest cost first: cost against the paper's algorithm, consistency, score, and errors.
 
     Args:
         records: tidy records of one environment and scenario.
+        knows: what references and bounds know, by their names.
         width: columns of the terminal. What does not fit beside each other stands below: the errors in tables of their
             own, so that no number is cut.
     """
@@ -160,8 +160,6 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
         each = [_of_competitors(names, {title: error}, False) for title, error in errors.items()]
         tables += each if beside is None else [beside]
     tables[0].title = title
-    known = baselines_of(first.environment)
-    told = {**known.references, **known.bounds}
     notes = [
         "median, wins: of the cost of each episode against the paper's algorithm. "
         f"ANEES: 1 if errors are as large as the covariance says; {INCONSISTENT}: off by more than a factor of two.",
@@ -172,7 +170,7 @@ def results_tables(records: Sequence[Any], width: int) -> list[Table]:
         notes.append(
             "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."
         )
-    notes += [f"{name} knows {told[name].knows}." for name, *_ in names if name in told]
+    notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
     tables[-1].caption = "\n".join(notes)
     return tables
 

@@ -6,7 +6,6 @@ import json
 from ..agents.learned_policy import pretrained_path
 from ..agents.named_policies import shipped_agents
 from ..baselines.problem import Problem, problem_of
-from ..baselines.tuning import stored_values
 from ..envs.catalogue import short_name
 from ..evaluation.evaluate import Experiment
 from ..evaluation.store import Work
@@ -42,7 +41,7 @@ def meaning_of(problem: Problem, name: str) -> str | None:
     if problem.name != problem.id:
         return None
     if name in problem.tuned:
-        return json.dumps(stored_values(problem.id, name.removesuffix("-tuned"))[0])
+        return json.dumps(problem.tuned_values.values(name.removesuffix("-tuned"))[0])
     if name in shipped_agents(problem.id):
         return hashlib.sha256(pretrained_path(problem.id, name).read_bytes()).hexdigest()
     return name if name in problem.baselines.names else None

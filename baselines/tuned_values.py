@@ -1,0 +1,183 @@
+"""Tuned values of policies and estimators as they are stored: one's own in ``tuned/``, and those that are shipped."""
+
+import json
+import math
+import reprlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..envs.catalogue import nearest, short_name
+from ..envs.task import Task
+from ..evaluation.competitors import Kind
+from ..evaluation.files import write_text
+from ..evaluation.stored import fits, read_json
+from .table import Tunable
+
+FOLDER = Path("tuned")
+"""Where tuned values of one's own are kept, below the working directory."""
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Outcome of a search."""
+
+    environment: str
+    policy: str
+    scenario: str
+    values: dict[str, float]
+    cost: float
+    """Mean cost on the validation split."""
+    untuned_cost: float
+    environment_steps: int
+    seed: int
+
+
+class TunedPolicy(NamedTuple):
+    """A policy or estimator with tuned values, some of which belong to the task."""
+
+    task_keywords: dict[str, Any]
+    control: str | None
+    make: Callable[[Task], Any]
+
+    @property
+    def kind(self) -> Kind:
+        """What it makes."""
+        return "policy" if self.control else "estimator"
+
+    def __call__(self, task: Task) -> Any:
+        """Make the policy or estimator for a task."""
+        return self.make(task)
+
+
+@dataclass(frozen=True)
+class TunedValues:
+    """What is stored of an environment's policies and estimators; files are read when they are asked for."""
+
+    environment: str
+    """Gymnasium id."""
+    tunable: Mapping[str, Tunable]
+    places: Sequence[Any]
+    """Files of tuned values, one's own first."""
+
+    def _tables(self) -> Iterator[tuple[Any, dict[str, dict[str, Any]]]]:
+        """Files and what they say."""
+        for place in self.places:
+            yield place, read_table(place)
+
+    def names(self) -> list[str]:
+        """Return ``NAME-tuned`` of every tunable policy that has stored values."""
+        tables = [table for _, table in self._tables()]
+        return [f"{policy}-tuned" for policy in self.tunable if any(policy in table for table in tables)]
+
+    def best_policy(self, control: str | None = None) -> str | None:
+        """Return ``NAME-tuned`` of the policy that cost least on the validation split; None if none was tuned.
+
+        Args:
+            control: only policies of this control; estimators have none and are left out anyway.
+        """
+        entries: dict[str, dict[str, Any]] = {}
+        for _, table in reversed(list(self._tables())):  # one's own go before those that are shipped
+            entries |= table
+        found = {
+            f"{policy}-tuned": entries[policy].get("validation_cost", math.inf)
+            for policy, tunable in self.tunable.items()
+            if policy in entries and tunable.control is not None and control in (None, tunable.control)
+        }
+        return min(found, key=lambda name: found[name], default=None)
+
+    def values(self, policy: str) -> tuple[dict[str, float], str]:
+        """Return tuned values and the file in which they stand.
+
+        Raises:
+            ValueError: if the policy was never tuned, or the file that should say so is broken.
+        """
+        for place, table in self._tables():
+            if policy in table:
+                return self._checked(table[policy].get("values"), policy, place), str(place)
+        raise ValueError(
+            f"no tuned values of policy {policy!r}: run filtergym tune {self.environment} --policy {policy}"
+        )
+
+    def _checked(self, values: Any, policy: str, place: Any) -> dict[str, float]:
+        """Raise ValueError if values are not those of a policy, within the limits of the search."""
+        limits = self.tunable[policy].limits
+        if not fits(values, dict[str, float]) or values.keys() != limits.keys():
+            raise ValueError(
+                f"{place} must give policy {policy!r} a number for each of {', '.join(limits)}, got "
+                f"{reprlib.repr(values)}: tune it again, or remove the file"
+            )
+        for name, (low, high) in limits.items():
+            # Values are stored rounded, so that one at a limit can lie just beyond it.
+            if not min(low, rounded(low)) <= values[name] <= max(high, rounded(high)):
+                raise ValueError(
+                    f"{place}: {name} of policy {policy!r} must be from {low:g} to {high:g}, got {values[name]!r}"
+                )
+        return values
+
+    def competitor(self, policy: str) -> TunedPolicy:
+        """Return what makes a policy with its stored values for a task.
+
+        Raises:
+            ValueError: if it cannot be tuned, or never was.
+        """
+        if policy not in self.tunable:
+            raise nearest("tunable policy", policy, self.tunable)
+        tunable = self.tunable[policy]
+        keywords, make = tunable.apply(self.values(policy)[0])
+        return TunedPolicy(keywords, tunable.control, make)
+
+
+def rounded(value: float) -> float:
+    """Six digits, as tuned values are stored."""
+    return float(f"{value:.6g}")
+
+
+def read_table(place: Any) -> dict[str, dict[str, Any]]:
+    """Return what a file says of tuned policies; nothing if there is none.
+
+    Raises:
+        ValueError: if it is not such a file.
+    """
+    try:
+        table = read_json(place)
+    except FileNotFoundError:
+        return {}
+    if not fits(table, dict[str, dict[str, Any]]):
+        raise ValueError(f"{place} is not a table of tuned policies: correct or remove it")
+    return table
+
+
+def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
+    """Put tuned values into the environment's file in a folder, which is returned.
+
+    Args:
+        outcome: of a search.
+        command: that made it.
+        folder: of such files.
+    """
+    path = table_path(outcome.environment, folder)
+    existing = path.read_text(encoding="utf-8") if path.exists() else None
+    write_text(path, merged_table(existing, outcome, command))
+    return path
+
+
+def merged_table(existing: str | None, outcome: Tuned, command: str) -> str:
+    """JSON text of a table of tuned values with one policy's replaced."""
+    table: dict[str, Any] = json.loads(existing) if existing else {}
+    table[outcome.policy] = {
+        "values": outcome.values,
+        "scenario": outcome.scenario,
+        "validation_cost": outcome.cost,
+        "untuned_validation_cost": outcome.untuned_cost,
+        "environment_steps": outcome.environment_steps,
+        "seed": outcome.seed,
+        "command": command,
+    }
+    return json.dumps(table, indent=1, sort_keys=True) + "\n"
+
+
+def table_path(id: str, folder: Path = FOLDER) -> Path:
+    """File of an environment's tuned values in a folder."""
+    return folder / f"{short_name(id)}.json"
