@@ -164,7 +164,8 @@ def seeds(
         check_formats([curves.suffix.removeprefix(".").lower()])
     found = training_seeds.load_runs(runs, trust)
     problem = found[0].run.problem
-    scenarios = [find_scenario(problem.task, name).name for name in scenario or [None]]
+    names: list[str | None] = [*scenario] if scenario else [None]
+    scenarios = [find_scenario(problem.task, name).name for name in names]
     opponents = policy or training_seeds.default_opponents(problem)
     marker = f"seeds {problem.short_name}"
     for file in (out, curves):

@@ -102,6 +102,15 @@ class _Training(NamedTuple):
     session: Session
 
 
+def _session_with(session: Session, bar: Progress, line: TaskID) -> Session:
+    """Return the session with its progress and reports on the console."""
+    return replace(
+        session,
+        progress=lambda done: bar.update(line, completed=done),
+        report=lambda text: console.print(text, highlight=False),
+    )
+
+
 def _one_by_one(
     waiting: Mapping[Path, _Training], trainer: Trainer, several: bool
 ) -> dict[Path, TrainingRun]:
@@ -111,12 +120,7 @@ def _one_by_one(
             console.print(f"{folder}: seed {run.seed}")
         with progress_bar() as bar:
             line = bar.add_task(f"training {run.algorithm}", total=run.steps)
-            told = replace(
-                session,
-                progress=lambda done, bar=bar, line=line: bar.update(line, completed=done),
-                report=lambda text: console.print(text, highlight=False),
-            )
-            trainer(run, told)
+            trainer(run, _session_with(session, bar, line))
         _print_done(folder, run)
         if not run.finished:
             break
