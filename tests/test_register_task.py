@@ -248,14 +248,7 @@ def fail(*_):
             r"block 'more' must be numbers of shape \(\.\.\., 24\).*got float",
         ),
         (with_bank(blocks=further(lambda s, _: np.nan * rows(s, _)[0])), "block 'more' must be finite"),
-<<<<<<< HEAD
-        (
-            with_bank(blocks=further(fail)),
-            r"fails in block 'more': KeyError: 'gamma' \(test_register_task.py, line \d+\)",
-        ),
-=======
         (with_bank(blocks=further(fail)), r"fails in block 'more': KeyError: 'gamma' \(test_register_task"),
->>>>>>> battery
         (
             with_bank(quantities=(Quantity("q", "m", "", lambda read: np.ones(3)),)),
             r"quantity 'q' .* got \(3,\)",
