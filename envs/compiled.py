@@ -298,7 +298,8 @@ class _Compiled(Task):
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
         functions, threads = self.programs, self.threads
-        feedback = self.run(_feedback, episode.filter, episode.measurement)
+        given = episode.filter, episode.measurement
+        feedback = self.filter.feedback(*given) if self.filter.in_python else self.run(_feedback, *given)
         truth, measurement = functions.advanced(episode.truth, feedback, noise, threads=threads)
         state, _ = functions.predicted(episode.filter, measurement, threads=threads)
         return Episode(truth, measurement, state)

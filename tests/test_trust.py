@@ -212,7 +212,7 @@ def test_what_nobody_expected_is_a_sentence(monkeypatch, command):
     monkeypatch.setattr("filtergym.commands.measure.summaries", broken)
     code, _, errors = command("evaluate", ID, "--policy", "imm")
     assert (code, errors.count("\n")) == (1, 1)
-    assert "Error: unexpected KeyError: 'lost'; --debug shows where" in errors
+    assert "Error: unexpected KeyError: 'lost' (test_trust.py, line " in errors
     assert "please report it" in errors
     monkeypatch.setattr("sys.argv", ["filtergym", "evaluate", ID, "--policy", "imm", "--debug"])
     with pytest.raises(KeyError, match="lost"):
