@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
+from rich.progress import Progress, TaskID
 
 from ..agents import training_run
 from ..agents.export import export_run
