@@ -118,8 +118,8 @@ class Problem:
             **keywords: likewise.
         """
         known = self.baselines
-        standards: dict[str, Any] = {"paper": known.score_paper, "reference": known.score_reference}
-        return evaluate(self.name, competitors, *arguments, **standards, **keywords)
+        keywords |= {"paper": known.score_paper, "reference": known.score_reference}
+        return evaluate(self.name, competitors, *arguments, **keywords)
 
 
 def problem_of(id: str) -> Problem:
