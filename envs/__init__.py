@@ -1,5 +1,5 @@
 """Tasks, their scenarios, and the Gymnasium classes over them.
 
-The contract stands in :mod:`.task`. A new environment is a module in :mod:`.tasks` and a table of scenarios
-in :mod:`.scenarios`; nothing else in this folder changes.
+The contract stands in :mod:`.task`, :mod:`.world` and :mod:`.filter`. A new environment is a folder of its own beside
+them, found by its name; nothing else in this folder changes.
 """

@@ -92,13 +92,15 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
             given: the same measurement, and what else this filter is given.
         """
 
-    @abstractmethod
     def mean(self, state: State) -> Array:
-        """Estimate of the task's components, after :meth:`update`, ``(C, N)``."""
+        """Estimate of the task's components, after :meth:`update`, ``(C, N)``; by default the state's ``mean``."""
+        mean: Array = state.mean  # type: ignore[attr-defined]
+        return mean
 
-    @abstractmethod
     def covariance(self, state: State) -> Array:
-        """Covariance that is reported for it, ``(C, C, N)``."""
+        """Covariance that is reported for it, ``(C, C, N)``; by default the state's ``covariance``."""
+        covariance: Array = state.covariance  # type: ignore[attr-defined]
+        return covariance
 
     def feedback(self, state: State, measurement: Any) -> Any:
         """Report what a closed loop gives back to the world, by default what follows from the estimate; None in an

@@ -63,9 +63,10 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
             feedback: of a closed loop, what :meth:`Filter.feedback` returned; else None.
         """
 
-    @abstractmethod
     def state(self, truth: Truth) -> Array:
-        """True values of the task's components, ``(C, N)``."""
+        """True values of the task's components, ``(C, N)``; by default the truth's ``state``."""
+        state: Array = truth.state  # type: ignore[attr-defined]
+        return state
 
     def received(self, measurement: Measurement) -> Measurement:
         """Return a measurement as an estimator is given it: NaN in place of every value that was not received.

@@ -81,14 +81,6 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
         likelihood = Likelihood.of(*told).filled() if told else state.likelihood
         return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
 
-    def mean(self, state: Estimated) -> Array:
-        """Last valid answer."""
-        return state.mean
-
-    def covariance(self, state: Estimated) -> Array:
-        """Covariance of it."""
-        return state.covariance
-
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
         """How likely the measurement was."""
         return state.likelihood._asdict()

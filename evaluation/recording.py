@@ -8,7 +8,6 @@ import numpy
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, import_task, opened
 from ..envs.filter import Filter, Initial, Input
-from ..envs.observation import Array
 from ..envs.recording import MOST_NUMBERS, Recording, measured_once
 from ..envs.recording_files import differing
 from ..envs.task import Episode, Task, named_arrays
@@ -29,14 +28,6 @@ class NoFilter(Filter[Task, Any, Initial]):
     def update(self, state: Initial, given: Input) -> Initial:
         """Learn nothing."""
         return state
-
-    def mean(self, state: Initial) -> Array:
-        """That of the start."""
-        return state.mean
-
-    def covariance(self, state: Initial) -> Array:
-        """That of the start."""
-        return state.covariance
 
 
 def record(

@@ -107,10 +107,6 @@ class PendulumWorld(World[Task, Truth, Measurement]):
         reading = state[:1] + p.angle_sigma * noise[1:]
         return truth._replace(state=state), Measurement(reading, feedback)
 
-    def state(self, truth: Truth) -> Array:
-        """Angle and rate."""
-        return truth.state
-
     def cost(self, truth: Truth, mean: Array) -> Array:
         """Squared angle, over the variance of the sensor: what matters is to stay upright."""
         return (truth.state[0] / self.parameters.angle_sigma) ** 2
@@ -174,14 +170,6 @@ class NoiseBank(Bank["InvertedPendulum", Measurement, Filter]):
         covariance = state.covariance + scale * task.Q[:, :, None]
         result = kalman.update(state.mean, covariance, measurement.angle, task.H, task.R)
         return state._replace(mean=result.mean, covariance=result.covariance, scale=scale)
-
-    def mean(self, state: Filter) -> Array:
-        """Angle and rate."""
-        return state.mean
-
-    def covariance(self, state: Filter) -> Array:
-        """Of the Kalman filter."""
-        return state.covariance
 
     def records(self, state: Filter, measurement: Measurement) -> dict[str, Array]:
         """NIS and the factor on the process noise."""

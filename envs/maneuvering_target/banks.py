@@ -289,10 +289,6 @@ class GainBank(_RadarBank):
         missed = f._replace(mean=xp.concat([f.predicted, f.mean[2:]]), since=measurement.elapsed)
         return self.seen(measurement, after, missed)
 
-    def mean(self, state: AlphaBeta) -> Array:
-        """Position and velocity, ``(4, N)``."""
-        return state.mean
-
     def covariance(self, state: AlphaBeta) -> Array:
         """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last
         would leave of which these know nothing: one as large as usual, and as the last innovations say.

@@ -257,11 +257,3 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
             deviation=deviation,
             correction=apply(frame, correction[2:]),
         )
-
-    def mean(self, state: Track) -> Array:
-        """Position and velocity, ``(4, N)``."""
-        return state.mean
-
-    def covariance(self, state: Track) -> Array:
-        """Covariance by the gain and the noises that were answered, ``(4, 4, N)``."""
-        return state.covariance

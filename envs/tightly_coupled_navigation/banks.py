@@ -306,14 +306,6 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             last_action=last_action,
         )
 
-    def mean(self, state: Filters) -> Array:
-        """Of the combination, ``(17, N)``."""
-        return state.mean
-
-    def covariance(self, state: Filters) -> Array:
-        """Of the combination, ``(17, 17, N)``."""
-        return state.covariance
-
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
         """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
         rate is beyond its aperture.

@@ -453,10 +453,6 @@ class NavigationWorld(World[Task, Truth, Measurement]):
 
     # --- judgement
 
-    def state(self, truth: Truth) -> Array:
-        """``(17, N)``, in the order of filters.gnss_ins."""
-        return truth.state
-
     def error_cost(self, error: Array) -> Array:
         """Squared position and velocity errors over those of a single-epoch fix."""
         p, x, v = self.parameters, error[gnss_ins.POSITION], error[gnss_ins.VELOCITY]

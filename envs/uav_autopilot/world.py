@@ -224,10 +224,6 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         )
         return truth, Measurement(number, reading, available, command, feedback)
 
-    def state(self, truth: Truth) -> Array:
-        """State of the plant, ``(n, N)``."""
-        return truth.state
-
     def seen(self, measurement: Measurement) -> Array:
         """Every coordinate that has a sensor."""
         sensors = list(self.task.sensors)
