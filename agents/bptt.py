@@ -190,7 +190,7 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
         run.envs,
         control=run.control,
         scenario=run.scenario,
-        reward=_descended(run),
+        reward=_reward_to_descend(run),
         autoreset_mode="Disabled",
         **run.task_keywords,
     )
@@ -213,7 +213,7 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
     return make(backend="torch")
 
 
-def _descended(run: TrainingRun) -> str:
+def _reward_to_descend(run: TrainingRun) -> str:
     """Reward whose gradient is followed; that of the difference to the paper's algorithm is the cost's own."""
     kind = run.hyperparameters.get("env_kwargs", {}).get("reward", "cost")
     return "cost" if kind == "relative" else kind
@@ -254,7 +254,9 @@ class Descent:
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
         gate, largest = Gate(env.task) if self.run.gated else None, self.values.get("max_action_grad")
         if env.backend == "compiled":
-            return Unrolled(env, policy, truncation, _descended(self.run), gate, largest).descend_episodes
+            return Unrolled(
+                env, policy, truncation, _reward_to_descend(self.run), gate, largest
+            ).descend_episodes
         return functools.partial(descend_episodes, env, policy, truncation, gate=gate, largest=largest)
 
     def update(self) -> float:

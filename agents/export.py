@@ -4,8 +4,8 @@ import shutil
 from pathlib import Path
 
 from ..evaluation.files import whole_files, writable_file
-from .learned_policy import stored_policy, write_arrays
-from .named_policies import zipped_model
+from .learned_policy import load_policy, write_arrays
+from .named_policies import load_zipped_model
 from .training_run import TrainingEpisodes, TrainingRun, best_agent, load_run, save_run
 
 CHECK_EPISODES = 32
@@ -36,10 +36,10 @@ def export_run(folder: Path, out: Path, trust: bool = False) -> TrainingRun:
         else:
             from .network_arrays import network_arrays  # with torch, which the arrays alone do not need
 
-            agent = zipped_model(run.problem.task, source, run.control, trust)
+            agent = load_zipped_model(run.problem.task, source, run.control, trust)
             arrays, output, activation = network_arrays(agent, run.algorithm)
             write_arrays(file, arrays, run, output, activation)
-        costs = TrainingEpisodes(run, CHECK_EPISODES).costs(stored_policy(run.problem.task, file))
+        costs = TrainingEpisodes(run, CHECK_EPISODES).costs(load_policy(run.problem.task, file))
         run.exported = {"episodes": CHECK_EPISODES, "cost": float(costs.mean())}
         save_run(run, file.with_suffix(".json"))
     return run

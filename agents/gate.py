@@ -14,7 +14,7 @@ import numpy
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem
 from ..envs.task import Task
-from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, kind_of, made, shown_as
+from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, expose_spaces, kind_of, made
 from .residual import ResidualPolicy, policy_to_correct
 
 NEVER = numpy.iinfo(numpy.int64).max // 2
@@ -138,7 +138,7 @@ class Gated(Policy):
         if own != task.control:
             raise ValueError(f"the policy is made for control {own!r}, but the task has {task.control!r}")
         self.gate = Gate(task, fallback, alarm, window)
-        shown_as(self, self.policy)
+        expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory]:
         """Memories of policy and gate."""
@@ -165,7 +165,7 @@ class PolicyMaker:
 
     def __init__(self, maker: Any, wrap: Callable[[Task, Any], Any], control: str | None = None) -> None:
         self.maker, self.wrap = maker, wrap
-        shown_as(self, maker, "control", "task_keywords")
+        expose_spaces(self, maker, "control", "task_keywords")
         if control is not None:
             self.control = control
 

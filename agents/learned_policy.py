@@ -182,7 +182,7 @@ def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
             raise ValueError(f"unknown output {header['output']!r} or activation {header['activation']!r}")
         if not fits(header["fields"], list[str]) or not fits(header["run"], dict[str, Any]):
             raise ValueError("its header has no list of fields or no record of a run")
-        header["answers"] = _checked_answers(arrays, len(header["fields"]))
+        header["answers"] = _count_answers(arrays, len(header["fields"]))
     except FileNotFoundError as error:
         raise ValueError(f"no learned policy at {path}") from error
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
@@ -190,7 +190,7 @@ def _read(path: Path) -> tuple[dict[str, numpy.ndarray], dict[str, Any]]:
     return arrays, header
 
 
-def _checked_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
+def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
     """Check that arrays are those of a network, and return how many numbers it answers with.
 
     Args:
@@ -257,7 +257,7 @@ class _Stored:
         return as_trained(task, network, *self.around)
 
 
-def stored_policy(cls: type[Task], path: Path) -> _Stored | EstimatorMaker:
+def load_policy(cls: type[Task], path: Path) -> _Stored | EstimatorMaker:
     """Load a learned policy or estimator of an environment from a file: what makes it for a task.
 
     Raises:

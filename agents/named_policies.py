@@ -5,7 +5,7 @@ from typing import Any
 
 from ..envs.task import Task
 from .gate import PolicyMaker, as_trained
-from .learned_policy import pretrained_path, stored_policy
+from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
 
 
@@ -28,22 +28,22 @@ def learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
         ValueError: if the file or folder is not what its name says, or takes ``trust``.
     """
     if name in shipped_agents(cls.id):
-        return stored_policy(cls, pretrained_path(cls.id, name))
+        return load_policy(cls, pretrained_path(cls.id, name))
     path = Path(name)
     if path.is_dir():
         return _agent_of_run(cls, path, trust)
     if name.endswith(".safetensors"):
-        return stored_policy(cls, path)
+        return load_policy(cls, path)
     if not name.endswith(".zip"):
         return None
-    model = zipped_model(cls, path, None, trust)
+    model = load_zipped_model(cls, path, None, trust)
     # Beside the model of a run that is more than its network lies what it is.
     return (
         _as_recorded(model, load_run(path.parent, trust)) if (path.parent / "run.json").is_file() else model
     )
 
 
-def zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
+def load_zipped_model(cls: type[Task], path: Path, control: str | None, trust: bool) -> Any:
     """Load a model of Stable-Baselines3, the network alone.
 
     Raises:
@@ -62,15 +62,15 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
         # rl-zoo3: ENV_1/best_model.zip if there was an evaluation, and ENV_1/ENV.zip at the end.
         for name in ("best_model", folder.absolute().name.rpartition("_")[0]):
             if (folder / f"{name}.zip").is_file():
-                return zipped_model(cls, folder / f"{name}.zip", None, trust)
+                return load_zipped_model(cls, folder / f"{name}.zip", None, trust)
     run = load_run(folder, trust)
     agent = best_agent(folder)
     if agent.suffix == ".safetensors":
-        return stored_policy(cls, agent)
+        return load_policy(cls, agent)
     own = run.environment.rpartition(":")[2]
     if own != cls.id:
         raise ValueError(f"{folder} holds a run of {own}, not of {cls.id}")
-    return _as_recorded(zipped_model(cls, agent, run.control, trust), run)
+    return _as_recorded(load_zipped_model(cls, agent, run.control, trust), run)
 
 
 def _as_recorded(model: Any, run: TrainingRun) -> Any:

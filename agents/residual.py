@@ -13,7 +13,7 @@ import numpy
 from ..baselines.problem import Problem
 from ..envs.environment import TaskEnv
 from ..envs.task import Task
-from ..evaluation.competitors import Policy, kind_of, made, shown_as
+from ..evaluation.competitors import Policy, expose_spaces, kind_of, made
 
 
 def check_residual(task: Task, policy: Any) -> None:
@@ -108,7 +108,7 @@ class ResidualPolicy(Policy):
         check_residual(task, policy)
         self.control = task.control  # type: ignore[misc]
         self.policy, self.agent = policy, agent
-        shown_as(self, agent)
+        expose_spaces(self, agent)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, Any]:
         """Memories of both."""

@@ -72,14 +72,14 @@ class Sb3Policy:
         name = name or f"this model of {type(model).__name__}"
         if self.normalisation is not None:
             _check_shape(self.normalisation, model)
-        elif trained_normalised(model):
+        elif was_trained_normalised(model):
             warnings.warn(
                 f"{name} was trained under VecNormalize, and its statistics are not here, so it is shown raw "
                 "observations and its score is not the model's: keep vecnormalize.pkl beside the zip, or in Python "
                 "pass Sb3Policy(model, normalisation)",
                 stacklevel=2,
             )
-        if _wrapped(model):
+        if _is_wrapped(model):
             warnings.warn(
                 f"{name} was trained on what Gymnasium's NormalizeObservation makes of observations, and is shown raw "
                 "ones, so its score is not the model's: train under VecNormalize instead",
@@ -109,7 +109,7 @@ def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
         )
 
 
-def trained_normalised(model: BaseAlgorithm) -> bool:
+def was_trained_normalised(model: BaseAlgorithm) -> bool:
     """Whether a model shows that it was trained under ``VecNormalize``.
 
     A model keeps, and stores, what it was shown last and, under ``VecNormalize``, what that was before; algorithms
@@ -126,7 +126,7 @@ def trained_normalised(model: BaseAlgorithm) -> bool:
     return not isinstance(model, OffPolicyAlgorithm)
 
 
-def _wrapped(model: BaseAlgorithm) -> bool:
+def _is_wrapped(model: BaseAlgorithm) -> bool:
     """Whether Gymnasium's own wrapper normalises in the environment that a model holds."""
     env = model.get_env()
     inner = None if env is None else env.unwrapped
@@ -180,7 +180,7 @@ def load_sb3_policy(
     places = list(statistics_places(path, environment))
     found = next((place for place in places if place.is_file()), None)
     try:
-        model = _loaded_model(path)
+        model = _load_model(path)
         normalisation = None
         if found is not None:
             with found.open("rb") as file:
@@ -192,7 +192,7 @@ def load_sb3_policy(
         raise ValueError(f"cannot read the model {path}: {error}") from error
 
 
-def _loaded_model(path: Path) -> BaseAlgorithm:
+def _load_model(path: Path) -> BaseAlgorithm:
     """Load a zip by the class that fits what it stores.
 
     Raises:

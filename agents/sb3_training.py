@@ -213,7 +213,7 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
     """Train until ``run.steps`` environment steps are done, or somebody presses Ctrl-C or sends SIGTERM.
 
     Args:
-        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resumed_run`.
+        run: from :func:`~.training_run.new_run` or :func:`~.training_run.resume_run`.
         session: how it is trained.
 
     Raises:

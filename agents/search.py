@@ -32,7 +32,7 @@ from ..envs.parameters import check_integer
 from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merged, read_section
-from .training_run import FILES, RunOptions, Session, TrainingRun, Validated, load_run, new_run, opened_run
+from .training_run import FILES, RunOptions, Session, TrainingRun, Validated, load_run, new_run, open_run
 
 VALIDATIONS = 5
 """Of each run, after which a trial may be pruned."""
@@ -141,7 +141,7 @@ def suggested(trial: optuna.Trial, space: Mapping[str, Any], inside: str = "") -
     return found
 
 
-def opened_study(search: Search, folder: Path) -> optuna.Study:
+def open_study(search: Search, folder: Path) -> optuna.Study:
     """Begin a search in a folder, or go on with the one that is there.
 
     Raises:
@@ -163,7 +163,7 @@ def opened_study(search: Search, folder: Path) -> optuna.Study:
     return study
 
 
-def ended_trials(study: optuna.Study) -> list[Any]:
+def finished_trials(study: optuna.Study) -> list[Any]:
     """Trials that came to an end, pruned ones and failed ones among them; not what was interrupted."""
     return [trial for trial in study.get_trials(deepcopy=False) if trial.user_attrs.get("ended")]
 
@@ -193,11 +193,11 @@ def search_hyperparameters(
         ValueError: for no trials, a folder that holds another search, or settings that cannot be trained with.
     """
     check_integer("trials", trials, 1)
-    study = opened_study(search, folder)
+    study = open_study(search, folder)
     for left in study.get_trials(deepcopy=False):
         if not left.state.is_finished():  # by a crash
             study.tell(left.number, state=TrialState.FAIL)
-    while (done := len(ended_trials(study))) < trials:
+    while (done := len(finished_trials(study))) < trials:
         progress(done)
         study.sampler = optuna.samplers.TPESampler(
             n_startup_trials=STARTUP_TRIALS, seed=1_000_003 * search.sampling + done
@@ -209,7 +209,7 @@ def search_hyperparameters(
         except optuna.TrialPruned as reason:
             ended, words = TrialState.PRUNED, str(reason)
         except ValueError as error:
-            if not any(other.state == TrialState.COMPLETE for other in ended_trials(study)):
+            if not any(other.state == TrialState.COMPLETE for other in finished_trials(study)):
                 study.tell(trial, state=TrialState.FAIL)
                 raise  # nothing has worked yet: rather the settings are to blame than what was drawn
             ended, words = TrialState.PRUNED, f"failed, {error}"
@@ -222,7 +222,7 @@ def search_hyperparameters(
         study.tell(trial, _mean(costs) if ended == TrialState.COMPLETE else None, ended)
         report(f"trial {trial.number}: {words}; {json.dumps(chosen)}")
         write_best(search, folder, study)
-    progress(len(ended_trials(study)))
+    progress(len(finished_trials(study)))
     return study
 
 
@@ -247,7 +247,7 @@ def _costs(
     for seed in search.seeds:
         place = run_folder(folder, trial.number, seed)
         shutil.rmtree(place, ignore_errors=True)
-        run = opened_run(place, search.run(seed, chosen), resume=False)
+        run = open_run(place, search.run(seed, chosen), resume=False)
         lowest, told = math.inf, -1
         behind = False
 
@@ -282,7 +282,7 @@ def write_best(search: Search, folder: Path, study: optuna.Study) -> None:
     """Write the best trial's settings as ``filtergym train --config`` takes them; nothing where all were pruned."""
     import yaml
 
-    if not any(trial.state == TrialState.COMPLETE for trial in ended_trials(study)):
+    if not any(trial.state == TrialState.COMPLETE for trial in finished_trials(study)):
         return
     best = study.best_trial
     run = load_run(run_folder(folder, best.number, search.seeds[0]))
@@ -292,7 +292,7 @@ def write_best(search: Search, folder: Path, study: optuna.Study) -> None:
     seeds = ", ".join(map(str, search.seeds))
     text = (
         f"# Hyperparameters of {search.options.algorithm}: trial {best.number}, the best of "
-        f"{len(ended_trials(study))}.\n"
+        f"{len(finished_trials(study))}.\n"
         f"# Lowest validation cost, mean over the training seeds {seeds}: {best.value:.6g}\n"
     )
     own = {search.problem.id: section}

@@ -47,7 +47,7 @@ def merged(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
     return both
 
 
-def parsed_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read ``env.NAME=VALUE`` and ``algo.NAME=VALUE``, with further dots for what is inside a mapping.
 
     Returns:

@@ -42,7 +42,7 @@ from ..envs.reward import REWARDS
 from ..envs.task import Episode, Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.competitors import kind_of
-from ..evaluation.files import found_folder, settle_folder, whole_folder, writable_folder, write_text
+from ..evaluation.files import find_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.rollout import run_competitor
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stored import read_json, restored
@@ -187,7 +187,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     cls, algorithm = problem.task, options.algorithm
     if algorithm not in FILES:
         raise nearest("algorithm", algorithm, FILES)
-    values, own_keywords = _merged_settings(problem, options)
+    values, own_keywords = _merge_settings(problem, options)
     of_environment = merged(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     control = options.control
@@ -224,13 +224,13 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     )
 
 
-def _merged_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
+def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return hyperparameters, and the keywords of the environment that do not come from the file that is shipped.
 
     Raises:
         ValueError: for one that there is not.
     """
-    shipped = stored_hyperparameters(problem.id, options.algorithm)
+    shipped = read_hyperparameters(problem.id, options.algorithm)
     keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
     keywords, values = merged(keywords, options.keywords), merged(values, options.overrides)
     check_keywords(problem.task, options.algorithm, keywords)
@@ -323,7 +323,7 @@ def in_words(weights: Mapping[str, float]) -> str:
     return ",".join(f"{name}:{weight!r}" for name, weight in weights.items())
 
 
-def stored_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
+def read_hyperparameters(id: str, algorithm: str) -> dict[str, Any]:
     """Return the hyperparameters of an algorithm for an environment; default ones where it has none."""
     import yaml
 
@@ -416,14 +416,14 @@ def best_agent(folder: Path) -> Path:
     Raises:
         ValueError: if the run has not been validated yet.
     """
-    best = found_folder(folder / "best")
+    best = find_folder(folder / "best")
     for name in ("agent.safetensors", "model.zip"):
         if (best / name).is_file():
             return best / name
     raise ValueError(f"{folder} has no best agent yet: train it up to its first validation")
 
 
-def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> TrainingRun:
+def resume_run(folder: Path, asked: TrainingRun, same: bool = False) -> TrainingRun:
     """Read the run of a folder to go on with it, up to the steps asked for; what a crash left is put in order.
 
     Args:
@@ -476,17 +476,17 @@ def resumed_run(folder: Path, asked: TrainingRun, same: bool = False) -> Trainin
 
 def holds_run(folder: Path) -> bool:
     """Whether a training run was begun in a folder, up to its first checkpoint at least."""
-    return (folder / "run.json").exists() or found_folder(folder / "checkpoint").exists()
+    return (folder / "run.json").exists() or find_folder(folder / "checkpoint").exists()
 
 
-def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
+def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False) -> TrainingRun:
     """Begin a run in a folder, or go on with the one that is there; its command and versions are noted.
 
     Args:
         folder: of the run.
         asked: what the user says that it is.
         resume: go on with it.
-        same: as of :func:`resumed_run`.
+        same: as of :func:`resume_run`.
 
     Raises:
         ValueError: if the folder cannot be written to, holds a run already, or holds another one.
@@ -495,7 +495,7 @@ def opened_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = Fals
         raise ValueError(
             f"{folder} holds a training run: add --resume to go on with it, or choose another folder"
         )
-    run = resumed_run(folder, asked, same) if resume else asked
+    run = resume_run(folder, asked, same) if resume else asked
     writable_folder(folder)
     run.command = " ".join(
         [
@@ -522,7 +522,7 @@ def _settings_in_words(run: TrainingRun) -> Iterator[str]:
         elif own != shipped:
             yield "--set " + shlex.quote(f"{path}={json.dumps(own)}")
 
-    shipped = stored_hyperparameters(run.problem.id, run.algorithm)
+    shipped = read_hyperparameters(run.problem.id, run.algorithm)
     values = dict(run.hyperparameters)
     yield from differing("env", values.pop("env_kwargs", {}), shipped.pop("env_kwargs", {}))
     yield from differing("algo", values, shipped)

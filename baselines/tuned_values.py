@@ -95,12 +95,12 @@ class TunedValues:
         """
         for place, table in self._tables():
             if policy in table:
-                return self._checked(table[policy].get("values"), policy, place), str(place)
+                return self._check(table[policy].get("values"), policy, place), str(place)
         raise ValueError(
             f"no tuned values of policy {policy!r}: run filtergym tune {self.environment} --policy {policy}"
         )
 
-    def _checked(self, values: Any, policy: str, place: Any) -> dict[str, float]:
+    def _check(self, values: Any, policy: str, place: Any) -> dict[str, float]:
         """Raise ValueError if values are not those of a policy, within the limits of the search."""
         limits = self.tunable[policy].limits
         if not fits(values, dict[str, float]) or values.keys() != limits.keys():
@@ -159,11 +159,11 @@ def save_tuned(outcome: Tuned, command: str, folder: Path = FOLDER) -> Path:
     """
     path = table_path(outcome.environment, folder)
     existing = path.read_text(encoding="utf-8") if path.exists() else None
-    write_text(path, merged_table(existing, outcome, command))
+    write_text(path, merge_tables(existing, outcome, command))
     return path
 
 
-def merged_table(existing: str | None, outcome: Tuned, command: str) -> str:
+def merge_tables(existing: str | None, outcome: Tuned, command: str) -> str:
     """JSON text of a table of tuned values with one policy's replaced."""
     table: dict[str, Any] = json.loads(existing) if existing else {}
     table[outcome.policy] = {

@@ -183,7 +183,7 @@ def tune(
             f"the search needs at least {2 * population}: give {2 * population * steps} steps"
         )
     store = store or Store()
-    asked = _asked(problem, search, tunable, chosen)
+    asked = _search_content(problem, search, tunable, chosen)
 
     def candidate(values: Mapping[str, float], seeds: Sequence[int]) -> Candidate:
         return Candidate(problem, chosen.name, tunable, values, seeds, search.backend)
@@ -210,7 +210,7 @@ def tune(
     return Tuned(problem.id, policy, chosen.name, kept, cost, untuned, generations.spent * steps, search.seed)
 
 
-def _asked(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
+def _search_content(problem: Problem, search: Search, tunable: Tunable, scenario: Scenario) -> list[Any]:
     """All that the cost of a candidate depends on beside its values and the code."""
     limited = {name: list(limit) for name, limit in tunable.limits.items()}
     how = [search.seed, search.episodes, search.backend]

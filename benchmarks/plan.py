@@ -55,13 +55,13 @@ from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.store import Store, Work
-from filtergym.evaluation.summary import Asked, Part, _resampling, combine_summaries, summarise
+from filtergym.evaluation.summary import EvaluationRequest, Part, _resampling, combine_summaries, summarise
 from rich.box import MARKDOWN
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from filtergym.names import asked_of
+from filtergym.names import evaluation_requests
 from filtergym.reports.benchmark import benchmark_policies, cells
 
 EPISODES, SEEDS, CORES = 100_000, 20, (1, 64, 1000)
@@ -114,13 +114,13 @@ def start_seconds() -> dict[str, float]:
     return {"imports": imports, "resampling": spent(lambda: Bootstrap(EPISODES, RESAMPLES))[1]}
 
 
-def long_work(id: str, competitors: Any) -> list[Asked]:
+def long_work(id: str, competitors: Any) -> list[EvaluationRequest]:
     """Return the work of the plan with competitors of an environment, of which the first episodes are measured."""
     problem = problem_of(id)
-    return asked_of(problem, problem.experiment(None, EPISODES, drawn_episodes=1), competitors)
+    return evaluation_requests(problem, problem.experiment(None, EPISODES, drawn_episodes=1), competitors)
 
 
-def competitor_units(asked: Asked, two_sizes: bool) -> Units:
+def competitor_units(asked: EvaluationRequest, two_sizes: bool) -> Units:
     """Seconds of a competitor's episodes and of what becomes of them, for one measurement of one episode.
 
     Args:
@@ -418,7 +418,9 @@ def planned(units: Units, episodes: int, seeds: int, moved: int) -> Iterator[Ite
     for cell in cells(True):
         id = cell.environment
         T = cell.measurements // (cell.episodes * len(cell.policies))
-        [one] = asked_of(cell.problem, cell.problem.experiment(cell.scenario, episodes), cell.policies[:1])
+        [one] = evaluation_requests(
+            cell.problem, cell.problem.experiment(cell.scenario, episodes), cell.policies[:1]
+        )
         pieces = [piece.measurements // T for piece in one.pieces()]
         block = units["competitors"][id][baselines_of(id).score_paper]["block"]
         told = units["told"][id] * episodes / EPISODES
@@ -489,7 +491,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(Asked(Experiment("", episodes=episodes), "", None).pieces())
+        pieces = len(EvaluationRequest(Experiment("", episodes=episodes), "", None).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(

@@ -70,7 +70,7 @@ def keep(name: str, code: bytes) -> None:
     with contextlib.suppress(OSError):
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         try:
-            with _opened_folder(place):
+            with _open_folder(place):
                 pass
         except _Untrusted as error:
             _explain(place, error)
@@ -114,8 +114,8 @@ def _read(place: Path, name: str) -> bytes:
         OSError: if there is none.
     """
     with (
-        _opened_folder(place) as within,
-        _opened(place / name if within is None else name, 0, within) as handle,
+        _open_folder(place) as within,
+        _open(place / name if within is None else name, 0, within) as handle,
     ):
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise OSError(f"{name} is no file")
@@ -126,19 +126,19 @@ def _read(place: Path, name: str) -> bytes:
 
 
 @contextlib.contextmanager
-def _opened_folder(place: Path) -> Iterator[int | None]:
+def _open_folder(place: Path) -> Iterator[int | None]:
     """Open the folder, so that entries are looked up in what was checked; None on systems without owners."""
     if not hasattr(os, "getuid"):  # Windows: folders below a user's own are his own
         yield None
         return
     if place.is_symlink():  # whoever made the link chooses the folder
         raise _Untrusted("the folder is a symbolic link")
-    with _opened(place, os.O_DIRECTORY, None) as handle:
+    with _open(place, os.O_DIRECTORY, None) as handle:
         yield handle
 
 
 @contextlib.contextmanager
-def _opened(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
+def _open(path: str | Path, flags: int, within: int | None) -> Iterator[int]:
     """Open a file or a folder, no link, that nobody else can have written.
 
     Raises:

@@ -42,7 +42,7 @@ def _address(library: ctypes.CDLL, symbol: str) -> int | None:
     return ctypes.cast(getattr(library, symbol), ctypes.c_void_p).value
 
 
-def _opened(*names: str | None) -> ctypes.CDLL | None:
+def _open(*names: str | None) -> ctypes.CDLL | None:
     for name in names:
         try:
             return ctypes.CDLL(name)
@@ -54,7 +54,7 @@ def _opened(*names: str | None) -> ctypes.CDLL | None:
 @functools.cache
 def portable() -> Library:
     """Scalar functions of the C library."""
-    library = _opened("ucrtbase") if sys.platform == "win32" else _opened("libm.so.6", None)
+    library = _open("ucrtbase") if sys.platform == "win32" else _open("libm.so.6", None)
     functions = {}
     for name in (*FUNCTIONS, *ROUNDING):
         address = library and _address(library, name)
@@ -71,7 +71,7 @@ def fastest(features: str) -> Library:
         features: as LLVM lists them, ``+avx2,-avx512f,...``.
     """
     there = features.split(",")
-    vectors = _opened("libmvec.so.1")
+    vectors = _open("libmvec.so.1")
     if platform.machine() == "aarch64":
         there.append("+neon")
     variant = next((VARIANTS[name] for name in VARIANTS if f"+{name}" in there), None)

@@ -47,7 +47,7 @@ def tracing(graph: Graph) -> Iterator[Graph]:
             _OPEN.reset(token)
 
 
-def _refused(self: Any, *_: Any) -> Any:
+def _refuse(self: Any, *_: Any) -> Any:
     raise NotTraceable("a branch or a loop depends on the numbers of an array")
 
 
@@ -62,7 +62,7 @@ class Traced:
     __slots__ = ("dtype", "nodes")
     __array_priority__ = 1  # NumPy leaves mixed arithmetic to the methods below
     device = None
-    __bool__ = __float__ = __int__ = __index__ = __complex__ = _refused
+    __bool__ = __float__ = __int__ = __index__ = __complex__ = _refuse
 
     def __init__(self, nodes: Any, dtype: Any) -> None:
         self.nodes = numpy.asarray(nodes)
@@ -166,7 +166,7 @@ def _numbers(array: Traced) -> Traced:
     return _elementwise("number", [array], int64) if array.dtype == bool else array
 
 
-def _joined(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
+def _join(arrays: Sequence[Any]) -> tuple[list[Traced], numpy.dtype]:
     """Arrays as traced ones of one kind, numbers or truth values, and NumPy's common type of them."""
     found = [asarray(array) for array in arrays]
     # NumPy asks Python's own numbers only for their kind.
@@ -181,7 +181,7 @@ def _binary(name: str, result: Any = None) -> Callable[..., Any]:
     def operation(one: Any, other: Any, /) -> Any:
         if not isinstance(other, Traced | numpy.ndarray | numpy.generic | int | float | list):
             return NotImplemented
-        arrays, dtype = _joined([one, other])
+        arrays, dtype = _join([one, other])
         if dtype == bool:
             arrays, dtype = [_numbers(array) for array in arrays], int64
         return _elementwise(name, arrays, result or dtype)
@@ -210,7 +210,7 @@ def _logical(name: str) -> Callable[..., Any]:
 def _floor_divide(one: Any, other: Any) -> Traced:
     # The quotient itself may be rounded up to a whole number that it does not reach.
     quotient = divide(subtract(one, remainder(one, other)), other)
-    return Traced(round(quotient).nodes, _joined([one, other])[1])
+    return Traced(round(quotient).nodes, _join([one, other])[1])
 
 
 add, subtract, multiply, remainder = (_binary(n) for n in ("add", "subtract", "multiply", "remainder"))
@@ -229,7 +229,7 @@ asin, acos, atan, sinh, cosh, tanh, asinh, acosh, atanh = (
 atan2, pow, hypot = (_binary(name, float64) for name in ("atan2", "pow", "hypot"))
 
 
-def _reflected(operation: Callable[..., Any]) -> Callable[..., Any]:
+def _reflect(operation: Callable[..., Any]) -> Callable[..., Any]:
     return lambda self, other: operation(other, self) if not isinstance(other, Traced) else NotImplemented
 
 
@@ -238,7 +238,7 @@ _METHODS = {"add": add, "sub": subtract, "mul": multiply, "truediv": divide, "fl
 _METHODS |= {"mod": remainder, "and": logical_and, "or": logical_or}
 for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
-    setattr(Traced, f"__r{_name}__", _reflected(_operation))
+    setattr(Traced, f"__r{_name}__", _reflect(_operation))
 _METHODS = {"lt": less, "le": less_equal, "gt": greater, "ge": greater_equal, "eq": equal, "ne": not_equal}
 for _name, _operation in _METHODS.items():
     setattr(Traced, f"__{_name}__", _operation)
@@ -262,7 +262,7 @@ def isfinite(x: Any) -> Traced:
 
 def where(condition: Any, one: Any, other: Any) -> Traced:
     """Choose by a condition."""
-    arrays, dtype = _joined([one, other])
+    arrays, dtype = _join([one, other])
     return _elementwise("where", [astype(condition, bool), *arrays], dtype)
 
 
@@ -287,7 +287,7 @@ def astype(x: Any, dtype: Any, copy: Any = True, device: Any = None) -> Traced:
     return Traced(x.nodes, dtype)
 
 
-def _moved(move: Callable[..., Any]) -> Callable[..., Traced]:
+def _mover(move: Callable[..., Any]) -> Callable[..., Traced]:
     """Function of one array that moves its entries, as NumPy's."""
 
     @functools.wraps(move)
@@ -298,28 +298,28 @@ def _moved(move: Callable[..., Any]) -> Callable[..., Traced]:
     return function
 
 
-def _gathered(gather: Callable[..., Any]) -> Callable[..., Traced]:
+def _gatherer(gather: Callable[..., Any]) -> Callable[..., Traced]:
     """Function of several arrays that puts them together, as NumPy's."""
 
     @functools.wraps(gather)
     def function(arrays: Any, *, axis: int | None = 0) -> Traced:
-        found, dtype = _joined(list(arrays))
+        found, dtype = _join(list(arrays))
         return Traced(gather([array.nodes for array in found], axis=axis), dtype)
 
     return function
 
 
-reshape, moveaxis, permute_dims = _moved(numpy.reshape), _moved(numpy.moveaxis), _moved(numpy.permute_dims)
+reshape, moveaxis, permute_dims = _mover(numpy.reshape), _mover(numpy.moveaxis), _mover(numpy.permute_dims)
 broadcast_to, expand_dims, squeeze = (
-    _moved(numpy.broadcast_to),
-    _moved(numpy.expand_dims),
-    _moved(numpy.squeeze),
+    _mover(numpy.broadcast_to),
+    _mover(numpy.expand_dims),
+    _mover(numpy.squeeze),
 )
-flip, roll, tile, repeat = (_moved(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat))
-concat, stack = _gathered(numpy.concat), _gathered(numpy.stack)
+flip, roll, tile, repeat = (_mover(move) for move in (numpy.flip, numpy.roll, numpy.tile, numpy.repeat))
+concat, stack = _gatherer(numpy.concat), _gatherer(numpy.stack)
 
 
-def _made(make: Callable[..., Any]) -> Callable[..., Traced]:
+def _maker(make: Callable[..., Any]) -> Callable[..., Traced]:
     """Function that makes an array of constants, as NumPy's."""
 
     @functools.wraps(make)
@@ -329,7 +329,7 @@ def _made(make: Callable[..., Any]) -> Callable[..., Traced]:
     return function
 
 
-zeros, ones, eye, arange = (_made(make) for make in (numpy.zeros, numpy.ones, numpy.eye, numpy.arange))
+zeros, ones, eye, arange = (_maker(make) for make in (numpy.zeros, numpy.ones, numpy.eye, numpy.arange))
 
 
 def full(shape: Any, value: Any, *, dtype: Any = None, device: Any = None) -> Traced:
@@ -375,14 +375,14 @@ def take(x: Any, indices: Any, *, axis: int = 0) -> Traced:
         x = asarray(x)
         rows = numpy.moveaxis(x.nodes, axis, -1)
         choices = rows.reshape(-1, rows.shape[-1]).tolist()
-        taken = [[_chosen(graph, row, place) for place in places] for row in choices]
+        taken = [[_choose(graph, row, place) for place in places] for row in choices]
     shaped = numpy.array(taken, dtype=numpy.int64).reshape(*rows.shape[:-1], *indices.shape)
     for i in range(indices.ndim):
         shaped = numpy.moveaxis(shaped, rows.ndim - 1 + i, axis % x.ndim + i)
     return Traced(shaped, x.dtype)
 
 
-def _chosen(graph: Graph, row: list[int], index: int) -> int:
+def _choose(graph: Graph, row: list[int], index: int) -> int:
     values, known = [graph.values[node] for node in row], graph.values[index]
     if known is not None:
         return row[int(known)]

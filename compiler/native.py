@@ -77,10 +77,10 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         library = library or fastest(features)
         text = emitted(program, lane_first, library)
         version = ".".join(map(str, binding.llvm_version_info))
-        return _loaded(text, cache.key(text, name, features, version), library)
+        return _load(text, cache.key(text, name, features, version), library)
 
 
-def _loaded(text: str, key: str, library: Library) -> Native:
+def _load(text: str, key: str, library: Library) -> Native:
     if key in _LOADED:
         return _LOADED[key]
     binding = llvm()

@@ -78,7 +78,7 @@ class Graph:
         self.tables: list[numpy.ndarray] = []
         self._found: dict[Any, int] = {}
 
-    def _kept(self, key: Any, name: str, arguments: tuple[int, ...], value: Any, logical: bool) -> int:
+    def _intern(self, key: Any, name: str, arguments: tuple[int, ...], value: Any, logical: bool) -> int:
         found = self._found.get(key)
         if found is None:
             found = self._found[key] = len(self.operations)
@@ -90,15 +90,15 @@ class Graph:
 
     def input(self, argument: int, row: int) -> int:
         """Number in a row of an argument."""
-        return self._kept(("input", argument, row), "input", (argument, row), None, False)
+        return self._intern(("input", argument, row), "input", (argument, row), None, False)
 
     def constant(self, value: Any) -> int:
         """Number or truth value that is known."""
         if isinstance(value, bool | numpy.bool_):
-            return self._kept(("constant", bool(value)), "constant", (), bool(value), True)
+            return self._intern(("constant", bool(value)), "constant", (), bool(value), True)
         number = numpy.float64(value)
         # By its bits: -0.0 is not 0.0, and NaN is itself.
-        return self._kept(("constant", number.tobytes()), "constant", (), float(number), False)
+        return self._intern(("constant", number.tobytes()), "constant", (), float(number), False)
 
     def take(self, table: numpy.ndarray, index: int) -> int:
         """Entry of a table; an index outside is that of the nearest end, a negative one counts from the last."""
@@ -110,7 +110,7 @@ class Graph:
             self._found[key] = len(self.tables)
             self.tables.append(table)
         place = self._found[key]
-        return self._kept(("take", place, index), "take", (place, index), None, False)
+        return self._intern(("take", place, index), "take", (place, index), None, False)
 
     def node(self, name: str, *arguments: int) -> int:
         """Expression of others."""
@@ -124,7 +124,7 @@ class Graph:
         if name in COMMUTATIVE and arguments[1] < arguments[0]:
             arguments = (arguments[1], arguments[0])
         logical = name in LOGICAL or (name == "where" and self.logical[arguments[1]])
-        return self._kept((name, *arguments), name, arguments, None, logical)
+        return self._intern((name, *arguments), name, arguments, None, logical)
 
     def _simpler(self, name: str, arguments: tuple[int, ...], values: list[Any]) -> int | None:
         """The same with less work, for finite numbers."""

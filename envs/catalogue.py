@@ -44,11 +44,11 @@ MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
 
 def catalogue() -> dict[str, type[Task]]:
     """Return every environment: Gymnasium id -> task class."""
-    return {**_shipped(), **ADDED}
+    return {**_shipped_tasks(), **ADDED}
 
 
 @functools.cache
-def _shipped() -> dict[str, type[Task]]:
+def _shipped_tasks() -> dict[str, type[Task]]:
     package = importlib.import_module(__package__)
     rooms = (
         importlib.import_module(f"{__package__}.{m.name}")

@@ -57,29 +57,29 @@ Report = Callable[[Task, Episode], Any]
 # what is long, world and filter, is compiled once for all of them.
 
 
-def _updated(task: Task, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
+def _update(task: Task, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
     """Filter after the measurement, and what it gives back to the world."""
     after = task.filter.update(state, Input(measurement, truth, action))
     return after, task.filter.feedback(after, measurement)
 
 
-def _advanced(task: Task, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
+def _advance(task: Task, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
     """Truth at the next measurement, and the measurement."""
     return task.world.advance(truth, noise, feedback)
 
 
-def _predicted(task: Task, state: Any, measurement: Any) -> tuple[Any, Array]:
+def _predict(task: Task, state: Any, measurement: Any) -> tuple[Any, Array]:
     """Filter at the measurement, and what is shown of it."""
     predicted = task.filter.predict(state, measurement)
     return predicted, task.observe(Episode(None, measurement, predicted))
 
 
-def _world_begun(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]:
+def _begin_world(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]:
     """Truth at the start of the track, and the initial estimate."""
     return task.world.begin(Draws(uniforms, task.xp), normals)
 
 
-def _filter_started(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
+def _start_filter(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
     state = task.filter.begin(Input(initial, truth))
     return state, task.filter.feedback(state, initial)
@@ -168,19 +168,19 @@ class Programs:
     @_Once
     def updated(self) -> Function:
         """The filter with the measurement; a part of it that stays is not written again."""
-        return self.function(_updated, unchanged=None)
+        return self.function(_update, unchanged=None)
 
     @_Once
     def advanced(self) -> Function:
         """The world; a part of the truth that stays is not written again."""
         if self._of_world is not self:
             return self._of_world.advanced
-        return self.function(_advanced, unchanged=len(leaves(self.world_begun.example()[0])))
+        return self.function(_advance, unchanged=len(leaves(self.world_begun.example()[0])))
 
     @_Once
     def predicted(self) -> Function:
         """The filter at the next measurement."""
-        return self.function(_predicted, turned=True)
+        return self.function(_predict, turned=True)
 
     @_Once
     def world_begun(self) -> Specialised:
@@ -189,14 +189,14 @@ class Programs:
             return self._of_world.world_begun
         noise = self.traced.noise
         uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
-        return self.function(_world_begun).specialised(uniforms, normals)
+        return self.function(_begin_world).specialised(uniforms, normals)
 
     @_Once
     def begun(self) -> tuple[Specialised, Specialised]:
         """World and filter at the start of the track."""
         truth, initial = self.world_begun.example()
-        return self.world_begun, self.function(_filter_started).specialised(
-            initial, self.traced.known_to_filter(truth)
+        return self.world_begun, self.function(_start_filter).specialised(
+            initial, self.traced.truth_for_filter(truth)
         )
 
     @_Once
@@ -235,7 +235,7 @@ class Programs:
         following, measurement = advance.example()
         predict = self.predicted.specialised(state, measurement)
         predicted = predict.example()[0]
-        known = self.traced.known_to_filter(following)
+        known = self.traced.truth_for_filter(following)
         update = self.updated.specialised(known, predicted, measurement, action)
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
@@ -275,7 +275,7 @@ class _Compiled(Task):
         Raises:
             NotTraceable: if the filter is no straight line of arithmetic, and does not say so.
         """
-        return _wrapped(self.original.with_filter(make), self.programs.with_filter(make), self.threads)
+        return _wrap(self.original.with_filter(make), self.programs.with_filter(make), self.threads)
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
         """Call ``function(task, *parts)`` as code of the processor, or with NumPy where it cannot be traced."""
@@ -289,11 +289,11 @@ class _Compiled(Task):
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
-        truth, initial = self.run(_world_begun, uniforms, normals)
-        known = self.known_to_filter(truth)
+        truth, initial = self.run(_begin_world, uniforms, normals)
+        known = self.truth_for_filter(truth)
         if self.filter.in_python:
             return Episode(truth, initial, self.filter.begin(Input(initial, known)))
-        return Episode(truth, initial, self.run(_filter_started, initial, known)[0])
+        return Episode(truth, initial, self.run(_start_filter, initial, known)[0])
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
@@ -308,7 +308,7 @@ class _Compiled(Task):
         """Step 4."""
         if self.filter.in_python:
             return super().act(episode, action)
-        arguments = (self.known_to_filter(episode.truth), episode.filter, episode.measurement, action)
+        arguments = (self.truth_for_filter(episode.truth), episode.filter, episode.measurement, action)
         return episode._replace(filter=self.programs.updated(*arguments, threads=self.threads)[0])
 
 
@@ -329,14 +329,14 @@ def _class_of(cls: type[Task]) -> type[_Compiled]:
     return type(cls.__name__, (_Compiled, cls), {"__module__": cls.__module__, "__doc__": cls.__doc__})
 
 
-def _wrapped(task: Task, programs: Programs, threads: int) -> Task:
+def _wrap(task: Task, programs: Programs, threads: int) -> Task:
     other: _Compiled = object.__new__(_class_of(type(task)))
     other.__dict__.update(task.__dict__)
     other.backend, other.original, other.programs, other.threads = "compiled", task, programs, threads
     return other
 
 
-def _traced(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
+def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
         programs = Programs(cls(parameters, control, namespace, None, recording), graph)
@@ -344,7 +344,7 @@ def _traced(cls: type[Task], parameters: Any, control: str, recording: Any) -> P
     return programs
 
 
-_remembered = functools.lru_cache(REMEMBERED)(_traced)
+_remembered = functools.lru_cache(REMEMBERED)(_trace)
 
 
 def _hashes(value: Any) -> bool:
@@ -369,8 +369,8 @@ def compiled(task: Task, threads: int = 1) -> Task:
     if not AVAILABLE:
         raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
     # Parameters that hold arrays are traced each time.
-    trace = _remembered if _hashes(task.parameters) else _traced
-    return _wrapped(task, trace(type(task), task.parameters, task.control, task.recording), threads)
+    trace = _remembered if _hashes(task.parameters) else _trace
+    return _wrap(task, trace(type(task), task.parameters, task.control, task.recording), threads)
 
 
 def warn_of(what: str, error: BaseException) -> None:
@@ -482,7 +482,7 @@ class Stepper:
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
-        return _kept(self._template, self._copies[self._now], self._kinds)
+        return _copy_numbers(self._template, self._copies[self._now], self._kinds)
 
     def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: NoiseRing) -> None:
         """Start new episodes everywhere and let their first measurement arrive.
@@ -523,7 +523,7 @@ class Stepper:
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
-        return _kept(self._report_template, self._reported, self._report_kinds)
+        return _copy_numbers(self._report_template, self._reported, self._report_kinds)
 
     def shown(self) -> numpy.ndarray:
         """What is shown, ``(fields, width)``, until the next step."""
@@ -551,6 +551,6 @@ def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:
     return [array.dtype.kind for array in arrays]
 
 
-def _kept(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
+def _copy_numbers(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
     """Copies of arrays of numbers in their places, in their own types."""
     return mapped(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)

@@ -54,7 +54,7 @@ class Draws:
             )
         return self._uniforms[first] if count is None else self._uniforms[first : self.used]
 
-    def _kept(self, name: str, values: Array) -> Array:
+    def _keep(self, name: str, values: Array) -> Array:
         if name in self.drawn:
             raise ValueError(f"{name!r} is drawn twice")
         self.drawn[name] = values
@@ -62,26 +62,26 @@ class Draws:
 
     def unit(self, name: str, count: int | None = None) -> Array:
         """Uniform on [0, 1)."""
-        return self._kept(name, self._rows(count))
+        return self._keep(name, self._rows(count))
 
     def uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
         """Uniform between two limits."""
         low, high = limits
-        return self._kept(name, low + (high - low) * self._rows(count))
+        return self._keep(name, low + (high - low) * self._rows(count))
 
     def log_uniform(self, name: str, limits: Sequence[float], count: int | None = None) -> Array:
         """Between two positive limits, with a uniform logarithm."""
         low, high = limits
-        return self._kept(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
+        return self._keep(name, low * self.xp.exp(math.log(high / low) * self._rows(count)))
 
     def integer(self, name: str, limits: Sequence[int], count: int | None = None) -> Array:
         """Whole number from the first to the last, all equally probable, as a float."""
         first, last = limits
-        return self._kept(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
+        return self._keep(name, first + self.xp.floor((last - first + 1) * self._rows(count)))
 
     def event(self, name: str, probability: float, count: int | None = None) -> Array:
         """Boolean, true with a probability."""
-        return self._kept(name, self._rows(count) < probability)
+        return self._keep(name, self._rows(count) < probability)
 
     def category(self, name: str, thresholds: Sequence[Array]) -> Array:
         """Index drawn by the inverse of a cumulative distribution, ``(N,)`` of integers.
@@ -90,7 +90,7 @@ class Draws:
             name: of what is drawn.
             thresholds: the cumulative probabilities but the last, numbers or ``(N,)`` each.
         """
-        return self._kept(name, category(self._rows(None), thresholds, self.xp))
+        return self._keep(name, category(self._rows(None), thresholds, self.xp))
 
 
 def between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:

@@ -36,7 +36,7 @@ OBSERVATIONS = ("measured", "asymmetric")
 """What an observation holds: what can be known; or beside it, for critics in training, what cannot."""
 
 
-def _checked_seed(seed: Any) -> int | None:
+def _check_seed(seed: Any) -> int | None:
     if seed is None:
         return None
     if isinstance(seed, bool) or not isinstance(seed, int | numpy.integer) or seed < 0:
@@ -44,7 +44,7 @@ def _checked_seed(seed: Any) -> int | None:
     return int(seed)
 
 
-def _checked_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
+def _check_options(options: Any, known: Iterable[str]) -> Mapping[str, Any]:
     if options is None:
         return {}
     if not isinstance(options, Mapping):
@@ -67,7 +67,7 @@ def _all_finite(values: Array) -> bool:
         return math.isfinite(values.sum()) or all(map(math.isfinite, values.reshape(-1).tolist()))
 
 
-def checked_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
+def check_action(space: gymnasium.Space, action: Any, count: int | None) -> Array:
     """Return the action as an array, or as the tensor that it is, or say what arrived and what was expected."""
     if is_tensor(action):
         array, values = action, action.detach()
@@ -82,16 +82,16 @@ def checked_action(space: gymnasium.Space, action: Any, count: int | None) -> Ar
         shape: tuple[int, ...] = () if count is None else (count,)
         n = int(space.n)
         if array.shape != shape or floating or not real or (values < 0).any() or (values >= n).any():
-            raise _unexpected_action(f"integer actions from 0 to {n - 1} of shape {shape}", values)
+            raise _action_error(f"integer actions from 0 to {n - 1} of shape {shape}", values)
         return array
     assert space.shape is not None
     shape = space.shape if count is None else (count, *space.shape)
     if array.shape != shape or not real or not _all_finite(values):
-        raise _unexpected_action(f"finite actions of shape {shape}", values)
+        raise _action_error(f"finite actions of shape {shape}", values)
     return array
 
 
-def _unexpected_action(expected: str, action: Array) -> ValueError:
+def _action_error(expected: str, action: Array) -> ValueError:
     shown = numpy.array2string(host_array(action), threshold=8)
     return ValueError(f"expected {expected}, got {action.dtype} of shape {tuple(action.shape)}: {shown}")
 
@@ -278,22 +278,22 @@ class _EnvBase:
             {"observation": measured, "privileged": box(context + len(self.task.components))}
         )
 
-    def _rounded(self, values: Array) -> Array:
+    def _to_dtype(self, values: Array) -> Array:
         """Numbers in the type that was asked for."""
         if self.options.dtype == "float64":
             return values
         return self.task.xp.astype(values, self.task.xp.float32)
 
-    def _observed(self) -> Any:
+    def _observations(self) -> Any:
         """Observations of all lanes, batch first."""
-        shown = self._rounded(self.fleet.observe())
+        shown = self._to_dtype(self.fleet.observe())
         if not self.privileged:
             return shown
         xp, count = self.task.xp, self.fleet.count
         flat = [xp.reshape(values, (count, -1)) for values in self._context()[0].values()]
         return {
             "observation": shown,
-            "privileged": self._rounded(xp.concat([*flat, self._scaled_errors], axis=1)),
+            "privileged": self._to_dtype(xp.concat([*flat, self._scaled_errors], axis=1)),
         }
 
     def _context(self) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
@@ -302,9 +302,9 @@ class _EnvBase:
         for (part,) in self.fleet.parts():
             context, xp = part.task.context(part.state), part.task.xp
             found.append({name: xp.moveaxis(v[..., : part.count], -1, 0) for name, v in context.items()})
-        return self._gathered(found)
+        return self._gather_reports(found)
 
-    def _gathered(
+    def _gather_reports(
         self, found: Sequence[Mapping[str, Array]]
     ) -> tuple[dict[str, Array], dict[str, numpy.ndarray]]:
         """Put together what the lanes of several tasks report, and say who reports each part of it.
@@ -364,7 +364,7 @@ class _EnvBase:
             answers.append(self._step_part(part, own, infos[-1], watch))
         if self.privileged:
             self._scaled_errors = self.fleet.gather([scaled for _, scaled in answers])
-        info.update(self._gathered(infos)[0])
+        info.update(self._gather_reports(infos)[0])
         return self.fleet.gather([reward for reward, _ in answers])
 
     def _step_part(
@@ -482,7 +482,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
             ValueError: for a seed that is none, other options, an unknown name or a value out of its limits in them,
                 and for a scenario or parameters that would change the spaces.
         """
-        wanted, seed = _checked_options(options, self.reset_options), _checked_seed(seed)
+        wanted, seed = _check_options(options, self.reset_options), _check_seed(seed)
         self._apply_reset_options(wanted, [0])
         super().reset(seed=seed)
         self.fleet.seed(0, self.np_random)
@@ -498,13 +498,13 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         if self._late is not None and ahead is not None:
             self._late.begin(ahead)
             self._show()
-        return self._shown_alone(), self._with_context({})
+        return self._single_observation(), self._with_context({})
 
-    def _shown_alone(self) -> Any:
+    def _single_observation(self) -> Any:
         """Observation of the one episode."""
         if not self.privileged:
-            return self._rounded(self.fleet.observe()[0])
-        return {name: values[0] for name, values in self._observed().items()}
+            return self._to_dtype(self.fleet.observe()[0])
+        return {name: values[0] for name, values in self._observations().items()}
 
     def _with_context(self, info: dict[str, Any]) -> dict[str, Any]:
         if self.options.context:
@@ -515,7 +515,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         """Apply the action to the measurement just shown, then show the next one."""
         if not self.fleet.begun:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        array = checked_action(self.action_space, action, None)
+        array = check_action(self.action_space, action, None)
         info: dict[str, Any] = {}
         reward = self._step_lanes(array[None], info)
         if self._late is not None:
@@ -525,8 +525,8 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
             info = {name: values[0] for name, values in info.items()}
         if self.options.context:
             self._with_context(info)
-        reward = float(self._rounded(reward)[0])
-        return self._shown_alone(), reward, False, bool(self.fleet.finished[0]), info
+        reward = float(self._to_dtype(reward)[0])
+        return self._single_observation(), reward, False, bool(self.fleet.finished[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -670,13 +670,13 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._finished = numpy.zeros(num_envs, dtype=bool)
         self._never = numpy.zeros(num_envs, dtype=bool)
 
-    def _checked_seeds(self, seed: Any) -> list[int | None]:
+    def _check_seeds(self, seed: Any) -> list[int | None]:
         if not isinstance(seed, Sequence | numpy.ndarray) or isinstance(seed, str):
-            first = _checked_seed(seed)
+            first = _check_seed(seed)
             return [None if first is None else first + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise ValueError(f"expected {self.num_envs} seeds, one for each sub-environment, got {len(seed)}")
-        return [_checked_seed(one) for one in seed]
+        return [_check_seed(one) for one in seed]
 
     def _seed(self, seeds: Sequence[int | None], lanes: Sequence[int]) -> None:
         unseeded = not self.fleet.generators
@@ -700,8 +700,8 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 parameters that would change the spaces, and for seeds that are none.
             gymnasium.error.ResetNeeded: for a mask before the first reset.
         """
-        wanted = _checked_options(options, self.reset_options)
-        seeds = self._checked_seeds(seed)
+        wanted = _check_options(options, self.reset_options)
+        seeds = self._check_seeds(seed)
         mask = wanted.get("reset_mask")
         if self.pictures is not None and {"scenario", "parameters"} & wanted.keys():
             raise ValueError(
@@ -727,7 +727,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             chosen = numpy.flatnonzero(mask).tolist()
         shortened = wanted.get("shortened_by")
         if shortened is not None:
-            shortened = self._checked_shortening(shortened)
+            shortened = self._check_shortening(shortened)
         self._apply_reset_options(wanted, chosen)
         self._seed(seeds, chosen)
         self._restart(chosen)
@@ -736,7 +736,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         self._finished = self._finished.copy()
         self._finished[list(chosen)] = False
         begun = numpy.isin(numpy.arange(self.num_envs), chosen)
-        return self._observed(), self._with_context({}, begun)
+        return self._observations(), self._with_context({}, begun)
 
     def _with_context(self, info: dict[str, Any], lanes: numpy.ndarray) -> dict[str, Any]:
         """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
@@ -748,7 +748,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             info["context"], info["_context"] = told, self._mask(lanes)
         return info
 
-    def _checked_shortening(self, values: Any) -> numpy.ndarray:
+    def _check_shortening(self, values: Any) -> numpy.ndarray:
         try:
             shortened = numpy.asarray(values)
         except (ValueError, TypeError):  # rows of different lengths, a tensor on a device
@@ -791,20 +791,20 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         finished = self.fleet.finished
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
-            info = self._masked(info, ~finished) | {
-                "final_obs": self._final_observations(self._observed(), done),
+            info = self._with_masks(info, ~finished) | {
+                "final_obs": self._final_observations(self._observations(), done),
                 "_final_obs": self._mask(finished),
-                "final_info": self._with_context(self._masked(info, finished), finished),
+                "final_info": self._with_context(self._with_masks(info, finished), finished),
                 "_final_info": self._mask(finished),
             }
             self._restart(done.tolist())
             self._finished = self._never
         else:
-            info = self._masked(info, ~waiting)
+            info = self._with_masks(info, ~waiting)
             self._finished = finished
         if self.options.context:
             self._with_context(info, ~self._never)
-        shown, reward = self._observed(), self._rounded(reward)
+        shown, reward = self._observations(), self._to_dtype(reward)
         return shown, reward, self._mask(self._never), self._mask(finished), info
 
     def _watch(self, action: Array) -> Callable[[Any], None] | None:
@@ -838,7 +838,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if self.pictures is not None:
             self.pictures.close()
 
-    def _masked(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
+    def _with_masks(self, info: dict[str, Any], mask: numpy.ndarray) -> dict[str, Any]:
         """Gymnasium's form of what some sub-environments report: a mask beside every key."""
         if not mask.any():
             return {}
@@ -848,7 +848,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return masked
 
     def _actions(self, actions: Any) -> Array:
-        array = checked_action(self.single_action_space, actions, self.num_envs)
+        array = check_action(self.single_action_space, actions, self.num_envs)
         if self.backend != "torch":
             return host_array(array)
         return tensor_on(array, self.device)

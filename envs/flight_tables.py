@@ -102,7 +102,7 @@ def _csv(file: Path, known: Container[str]) -> Table:
     return Table(columns.mask(columns.eq("")), names)
 
 
-def opened_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
+def open_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
     """Open a NetCDF file, of the third or the fourth version.
 
     Args:
@@ -129,7 +129,7 @@ def opened_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
 def _netcdf(file: Path, known: Container[str]) -> Table:
     import pandas
 
-    with opened_netcdf(file, decode_timedelta=False) as data:
+    with open_netcdf(file, decode_timedelta=False) as data:
         names = list(map(str, data.variables))
         columns: dict[str, Any] = {}
         for name, lower in zip(names, _check_names(names), strict=True):

@@ -75,7 +75,7 @@ class Flights:
             )
         if not self.trajectories:
             raise ValueError("a set of flights needs at least one trajectory")
-        object.__setattr__(self, "trajectories", tuple(_told_apart(self.trajectories)))
+        object.__setattr__(self, "trajectories", tuple(_number_namesakes(self.trajectories)))
         if not self.sources:
             by_name: dict[str, list[Trajectory]] = {}
             for trajectory in self.trajectories:
@@ -107,7 +107,7 @@ class Flights:
                     kept.append(piece)
             said = [*source.said]
             if source.said or dropped:
-                said.append(_counted(len(source.trajectories), "piece"))
+                said.append(_count_of(len(source.trajectories), "piece"))
             if dropped:
                 said.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
             if far:
@@ -129,7 +129,7 @@ def flight_of(trajectory: Trajectory) -> str:
     return trajectory.flight or trajectory.name
 
 
-def _told_apart(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+def _number_namesakes(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     """Number whole flights that have the same name: they are not pieces of one."""
     names = [flight_of(trajectory) for trajectory in trajectories]
     return [
@@ -140,7 +140,7 @@ def _told_apart(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
     ]
 
 
-def _counted(count: int, what: str, plural: str = "") -> str:
+def _count_of(count: int, what: str, plural: str = "") -> str:
     return f"{count:,} {what if count == 1 else plural or what + 's'}"
 
 
@@ -286,7 +286,7 @@ def read_flights(
         ValueError: if nothing can be used, or an argument is out of its limits. One broken file of several is left out
             and named in the notes.
     """
-    limits = Cleaning(_checked_site(site), longest_gap, speeds, reach, smoothing)
+    limits = Cleaning(_check_site(site), longest_gap, speeds, reach, smoothing)
     limits.check()
     at_median = isinstance(source, str) and source.startswith(TRAFFIC)
     given: list[Any]
@@ -295,7 +295,7 @@ def read_flights(
     elif isinstance(source, Trajectory):
         name, given = source.name, [source]
     elif isinstance(source, list | tuple) and source:
-        name, given = _counted(len(source), "flight"), list(source)
+        name, given = _count_of(len(source), "flight"), list(source)
     else:
         raise ValueError(
             f"flights are a file, a folder, a pattern such as 'flights/*.csv', or a sequence of them, got {source!r}"
@@ -312,7 +312,7 @@ def read_flights(
             files += files_of(item)
         else:
             raise ValueError(f"a set of flights holds files and trajectories, got {item!r}")
-    sources += [Source(trajectory.name, (trajectory,)) for trajectory in _told_apart(own)]
+    sources += [Source(trajectory.name, (trajectory,)) for trajectory in _number_namesakes(own)]
     stems = [file.name.removesuffix(suffix_of(file)) for file in files]
     for file, stem in zip(files, stems, strict=True):
         label = stem if stems.count(stem) == 1 else str(file)
@@ -333,7 +333,7 @@ def _short(file: Path, files: Sequence[Path]) -> str:
     return file.name if [f.name for f in files].count(file.name) == 1 else str(file)
 
 
-def _checked_site(site: Any) -> tuple[float, float] | None:
+def _check_site(site: Any) -> tuple[float, float] | None:
     if site is None:
         return None
     check("site", site, tuple[float, float], Limits())
@@ -410,7 +410,7 @@ def _flights_of(
     if not good:
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
     said = [
-        f"{_counted(count, *words)}{tail(limits)}"
+        f"{_count_of(count, *words)}{tail(limits)}"
         for (words, tail), count in zip(COUNTED.values(), counts.values(), strict=True)
         if count
     ]

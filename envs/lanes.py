@@ -116,7 +116,7 @@ class TaskStepper:
             self._shown = self.task.observe(self._episode)
         return self._shown
 
-    def kept_shown(self) -> Array:
+    def computed_observation(self) -> Array:
         """What is shown where it was computed, else None."""
         return self._shown
 
@@ -179,7 +179,7 @@ class Lanes:
         self._averaged = averaged if task.decision_interval > 1 else []
         """Fields that are shown as their means over a decision."""
 
-    def _padded(self, values: numpy.ndarray, fill: float) -> Array:
+    def _pad(self, values: numpy.ndarray, fill: float) -> Array:
         """Widen ``(rows, lanes)`` to a multiple of eight lanes."""
         width = padded_width(values.shape[1])
         padded = numpy.full((values.shape[0], width), fill)
@@ -204,7 +204,7 @@ class Lanes:
             lengths = task.lengths(uniforms) // task.decision_interval
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
         # The padding lanes fly an average episode without noise.
-        scenario, start = self._padded(uniforms, 0.5), self._padded(normals, 0.0)
+        scenario, start = self._pad(uniforms, 0.5), self._pad(normals, 0.0)
         if self._begun is not None:
             self._begun(task.begin(scenario, start))
         if everyone:
@@ -344,7 +344,7 @@ class Lanes:
 
     def _episodes(self) -> tuple[Any, ...]:
         """Episodes of every task with what is shown of them; the arrays never change."""
-        return tuple((stepper.episode(), stepper.kept_shown()) for stepper in self._moving)
+        return tuple((stepper.episode(), stepper.computed_observation()) for stepper in self._moving)
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
         for stepper, (episode, shown) in zip(self._moving, episodes, strict=True):

@@ -113,7 +113,7 @@ def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
         raise TypeError(f"{name} is declared as {hint}, which has no check")
 
 
-def _stated(limits: Limits) -> str:
+def _limits_in_words(limits: Limits) -> str:
     words = {"above": "above", "at_least": "at least", "below": "below", "at_most": "at most"}
     parts = [f"{words[f]} {getattr(limits, f)}" for f in words if getattr(limits, f) is not None]
     return " and ".join(parts)
@@ -135,13 +135,15 @@ def _number(name: str, value: Any, limits: Limits) -> None:
     # Compared, not converted: a whole number can be too large for a float.
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_number or not _within(value, limits):
-        raise ValueError(f"{name} must be {f'a finite number {_stated(limits)}'.strip()}, got {value!r}")
+        raise ValueError(
+            f"{name} must be {f'a finite number {_limits_in_words(limits)}'.strip()}, got {value!r}"
+        )
 
 
 def _integer(name: str, value: Any, limits: Limits) -> None:
     is_whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= LARGEST
     if not is_whole or not _within(value, limits):
-        stated = f" of {_stated(limits)}" if _stated(limits) else ""
+        stated = f" of {_limits_in_words(limits)}" if _limits_in_words(limits) else ""
         raise ValueError(f"{name} must be an integer{stated}, got {value!r}")
 
 

@@ -237,7 +237,7 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
     """
     world: Any = task.world  # a RecordedWorld
     moving = task.log_format is not None and task.log_format.targets_move
-    seen, sigma = world.all_seen()
+    seen, sigma = world.all_observations()
     metres = [i for i, component in enumerate(task.components) if component.unit == "m"]
     measured = [i for i in metres if seen is not None and numpy.isfinite(seen[i]).any()]
     usual = getattr(task.parameters, "sampling_interval", None)
@@ -358,18 +358,18 @@ def _notes(
     if alone.any():
         farthest = float(_length(_deviations(time, position)).max())
         notes.append(
-            f"{_listed(number[alone])} off the track, by up to {farthest:,.0f} m: an outlier decides every "
+            f"{_list_measurements(number[alone])} off the track, by up to {farthest:,.0f} m: an outlier decides every "
             "mean of likelihoods"
         )
     repeated = numpy.append(False, moved == 0.0)
     if repeated.any():
         notes.append(
-            f"{_listed(number[repeated])} the same as before: does the sensor repeat its last value?"
+            f"{_list_measurements(number[repeated])} the same as before: does the sensor repeat its last value?"
         )
     return notes
 
 
-def _listed(numbers: numpy.ndarray) -> str:
+def _list_measurements(numbers: numpy.ndarray) -> str:
     """Name some measurements, and count them."""
     shown = ", ".join(map(str, numbers[:5].tolist())) + ", ..." * (len(numbers) > 5)
     return f"measurement {shown} is" if len(numbers) == 1 else f"{len(numbers):,} measurements ({shown}) are"

@@ -14,7 +14,7 @@ import numpy
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
 from .log_format import TrackLog
 from .plausibility import check_interval, ignored_columns
-from .recording import Recording, measured_once, side_by_side
+from .recording import Recording, measure_once, side_by_side
 from .task import Task
 
 if TYPE_CHECKING:
@@ -133,9 +133,9 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     """
     log_format = cls.log_format
     if log_format is None:
-        measured_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
+        measure_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
-    known = _Known({*TIME, RECORDING, *log_format.columns})
+    known = _ColumnNames({*TIME, RECORDING, *log_format.columns})
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     read, names = read_table(path, known)
@@ -167,7 +167,7 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     return _side_by_side(path, cls, keywords, parts, names, log_format.columns)
 
 
-class _Known(set[str]):
+class _ColumnNames(set[str]):
     """Names of columns; and all that begin with ``truth_``, because components follow from the parameters."""
 
     def __contains__(self, name: object) -> bool:

@@ -195,7 +195,7 @@ class Recording:
 
     def check_fits(self, task: Task) -> None:
         """Raise ValueError if a task of NumPy measures other arrays than there are, or a closed loop."""
-        initial, measurement = measured_once(task)
+        initial, measurement = measure_once(task)
         for kind, prefix, example, found, leading in (
             ("measures", "", measurement, self.measurements, 2),
             ("is told at the start", "initial_", initial, self.initial, 1),
@@ -384,7 +384,7 @@ def _first(values: numpy.ndarray) -> int:
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
-def measured_once(task: Task) -> tuple[Any, Any]:
+def measure_once(task: Task) -> tuple[Any, Any]:
     """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
 
     Raises:
@@ -417,7 +417,7 @@ class RecordedWorld(World[Task, Replayed, Any]):
         self.simulated = task.World(task)
         """The task's own world, which knows what an error costs."""
         plain = type(task)(task.parameters, task.control)
-        self._initial, self._measurement = measured_once(plain)
+        self._initial, self._measurement = measure_once(plain)
         tables = recording.tables
         # Tables of NumPy are read by compiled code as they are.
         kept = task.constant if task.backend == "torch" else numpy.asarray
@@ -446,7 +446,7 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Return a measurement with NaN in place of what was not received, as the task's own world does."""
         return self.simulated.received(measurement)
 
-    def all_seen(self) -> tuple[Array | None, Array | None]:
+    def all_observations(self) -> tuple[Array | None, Array | None]:
         """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
         ``(C, measurements)``; None where it is no component.
         """

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from .flight_tables import MOST_BYTES, opened_netcdf
+from .flight_tables import MOST_BYTES, open_netcdf
 from .recording import MOST_NUMBERS, Recording
 from .task import Task
 
@@ -85,7 +85,7 @@ def names_environment(path: Path) -> bool:
     """
     if path.suffix != ".nc":
         return False
-    with opened_netcdf(path, decode_times=False) as data:
+    with open_netcdf(path, decode_times=False) as data:
         return "environment" in data.attrs
 
 
@@ -158,7 +158,7 @@ def read_netcdf(path: Path, cls_of: Any, environment: str | None, keywords: Mapp
     Raises:
         ValueError: if it cannot be read, or is of another environment.
     """
-    with opened_netcdf(path, decode_times=False) as data:
+    with open_netcdf(path, decode_times=False) as data:
         attrs = data.attrs
         cls: type[Task] = cls_of(str(attrs.get("environment", environment)))
         if environment is not None and cls is not cls_of(environment):

@@ -330,7 +330,7 @@ class EpisodePicture:
 
     def frame(self, state: Any) -> numpy.ndarray:
         """Draw and return the picture, ``(height, width, 3)`` bytes."""
-        figure = self._drawn(state)
+        figure = self._draw(state)
         canvas = figure.canvas
         assert isinstance(canvas, FigureCanvasAgg)
         moving = [_moving(axes) for axes in figure.axes]
@@ -353,7 +353,7 @@ class EpisodePicture:
         from matplotlib import pyplot
 
         opened = self._figure is not None
-        figure = self._drawn(state)
+        figure = self._draw(state)
         if not opened:
             figure.show()
         elif not pyplot.fignum_exists(figure.number):
@@ -372,7 +372,7 @@ class EpisodePicture:
             pyplot.close(self._figure)
         vars(self).update(_NO_FIGURE)
 
-    def _drawn(self, state: Any) -> Figure:
+    def _draw(self, state: Any) -> Figure:
         figure = self._figure if self._figure is not None else self._open()
         if self._fresh:
             self._arrange()

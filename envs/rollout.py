@@ -20,7 +20,7 @@ AIMED = slice(1, 7, 2)
 """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of episodes, action and noise."""
 
 
-def _unpacked(like: Episode, state: Any) -> Episode:
+def _unpack(like: Episode, state: Any) -> Episode:
     """Episode whose numbers are the rows of an array, ``(rows, N)``."""
     row = 0
 
@@ -34,16 +34,16 @@ def _unpacked(like: Episode, state: Any) -> Episode:
     return unpacked
 
 
-def _packed(episode: Episode) -> Any:
+def _pack(episode: Episode) -> Any:
     arrays = [traced.astype(array, traced.float64) for array in leaves(episode)]
     return traced.concat([traced.reshape(array, (-1, 1)) for array in arrays])
 
 
 def _forward(programs: Programs, kind: str, state: Any, action: Any, noise: Any) -> Any:
     """Episodes at the next measurement, reward, and observation."""
-    episode = _unpacked(programs.later.episode, state)
+    episode = _unpack(programs.later.episode, state)
     episode, reward, shown = stepped(kind, programs.traced, episode, action, noise)
-    return _packed(episode), reward, shown
+    return _pack(episode), reward, shown
 
 
 def _backward(programs: Programs, kind: str, state: Any, action: Any, noise: Any, *adjoints: Any) -> Any:
@@ -53,7 +53,7 @@ def _backward(programs: Programs, kind: str, state: Any, action: Any, noise: Any
 
 
 @functools.lru_cache(16)
-def _compiled(programs: Programs, kind: str) -> tuple[Specialised, Specialised]:
+def _compile(programs: Programs, kind: str) -> tuple[Specialised, Specialised]:
     rows = sum(int(numpy.prod(leaf.shape[:-1])) for leaf in leaves(programs.later.episode))
     state = numpy.zeros((rows, 8))
     action = numpy.zeros((*(programs.traced.action_space.shape or ()), 8))
@@ -86,7 +86,7 @@ class Rollout:
     """
 
     def __init__(self, task: Any, kind: str, width: int, measurements: int) -> None:
-        forward, backward = _compiled(task.programs, kind)
+        forward, backward = _compile(task.programs, kind)
         rows, actions, noise = (leaf.rows for leaf in forward.inputs)
         self._states = [empty_lanes((rows,), width) for _ in range(measurements + 1)]
         self._next = empty_lanes((rows,), width)

@@ -227,7 +227,7 @@ class Task(ABC):
     def __reduce__(self) -> Any:
         """Pickle what it is made of; a module, its array namespace, cannot be."""
         named = (self.parameters, self.control, self.xp.__name__, self.device, self.recording)
-        return _made_again, (type(self), *named)
+        return _remake, (type(self), *named)
 
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""
@@ -353,7 +353,7 @@ class Task(ABC):
         other._take_filter(make(self))
         return other
 
-    def known_to_filter(self, truth: Any) -> Any:
+    def truth_for_filter(self, truth: Any) -> Any:
         """Truth as the filter is given it: None unless it ``knows`` something."""
         return truth if self.filter.knows else None
 
@@ -367,7 +367,7 @@ class Task(ABC):
             normals: ``(noise.initial_normals, N)``.
         """
         truth, initial = self.world.begin(Draws(uniforms, self.xp), normals)
-        return Episode(truth, initial, self.filter.begin(Input(initial, self.known_to_filter(truth))))
+        return Episode(truth, initial, self.filter.begin(Input(initial, self.truth_for_filter(truth))))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
@@ -384,7 +384,7 @@ class Task(ABC):
 
     def act(self, episode: Episode, action: Array) -> Episode:
         """Step 4: the filter takes the measurement in, a bank with the action."""
-        given = Input(episode.measurement, self.known_to_filter(episode.truth), action)
+        given = Input(episode.measurement, self.truth_for_filter(episode.truth), action)
         return episode._replace(filter=self.filter.update(episode.filter, given))
 
     def mean(self, episode: Episode) -> Array:
@@ -436,7 +436,7 @@ class Task(ABC):
         return {**own, **self.world.records(episode.truth)}
 
 
-def _made_again(
+def _remake(
     cls: type[Task], parameters: Any, control: str, namespace: str, device: Any, recording: Any
 ) -> Task:
     return cls(parameters, control, importlib.import_module(namespace), device, recording)

@@ -12,7 +12,7 @@ import numpy
 
 from ..envs.task import Array, Task
 from .competitors import Kind
-from .filters import chosen_lanes
+from .filters import select_lanes
 
 
 class SingleTrackEstimator(ABC):
@@ -91,7 +91,7 @@ class SingleTrackEstimator(ABC):
         """Begin the tracks; see :meth:`.Estimator.start`."""
         tracks = []
         for lane in range(N):
-            told = chosen_lanes(initial, lane)
+            told = select_lanes(initial, lane)
             mean, covariance = numpy.zeros(len(self.state)), numpy.zeros((len(self.state),) * 2)
             mean[self._places] = told.mean
             covariance[numpy.ix_(self._places, self._places)] = told.covariance
@@ -103,7 +103,7 @@ class SingleTrackEstimator(ABC):
         """Ask every track in turn; see :meth:`.Estimator.update`."""
         tracks, estimates = [], []
         for lane, track in enumerate(memory):
-            moved = self.step(track, chosen_lanes(measurement, lane))
+            moved = self.step(track, select_lanes(measurement, lane))
             tracks.append(track if moved is None else moved)
             estimates.append(self._components(tracks[-1]))
         means, covariances = zip(*estimates, strict=True)

@@ -68,7 +68,7 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
     return found
 
 
-def shown_as(outer: Any, inner: Any, *further: str) -> None:
+def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
     """Let a policy be asked like the model inside it, whose spaces say how.
 
     Args:

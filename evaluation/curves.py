@@ -100,7 +100,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
     return CompetitorCurves(curves, labels.get("action", []), labels.get("gain", []))
 
 
-def shown_quantities(dataset: xarray.Dataset) -> list[str]:
+def select_quantities(dataset: xarray.Dataset) -> list[str]:
     """Return the groups of components, where there are any, else the first three components."""
     return list(groups_of(dataset)) or list(reported_components(dataset))[:3]
 
@@ -119,10 +119,10 @@ def curve_statistics(
     distributed = max(block_of(times), DISTRIBUTED // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
-        squares = numpy.stack([squared_errors(run, name, groups) for name in shown_quantities(run)], axis=-1)
+        squares = numpy.stack([squared_errors(run, name, groups) for name in select_quantities(run)], axis=-1)
         yield Statistic(("curve", "rmse"), squares, _rmse, resamples)
         if str(run["kind"].values) != "bound":
-            yield Statistic(("curve", "error_exceeded"), squares, _exceeded, sample=distributed)
+            yield Statistic(("curve", "error_exceeded"), squares, _exceedance, sample=distributed)
             yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     for name in ("mode_probability", "true_class_probability"):
         if name in run:
@@ -169,7 +169,7 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
         dataset: the evaluation, of whose variables none is needed.
         episodes: of which the curves are.
     """
-    units, shown = reported_components(dataset), shown_quantities(dataset)
+    units, shown = reported_components(dataset), select_quantities(dataset)
     names = {
         "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
         "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),
@@ -235,7 +235,7 @@ def gains_of(dataset: xarray.Dataset) -> list[str]:
     ]
 
 
-def exceeded_errors(errors: numpy.ndarray) -> numpy.ndarray:
+def error_exceedance(errors: numpy.ndarray) -> numpy.ndarray:
     """Size that a share of errors reaches or exceeds, for each of :data:`SHARES`.
 
     Args:
@@ -296,9 +296,9 @@ def _rmse(means: numpy.ndarray) -> Curve:
     return _band(numpy.moveaxis(numpy.sqrt(means), -1, 1))
 
 
-def _exceeded(squares: numpy.ndarray) -> Curve:
+def _exceedance(squares: numpy.ndarray) -> Curve:
     errors = numpy.moveaxis(numpy.sqrt(squares), -1, 0)
-    return {"": numpy.stack([exceeded_errors(each) for each in errors])}
+    return {"": numpy.stack([error_exceedance(each) for each in errors])}
 
 
 def _over_dimension(episodes: int, means: numpy.ndarray) -> Curve:

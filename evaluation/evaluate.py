@@ -66,7 +66,7 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     return own
 
 
-def check_shown(task: Task, policy: Any, name: str) -> None:
+def check_observation(task: Task, policy: Any, name: str) -> None:
     """Raise ValueError if a model takes observations of another shape than the task shows, or privileged ones."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
@@ -83,7 +83,7 @@ def check_shown(task: Task, policy: Any, name: str) -> None:
         )
 
 
-def _measured(task: Task, episode: Episode) -> dict[str, Any]:
+def _measurement_report(task: Task, episode: Episode) -> dict[str, Any]:
     """What is kept of every measurement, arrays ``(..., N)``."""
     error = task.error(episode)
     return {
@@ -95,22 +95,22 @@ def _measured(task: Task, episode: Episode) -> dict[str, Any]:
     }
 
 
-def _said(task: Task, episode: Episode) -> dict[str, Any]:
+def _expectation_report(task: Task, episode: Episode) -> dict[str, Any]:
     """What is kept where the truth is not known."""
     return task.records(episode)
 
 
-def _said_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
-    return {**_said(task, episode), **task.track(episode)}
+def _expectation_and_track(task: Task, episode: Episode) -> dict[str, Any]:
+    return {**_expectation_report(task, episode), **task.track(episode)}
 
 
-def _measured_and_tracked(task: Task, episode: Episode) -> dict[str, Any]:
-    return {**_measured(task, episode), **task.track(episode)}
+def _measurement_and_track(task: Task, episode: Episode) -> dict[str, Any]:
+    return {**_measurement_report(task, episode), **task.track(episode)}
 
 
-def _and_drawn(task: Task, episode: Episode) -> dict[str, Any]:
+def _measurement_and_drawing(task: Task, episode: Episode) -> dict[str, Any]:
     """What is kept of every measurement, and what is kept of the first episodes only."""
-    kept = _measured(task, episode) if task.has_truth else _said(task, episode)
+    kept = _measurement_report(task, episode) if task.has_truth else _expectation_report(task, episode)
     return {**kept, **{f"{DRAWN}{name}": values for name, values in task.drawn(episode).items()}}
 
 
@@ -122,10 +122,10 @@ def _limits(task: Task, episode: Episode) -> dict[str, Any]:
 def _report(task: Task, tracks: bool, drawn: bool) -> Report:
     """What is kept of every measurement of a task."""
     if drawn:
-        return _and_drawn
+        return _measurement_and_drawing
     if task.has_truth:
-        return _measured_and_tracked if tracks else _measured
-    return _said_and_tracked if tracks else _said
+        return _measurement_and_track if tracks else _measurement_report
+    return _expectation_and_track if tracks else _expectation_report
 
 
 def evaluate(
@@ -405,11 +405,11 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         controls[name] = control_of(maker, kinds[name], control, cls, name)
         tasks[name] = experiment.make_task(maker, controls[name])
     for name, task in tasks.items():
-        check_shown(task, competitors[name], name)
+        check_observation(task, competitors[name], name)
     first = next(iter(tasks.values()))
     group_of_each([c.name for c in first.components], first.groups)  # refused now, not when all is done
     if chosen.recording is not None:
-        _check_told(kinds, chosen.name)
+        _check_known_truth(kinds, chosen.name)
         episodes = len(first.flights)  # nothing is random: each once
     flown, lengths = None, None
     if first.flights:
@@ -441,7 +441,7 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
             ) from error
 
 
-def _check_told(kinds: Mapping[str, Kind], name: str) -> None:
+def _check_known_truth(kinds: Mapping[str, Kind], name: str) -> None:
     """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
         if kind not in RANKED:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 @contextmanager
-def _refusals_told(place: str) -> Iterator[None]:
+def _explain_refusals(place: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
@@ -25,7 +25,7 @@ def writable_folder(path: Path) -> Path:
     Raises:
         ValueError: if it cannot.
     """
-    with _refusals_told(f"to folder {path}"):
+    with _explain_refusals(f"to folder {path}"):
         there = next(place for place in (path, *path.absolute().parents) if place.exists())
         with tempfile.TemporaryFile(dir=there):
             pass
@@ -33,7 +33,7 @@ def writable_folder(path: Path) -> Path:
 
 
 @contextmanager
-def _made_folder(path: Path) -> Iterator[None]:
+def _make_folder(path: Path) -> Iterator[None]:
     """Make a folder; if what shall be written into it fails, what was made is taken away again."""
     made = [place for place in (path, *path.parents) if not place.exists()]
     path.mkdir(parents=True, exist_ok=True)
@@ -52,7 +52,7 @@ def writable_file(path: Path) -> Path:
     Raises:
         ValueError: if it cannot, or if a folder or a device has its name.
     """
-    with _refusals_told(f"file {path}"):
+    with _explain_refusals(f"file {path}"):
         if path.exists() and not path.is_file():
             raise ValueError(f"cannot write file {path}: a folder or device has that name")
         writable_folder(path.parent)
@@ -76,7 +76,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         ValueError: if it cannot be written.
     """
     partial = _partial(writable_file(path))
-    with _refusals_told(f"file {path}"), _made_folder(path.parent):
+    with _explain_refusals(f"file {path}"), _make_folder(path.parent):
         try:
             yield partial
             partial.replace(os.path.realpath(path))
@@ -94,8 +94,8 @@ def whole_files(folder: Path) -> Iterator[Path]:
     """
     writable_folder(folder)
     with (
-        _refusals_told(f"to folder {folder}"),
-        _made_folder(folder),
+        _explain_refusals(f"to folder {folder}"),
+        _make_folder(folder),
         tempfile.TemporaryDirectory(dir=folder, prefix=".unfinished-", ignore_cleanup_errors=True) as waiting,
     ):
         yield Path(waiting)
@@ -112,7 +112,7 @@ def _beside(folder: Path) -> tuple[Path, Path]:
     return folder.with_name(folder.name + ".partial"), folder.with_name(folder.name + ".old")
 
 
-def found_folder(folder: Path) -> Path:
+def find_folder(folder: Path) -> Path:
     """Return where a folder of :func:`whole_folder` is: beside its place if a crash came while it was moved.
 
     The old one is moved away only when the new one is complete, so without the folder both others are whole.
@@ -129,9 +129,9 @@ def settle_folder(folder: Path) -> None:
     Raises:
         ValueError: if it cannot be moved into its place.
     """
-    found = found_folder(folder)
+    found = find_folder(folder)
     if found != folder:
-        with _refusals_told(f"folder {folder}"):
+        with _explain_refusals(f"folder {folder}"):
             found.rename(folder)
     for leftover in _beside(folder):
         shutil.rmtree(leftover, ignore_errors=True)
@@ -146,7 +146,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
     """
     settle_folder(folder)
     partial, old = _beside(folder)
-    with _refusals_told(f"folder {folder}"), _made_folder(folder.parent):
+    with _explain_refusals(f"folder {folder}"), _make_folder(folder.parent):
         try:
             partial.mkdir()
             yield partial
@@ -154,7 +154,7 @@ def whole_folder(folder: Path) -> Iterator[Path]:
                 folder.rename(old)
             partial.rename(folder)
         finally:
-            if found_folder(folder) == folder:
+            if find_folder(folder) == folder:
                 for leftover in (partial, old):
                     shutil.rmtree(leftover, ignore_errors=True)
 

@@ -24,7 +24,7 @@ from .competitors import Kind, Likelihood, check_competitor, made
 from .dataset import FAULTS
 
 
-def chosen_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
+def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
     entry, without that axis.
     """
@@ -306,7 +306,7 @@ class _CheckedInPython(_InPython):
 
     def _filled(self, part: Any) -> Any:
         width = part[0].shape[-1]
-        return chosen_lanes(part, numpy.minimum(numpy.arange(width), self.count - 1))
+        return select_lanes(part, numpy.minimum(numpy.arange(width), self.count - 1))
 
     def start(self, initial: Any, second: Any) -> None:
         """Keep the memory; an array of the initial estimate may be changed in place."""

@@ -8,10 +8,10 @@ import numpy
 from ..envs.backend import task_on
 from ..envs.catalogue import find_scenario, import_task, opened
 from ..envs.filter import Filter, Initial, Input
-from ..envs.recording import MOST_NUMBERS, Recording, measured_once
+from ..envs.recording import MOST_NUMBERS, Recording, measure_once
 from ..envs.recording_files import differing
 from ..envs.task import Episode, Task, named_arrays
-from .rollout import Progress, started_lanes
+from .rollout import Progress, start_lanes
 from .seeds import episode_seeds
 
 CHUNK = 256
@@ -65,7 +65,7 @@ def record(
     plain = task_on("numpy", cls.id, scenario=chosen, **keywords)
     if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
-    arrays = dict(named_arrays(measured_once(plain)[1]))
+    arrays = dict(named_arrays(measure_once(plain)[1]))
     row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(plain.components) + 1
     if row * episodes * (plain.horizon + 1) > MOST_NUMBERS:
         raise ValueError(
@@ -74,7 +74,7 @@ def record(
         )
     task = task_on(backend, cls.id, scenario=chosen, **keywords).with_filter(NoFilter)
     chunks = [
-        _recorded(task, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
+        _record(task, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
     ]
     joined = [
         {name: numpy.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -112,7 +112,7 @@ def times_there(lengths: numpy.ndarray, rows: int) -> numpy.ndarray:
     return numpy.arange(rows) <= lengths[:, None]
 
 
-def _recorded(
+def _record(
     task: Task, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
     """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
@@ -131,7 +131,7 @@ def _recorded(
             series.setdefault(name, []).append(first(values))
         series.setdefault("truth", []).append(first(task.world.state(episode.truth)))
 
-    lanes, nothing = started_lanes(task, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
+    lanes, nothing = start_lanes(task, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(nothing):
             keep(episode)

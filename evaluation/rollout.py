@@ -19,7 +19,7 @@ Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
 
 
-def started_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+def start_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
     Args:
@@ -60,12 +60,12 @@ def rollout(
     kind = kind or kind_of(competitor)
     if kind != "policy":
         task = put_in_loop(task, competitor, kind, name, len(seeds))
-        lanes, action = started_lanes(task, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+        lanes, action = start_lanes(task, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
         for _ in range(lanes.decisions_per_episode):
             for found, _ in lanes.decide(action, report):
                 yield found, action
         return
-    lanes = started_lanes(task, seeds)
+    lanes = start_lanes(task, seeds)
     policy = SteppingPolicy(task, check_competitor(name, made(competitor, task), kind))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler.functions import padded_width
-from ..envs.environment import checked_action
+from ..envs.environment import check_action
 from ..envs.task import Task
 from .competitors import Policy
 
@@ -101,7 +101,7 @@ class SteppingPolicy(Policy):
         answers, kept = [], []
         for call, memory in zip(calls, memories, strict=True):
             answer, after = self.policy.predict(batch[call], memory, start[call], deterministic=deterministic)
-            answers.append(checked_action(self.task.action_space, answer, len(call)))
+            answers.append(check_action(self.task.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
         return (action[0] if single else action), Memory(kept, False)

@@ -72,7 +72,7 @@ class Store:
         if path is None or not path.is_file():
             return None
         try:
-            return msgspec.msgpack.decode(path.read_bytes(), type=kind, dec_hook=_decoded)
+            return msgspec.msgpack.decode(path.read_bytes(), type=kind, dec_hook=_decode)
         except (msgspec.MsgspecError, OSError, ValueError, TypeError, LookupError):
             return None  # somebody else's, or damaged: it is made again
 
@@ -84,7 +84,7 @@ class Store:
         """
         path = self._path(work)
         if path is not None:
-            content = msgspec.msgpack.encode(result, enc_hook=_encoded)
+            content = msgspec.msgpack.encode(result, enc_hook=_encode)
             with whole_file(path) as partial:
                 partial.write_bytes(content)
 
@@ -109,7 +109,7 @@ class Store:
             self.folder.rmdir()
 
 
-def _encoded(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     """Put into plain values what MessagePack has no words for."""
     if isinstance(value, numpy.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
@@ -120,8 +120,8 @@ def _encoded(value: Any) -> Any:
     raise NotImplementedError(f"a {type(value).__name__} cannot be kept")
 
 
-def _decoded(kind: type, value: Any) -> Any:
-    """Return what :func:`_encoded` was given."""
+def _decode(kind: type, value: Any) -> Any:
+    """Return what :func:`_encode` was given."""
     if kind is numpy.ndarray:
         dtype, shape, content = value
         return numpy.frombuffer(content, dtype).reshape(shape).copy()

@@ -26,7 +26,7 @@ TOGETHER = 4 * BLOCK
 """Episodes of a piece of work: enough that what comes back is little beside what was done for it."""
 
 
-class Asked(NamedTuple):
+class EvaluationRequest(NamedTuple):
     """One competitor of an experiment."""
 
     experiment: Experiment
@@ -56,7 +56,7 @@ class Asked(NamedTuple):
         """How many there are."""
         return (self.end - self.first) * self.horizon
 
-    def pieces(self) -> list["Asked"]:
+    def pieces(self) -> list["EvaluationRequest"]:
         """Return the pieces of work that this is: one, unless there are many episodes."""
         if self.episodes <= TOGETHER:
             return [self]
@@ -97,7 +97,7 @@ def _resampling(episodes: int) -> Bootstrap:
     return Bootstrap(episodes, RESAMPLES)
 
 
-def summarise(asked: Asked, tick: Progress) -> Summary | Part:
+def summarise(asked: EvaluationRequest, tick: Progress) -> Summary | Part:
     """Run what is asked for and reduce it; of a piece of the episodes only, return what they contribute.
 
     Raises:
@@ -115,7 +115,7 @@ def summarise(asked: Asked, tick: Progress) -> Summary | Part:
 
 
 def reduce_episodes(
-    asked: Asked, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
+    asked: EvaluationRequest, declare: Callable[[xarray.Dataset], Iterable[Statistic]], tick: Progress
 ) -> Part:
     """Run what is asked for and reduce it to statistics, a block of episodes at a time.
 
@@ -150,7 +150,7 @@ def _head(run: xarray.Dataset) -> xarray.Dataset:
 
 
 def summaries(
-    asked: Sequence[Asked],
+    asked: Sequence[EvaluationRequest],
     workers: Workers,
     progress: Progress | None = None,
     store: Store | None = None,
@@ -183,13 +183,13 @@ def summaries(
         if progress is not None:
             progress(one.measurements)
         yield i, found
-    for i, found in _summarised(asked, missing, workers, progress):
+    for i, found in _summarise(asked, missing, workers, progress):
         store.write(keys[i], found)
         yield i, found
 
 
-def _summarised(
-    asked: Sequence[Asked], missing: Sequence[int], workers: Workers, progress: Progress | None
+def _summarise(
+    asked: Sequence[EvaluationRequest], missing: Sequence[int], workers: Workers, progress: Progress | None
 ) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
         for i in missing:

@@ -14,12 +14,12 @@ from .envs.catalogue import imported, make_task, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
-from .evaluation.evaluate import Experiment, check_shown, control_of
+from .evaluation.evaluate import Experiment, check_observation, control_of
 from .evaluation.metrics import Record
 from .evaluation.recording import record as record
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
-from .evaluation.summary import Asked
+from .evaluation.summary import EvaluationRequest
 
 GATED = "gated:"
 """Before the name of a policy: the policy behind a gate, see :mod:`.agents.gate`."""
@@ -137,7 +137,7 @@ def competitors_of(
         )
     named = competitors if isinstance(competitors, Mapping) else {str(name): name for name in competitors}
     for name, entry in named.items():
-        if entry != name and _is_taken(problem, name) and entry != find_competitor(problem, name):
+        if entry != name and _is_competitor(problem, name) and entry != find_competitor(problem, name):
             raise ValueError(
                 f"{name!r} is the name of what {problem.id} has already: call your own something else"
             )
@@ -149,17 +149,17 @@ def competitors_of(
     }
 
 
-def _is_taken(problem: Problem, name: str) -> bool:
+def _is_competitor(problem: Problem, name: str) -> bool:
     """Whether a name is that of a competitor of the environment."""
     return name in problem.names or name in shipped_agents(problem.id)
 
 
-def asked_of(
+def evaluation_requests(
     problem: Problem,
     experiment: Experiment,
     competitors: str | Path | Sequence[str | Path] | Mapping[str, Any],
     trust: bool = False,
-) -> list[Asked]:
+) -> list[EvaluationRequest]:
     """Return what :func:`.evaluation.summary.summaries` makes of an experiment, for each competitor.
 
     Args:
@@ -174,7 +174,7 @@ def asked_of(
     makers = competitors_of(problem, competitors, trust)
     task = make_task(problem.id, experiment.control, experiment.scenario, **experiment.keywords)
     own = problem.baselines.metrics
-    return [Asked(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
+    return [EvaluationRequest(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
 
 
 def make_policy(
@@ -229,7 +229,7 @@ def make_policy(
                     f"policy {name!r} acts in an environment with {parameter}={value!r}, and this one has {own!r}: "
                     "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
                 )
-    check_shown(task, maker, name)
+    check_observation(task, maker, name)
     return SteppingPolicy(task, check_competitor(name, made(maker, task), kind), scenario, keywords)
 
 

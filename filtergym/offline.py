@@ -155,7 +155,7 @@ def write_datasets(
                 returns += [float(episode.rewards.sum()) for episode in part]
                 if dataset is None:
                     about = f"{episodes} episodes of policy {policy}, control {stepping.control}, {story}"
-                    dataset = _created(name, part, gymnasium.make(cls.id, **made_with), policy, about)
+                    dataset = _create(name, part, gymnasium.make(cls.id, **made_with), policy, about)
                 else:
                     dataset.update_dataset_from_buffer(_buffers(part))
             mean = sum(returns) / episodes
@@ -184,8 +184,8 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
     owner, _, title = id.partition("/")
     title, _, version = title.rpartition("-v")
     if namespace is None:
-        namespace = f"{owner}/{_worded(re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '-', title).lower())}"
-    names = [f"{namespace}/{_worded(policy)}-v{version}" for policy in policies]
+        namespace = f"{owner}/{_minari_name(re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '-', title).lower())}"
+    names = [f"{namespace}/{_minari_name(policy)}-v{version}" for policy in policies]
     for i, name in enumerate(names):
         parse_dataset_id(name)
         if name in names[:i]:
@@ -197,7 +197,7 @@ def _names(id: str, policies: Sequence[str], namespace: str | None, root: Path) 
     return names
 
 
-def _worded(text: str) -> str:
+def _minari_name(text: str) -> str:
     """Letters, digits and hyphens, which Minari takes for a name."""
     return re.sub(r"[^\w-]+", "-", text).strip("-")
 
@@ -234,7 +234,7 @@ def _buffers(episodes: Sequence[Transitions]) -> list[Any]:
     ]
 
 
-def _created(name: str, episodes: Sequence[Transitions], env: Any, policy: str, about: str) -> Any:
+def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, about: str) -> Any:
     """Make a Minari data set of its first episodes."""
     import minari
 

@@ -28,7 +28,7 @@ class Update(NamedTuple):
     """Normalised innovation squared (NIS), ``(N,)``."""
 
 
-def _batched(matrix: Array) -> Array:
+def _with_batch_axis(matrix: Array) -> Array:
     """Give a matrix shared by the batch a batch axis of one."""
     return matrix[..., None] if matrix.ndim == 2 else matrix
 
@@ -45,7 +45,7 @@ def predict(
         Q: covariance of the process noise, ``(n, n)`` or ``(n, n, N)``.
         offset: known input, ``(n, N)`` or None.
     """
-    F, Q = _batched(F), _batched(Q)
+    F, Q = _with_batch_axis(F), _with_batch_axis(Q)
     moved = apply(F, mean)
     if offset is not None:
         moved = moved + offset
@@ -63,7 +63,7 @@ def update(mean: Array, covariance: Array, z: Array, H: Array, R: Array) -> Upda
         R: covariance of the measurement noise, ``(m, m)`` or ``(m, m, N)``.
     """
     xp = namespace(mean)
-    H, R = _batched(H), _batched(R)
+    H, R = _with_batch_axis(H), _with_batch_axis(R)
     innovation = z - apply(H, mean)
     HP = product(H, covariance)
     S = product(HP, transpose(H)) + R

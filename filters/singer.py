@@ -28,7 +28,7 @@ _NODES, _WEIGHTS = numpy.polynomial.legendre.leggauss(16)
 """Exact to rounding for the integrand of Q up to alpha T = 1."""
 
 
-def _checked(alpha: float, T: float) -> None:
+def _check(alpha: float, T: float) -> None:
     if not (math.isfinite(alpha) and alpha >= 0.0):
         raise ValueError(f"alpha must be a finite number of at least 0, got {alpha!r}")
     if not (math.isfinite(T) and T >= 0.0):
@@ -42,7 +42,7 @@ def acceleration_response(alpha: float, T: float) -> numpy.ndarray:
         alpha: inverse correlation time of the acceleration, 1/s; 0 is a constant acceleration.
         T: interval, s.
     """
-    _checked(alpha, T)
+    _check(alpha, T)
     x = alpha * T
     if x < 1.0:
         # (x - 1 + exp(-x)) / x^2 = sum (-x)^n / (n + 2)!, by Horner.
@@ -81,7 +81,7 @@ def process_noise(alpha: float, sigma: float, T: float) -> numpy.ndarray:
     Raises:
         ValueError: an argument is negative or not finite.
     """
-    _checked(alpha, T)
+    _check(alpha, T)
     if not (math.isfinite(sigma) and sigma >= 0.0):
         raise ValueError(f"sigma must be a finite number of at least 0, got {sigma!r}")
     x = alpha * T

@@ -175,12 +175,12 @@ def stored(tmp_path):
 
 
 def test_policy_of_another_environment_is_refused(stored):
-    from filtergym.agents.learned_policy import stored_policy
+    from filtergym.agents.learned_policy import load_policy
 
     assert evaluate(ID, [str(stored())], episodes=1).sizes["episode"] == 1
     path = stored(environment="filtergym/Other-v0")
     with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
-        stored_policy(problem_of(ID).task, path)
+        load_policy(problem_of(ID).task, path)
     fields = [field.name for field in make_task(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))
     with pytest.raises(ValueError, match=r"was trained on other fields .* has no field 'range': choose from"):

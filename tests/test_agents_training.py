@@ -31,7 +31,7 @@ from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy, read_head
 from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
 from filtergym.agents.sb3_training import train_sb3
-from filtergym.agents.training_run import RunOptions, Session, Trainee, load_run, new_run, resumed_run
+from filtergym.agents.training_run import RunOptions, Session, Trainee, load_run, new_run, resume_run
 from sb3_contrib import RecurrentPPO
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -94,7 +94,7 @@ def test_resumed_run_equals_one_that_never_stopped(algorithm, tmp_path):
 
     train(small_run(algorithm, steps), parts, progress=interrupt)
     assert 200 <= load_run(parts).steps_done < 600
-    train(resumed_run(parts, small_run(algorithm, steps)), parts, resume=True)
+    train(resume_run(parts, small_run(algorithm, steps)), parts, resume=True)
     assert load_run(parts).steps_done == load_run(tmp_path / "whole").steps_done == steps
     one, other = weights(algorithm, parts), weights(algorithm, tmp_path / "whole")
     assert one.keys() == other.keys()
@@ -117,7 +117,7 @@ def test_a_signal_leaves_a_checkpoint_to_resume_from(algorithm, number, tmp_path
     done = load_run(tmp_path).steps_done
     assert 0 < done < 2000
     assert signal.getsignal(number) is before
-    train(resumed_run(tmp_path, small_run(algorithm, 2000)), tmp_path, resume=True)
+    train(resume_run(tmp_path, small_run(algorithm, 2000)), tmp_path, resume=True)
     assert load_run(tmp_path).steps_done >= 2000
     assert len(load_run(tmp_path).validation) == 2
 
@@ -131,7 +131,7 @@ def test_resuming_a_finished_run_changes_nothing(algorithm, tmp_path):
     train(small_run(algorithm, 240), tmp_path)
     before = contents(tmp_path)
     for steps in (240, 100):
-        run = train(resumed_run(tmp_path, small_run(algorithm, steps)), tmp_path, resume=True)
+        run = train(resume_run(tmp_path, small_run(algorithm, steps)), tmp_path, resume=True)
         assert len(run.validation) == 1
         assert contents(tmp_path) == before
 
@@ -144,8 +144,8 @@ def test_a_checkpoint_newer_than_the_record_is_the_run(tmp_path):
     record = (tmp_path / "run.json").read_bytes()
     (tmp_path / "run.json").unlink()
     with pytest.raises(ValueError, match="add --resume"):
-        training_run.opened_run(tmp_path, small_run("bptt", 400), resume=False)
-    run = resumed_run(tmp_path, small_run("bptt", 800))
+        training_run.open_run(tmp_path, small_run("bptt", 400), resume=False)
+    run = resume_run(tmp_path, small_run("bptt", 800))
     assert (tmp_path / "run.json").read_bytes() == record
     assert train(run, tmp_path, resume=True).steps_done == 800
 
@@ -313,22 +313,22 @@ def test_algorithm_that_does_not_fit(algorithm, control, message, tmp_path):
 def test_checkpoints_that_cannot_be_resumed(algorithm, tmp_path):
     run = small_run(algorithm, 400)
     with pytest.raises(ValueError, match=r"it has no run\.json"):
-        resumed_run(tmp_path, run)
+        resume_run(tmp_path, run)
     train(run, tmp_path)
     with pytest.raises(ValueError, match="holds a run with control 'gain', not 'weights'"):
-        resumed_run(tmp_path, small_run(algorithm, 400, control="weights"))
+        resume_run(tmp_path, small_run(algorithm, 400, control="weights"))
     with pytest.raises(ValueError, match="holds a run with seed 0, not 3"):
-        resumed_run(tmp_path, small_run(algorithm, 400, seed=3))
+        resume_run(tmp_path, small_run(algorithm, 400, seed=3))
     later = dataclasses.replace(small_run(algorithm, 400), interface=7)
     with pytest.raises(ValueError, match="holds a run with interface 2, not 7"):
-        resumed_run(tmp_path, later)
+        resume_run(tmp_path, later)
     for file in (tmp_path / "checkpoint").iterdir():
         file.write_bytes(b"\x80garbage" * 20)
     with pytest.raises(ValueError, match=r"cannot read the checkpoint in"):
-        train(resumed_run(tmp_path, small_run(algorithm, 800)), tmp_path, resume=True)
+        train(resume_run(tmp_path, small_run(algorithm, 800)), tmp_path, resume=True)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(ValueError, match=r"cannot read .*run\.json"):
-        resumed_run(tmp_path, run)
+        resume_run(tmp_path, run)
 
 
 def test_normalisation_is_found_where_rl_zoo3_puts_it(tmp_path):

@@ -334,12 +334,12 @@ def test_a_fork_waits_for_a_thread_that_traces_or_compiles(monkeypatch, work):
             pause()
         return ordinary(x) / 11.0
 
-    def loaded(*given, own=native._loaded):
+    def loaded(*given, own=native._load):
         if work == "compilation" and not begun.is_set():
             pause()
         return own(*given)
 
-    monkeypatch.setattr(native, "_loaded", loaded)
+    monkeypatch.setattr(native, "_load", loaded)
     thread = threading.Thread(target=Function(function, graph), args=(x,))
     thread.start()
     begun.wait()

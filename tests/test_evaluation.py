@@ -10,7 +10,7 @@ import xarray
 from filtergym.baselines import tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.baselines.tuned_values import merged_table
+from filtergym.baselines.tuned_values import merge_tables
 from filtergym.baselines.tuning import Candidate, Search, mean_cost, tune
 from filtergym.evaluation.competitors import Policy
 from filtergym.evaluation.dataset import windows_of
@@ -176,6 +176,6 @@ def test_shipped_values_are_used_unless_there_are_ones_own(tmp_path, monkeypatch
 
 def test_merging_keeps_the_other_policies():
     outcome = tune(problem_of(ENV), "fixed-best", Search(20 * 8 * 100, episodes=8))
-    table = json.loads(merged_table('{"imm": {"values": {}}}', outcome, "a command"))
+    table = json.loads(merge_tables('{"imm": {"values": {}}}', outcome, "a command"))
     assert set(table) == {"imm", "fixed-best"}
     assert math.isfinite(table["fixed-best"]["validation_cost"])

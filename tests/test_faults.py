@@ -16,10 +16,10 @@ from filtergym.agents.training_run import (
     best_agent,
     load_run,
     new_run,
-    resumed_run,
+    resume_run,
 )
 from filtergym.baselines.problem import problem_of
-from filtergym.evaluation.files import found_folder, settle_folder, whole_files, whole_folder, write_text
+from filtergym.evaluation.files import find_folder, settle_folder, whole_files, whole_folder, write_text
 
 STEPS = ("open", "replace", "rename", "mkdir", "unlink", "rmdir")
 """Calls of the operating system that change the disk."""
@@ -111,7 +111,7 @@ def put_files(place, content):
 WRITERS = {
     "file": (lambda place, content: write_text(place / "x", content), lambda place: [place / "x"]),
     "files": (put_files, lambda place: [place / "a", place / "b"]),
-    "folder": (put_folder, lambda place: [found_folder(place / "x") / name for name in ("a", "b")]),
+    "folder": (put_folder, lambda place: [find_folder(place / "x") / name for name in ("a", "b")]),
 }
 
 
@@ -182,12 +182,12 @@ def test_a_run_is_resumed_after_a_fault_at_any_step(points, kind, monkeypatch, t
 
     def check(place):
         folder, _ = place
-        if not found_folder(folder / "checkpoint").exists():
+        if not find_folder(folder / "checkpoint").exists():
             assert points == 1  # a first checkpoint that was not completed is none
             assert not (folder / "run.json").exists()
             return
         best = int(best_agent(folder).read_text())
-        run = resumed_run(folder, asked())
+        run = resume_run(folder, asked())
         assert run.steps_done in {100, 100 * points}
         assert int((folder / "checkpoint" / "agent.safetensors").read_text()) == run.steps_done
         assert [entry["steps"] for entry in run.validation] == list(range(100, run.steps_done + 1, 100))

@@ -10,7 +10,7 @@ from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.evaluation.competitors import Likelihood
 from filtergym.evaluation.dataset import FAULTS
 from filtergym.evaluation.filters import find_fault, is_lacking, put_in_loop
-from filtergym.evaluation.rollout import rollout, started_lanes
+from filtergym.evaluation.rollout import rollout, start_lanes
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import packed_covariance
 from scipy.stats import multivariate_normal
@@ -143,7 +143,7 @@ def test_log_likelihood_is_the_density_of_every_measurement_as_it_was_predicted(
 def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_arrived():
     id = "filtergym/UavAutopilot-v0"
     task = make_task(id, "gain", "random", horizon=400, dropout_period=60, dropout_length=(10, 30))
-    lanes = started_lanes(task, episode_seeds("test", 2, 8))
+    lanes = start_lanes(task, episode_seeds("test", 2, 8))
     bank, R, counts = task.bank, np.diag(task.sensor_variances), set()
     for _ in range(lanes.decisions_per_episode):
         state, measurement = lanes.state.filter, lanes.state.measurement

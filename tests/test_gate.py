@@ -299,7 +299,7 @@ def small(monkeypatch, tmp_path):
         asked = training_run.new_run(
             problem_of(ID), training_run.RunOptions("ppo", None, steps, 4, overrides=network, **around)
         )
-        run = training_run.opened_run(tmp_path / folder, asked, resume)
+        run = training_run.open_run(tmp_path / folder, asked, resume)
         session = training_run.Session(tmp_path / folder, resume, 10**9, True, progress)
         return train_sb3(run, session), tmp_path / folder
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from filtergym.agents.learned_estimator import EstimatorMaker
-from filtergym.agents.learned_policy import LearnedPolicy, stored_policy, write_arrays
+from filtergym.agents.learned_policy import LearnedPolicy, load_policy, write_arrays
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue, make_task
 from filtergym.envs.draws import Draws
@@ -177,7 +177,7 @@ def stored(tmp_path):
 
 def test_a_file_is_an_estimator(stored, command):
     pytest.importorskip("stable_baselines3")
-    assert kind_of(stored_policy(problem_of(RADAR).task, stored)) == "estimator"
+    assert kind_of(load_policy(problem_of(RADAR).task, stored)) == "estimator"
     code, out, _ = command("evaluate", RADAR, "--policy", stored, "--policy", "imm", "--episodes", 2)
     assert code == 0
     assert "(est" in out

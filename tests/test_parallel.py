@@ -30,7 +30,7 @@ from filtergym.evaluation.summary import Summary, combine_summaries, summaries
 
 import filtergym
 from filtergym import evaluate, tidy_records
-from filtergym.names import asked_of
+from filtergym.names import evaluation_requests
 from filtergym.reports import benchmark, work
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -79,7 +79,7 @@ def test_summaries_tell_what_the_evaluation_does(env):
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
-    asked = asked_of(
+    asked = evaluation_requests(
         problem_of(env), problem_of(env).experiment(episodes=6, drawn_episodes=1, keywords=shorter), names
     )
     assert [one.episodes for one in asked] == [6] * len(names)
@@ -116,7 +116,9 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
     whole, expected = tidy_records(dataset), filtergym.evaluation.curves.curves_of(dataset)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     monkeypatch.setattr(summary, "TOGETHER", 16)
-    asked = asked_of(problem_of(env), problem_of(env).experiment(episodes=40, keywords=shorter), names)
+    asked = evaluation_requests(
+        problem_of(env), problem_of(env).experiment(episodes=40, keywords=shorter), names
+    )
     assert len(asked[0].pieces()) == 3
     in_turn = dict(summaries(asked, Workers()))
     monkeypatch.setattr(Workers, "run", shuffled(Workers.run))
@@ -187,7 +189,7 @@ def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatc
 
 
 def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, monkeypatch):
-    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm-tuned"])
+    [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm-tuned"])
     store = Store(tmp_path / "unfinished")
 
     def read(other):
@@ -227,7 +229,7 @@ def edit(tmp_path, monkeypatch):
 )
 def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, file, same):
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
-    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
+    [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     store = Store(tmp_path / "unfinished")
     list(summaries([asked], Workers(), None, store, [work.work_of(asked)]))
     calls = []
@@ -251,7 +253,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
 def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
-    [asked] = asked_of(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
+    [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
     assert work.work_of(asked) is None
 

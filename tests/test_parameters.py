@@ -7,7 +7,7 @@ import pytest
 from filtergym.envs.catalogue import make_task
 from filtergym.envs.parameters import TaskParameters, parameter, sized, square_matrix
 
-from filtergym.commands.terminal import parsed_settings
+from filtergym.commands.terminal import parse_settings
 
 
 @dataclass(frozen=True)
@@ -106,4 +106,4 @@ TARGET, NAVIGATION = "ManeuveringTarget", "TightlyCoupledNavigation"
 )
 def test_types_are_checked_also_from_the_command_line(id, setting, message):
     with pytest.raises(ValueError, match=message):
-        make_task(id, **parsed_settings([setting]))
+        make_task(id, **parse_settings([setting]))

@@ -11,7 +11,7 @@ from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import Bootstrap
-from filtergym.evaluation.rollout import started_lanes
+from filtergym.evaluation.rollout import start_lanes
 from filtergym.papers.measured import Measured
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
 
@@ -155,7 +155,7 @@ def test_exact_errors_after_a_minute():
 def played(task, estimator, seeds, decisions):
     """What was told of the start; then episodes after each measurement, and the estimator's mean and covariance."""
     begun, states = [], []
-    lanes = started_lanes(task, seeds, begun.append)
+    lanes = start_lanes(task, seeds, begun.append)
     (start,) = begun
     memory = estimator.start(start.measurement, start.truth)
     for _ in range(decisions):
@@ -223,7 +223,7 @@ def test_ideal_keeps_its_bound_where_the_class_changes():
 
 def decided(task, policy, seeds, decisions):
     """States after measurement and after the policy's action."""
-    lanes = started_lanes(task, seeds)
+    lanes = start_lanes(task, seeds)
     for _ in range(decisions):
         before = lanes.state
         action, _ = policy.predict(lanes.observe())
@@ -284,7 +284,7 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
     )
     joint = numpy.repeat((composition / 3.0)[:, :, None], 8, axis=2)
     last, state = numpy.zeros((4, 8)), None
-    lanes = started_lanes(task, range(8))
+    lanes = start_lanes(task, range(8))
     for step in range(60):
         bank = lanes.state.filter
         action, state = policy.predict(lanes.observe(), state, numpy.full(8, step == 0))
@@ -307,7 +307,7 @@ def test_forgetting_nothing_is_the_joint_posterior():
     task = make_task(ID, "weights", "random")
     joint, kept = baselines.JointType(task), baselines.ForgettingJointType(task, change=0.0)
     state = None
-    lanes = started_lanes(task, range(8))
+    lanes = start_lanes(task, range(8))
     for step in range(60):
         shown = lanes.observe()
         action, state = kept.predict(shown, state, numpy.full(8, step == 0))

@@ -19,7 +19,7 @@ from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.envs.recorded_tables import Columns
-from filtergym.envs.recording import measured_once
+from filtergym.envs.recording import measure_once
 from filtergym.envs.task import named_arrays
 from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.estimates import write_estimates
@@ -109,7 +109,7 @@ def _names(env):
 def test_types_of_measurements_come_back(recordings):
     for env, recording in recordings.items():
         task = make_task(env, scenario=recording)
-        expected = dict(named_arrays(measured_once(make_task(env, **OPEN[env]))[1]))
+        expected = dict(named_arrays(measure_once(make_task(env, **OPEN[env]))[1]))
         lanes = Lanes(task, 2)
         for lane in range(2):
             lanes.seed(lane, np.random.default_rng(lane))
@@ -458,7 +458,7 @@ def test_ranges_and_decisions(tmp_path):
     assert read.initial["first_decision"][0] == 1
     assert read.initial["first_bearing_difference"][0] == -3.0
     # Everyone is told what the simulation tells.
-    initial, _ = measured_once(make_task(ESM))
+    initial, _ = measure_once(make_task(ESM))
     np.testing.assert_allclose(read.initial["covariance"][0], initial.covariance[..., 0])
     assert np.isfinite(evaluate(ESM, _names(ESM)[:1], scenario=read, tracks=True)["estimate"].values).all()
 

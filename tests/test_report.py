@@ -19,8 +19,8 @@ from filtergym.reports.results import (
     Settings,
     read_all_results,
     read_results,
+    select_competitors,
     settings_of,
-    shown_competitors,
     spread,
     write_results,
 )
@@ -126,7 +126,7 @@ def test_a_file_of_results_is_bounded(result):
 
 
 def test_what_tells_most_is_shown(result):
-    names = shown_competitors(result.records, "imm", "known-turn", ["ppo"])
+    names = select_competitors(result.records, "imm", "known-turn", ["ppo"])
     assert names[:2] == ["imm", "known-turn"]
     assert set(names) == set(NAMES)
 

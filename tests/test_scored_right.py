@@ -143,10 +143,10 @@ class TestNormalisation:
     @pytest.mark.parametrize("dtype", [None, np.float32])
     @pytest.mark.parametrize("normalisation", [{}, {"norm_obs": True}, {"norm_obs": False}])
     def test_the_sign_of_it(self, sb3, name, dtype, normalisation, tmp_path):
-        from filtergym.agents.sb3_policy import trained_normalised
+        from filtergym.agents.sb3_policy import was_trained_normalised
 
         model = sb3.normalised(name, env=sb3.env(dtype=dtype, **normalisation))
-        sign = trained_normalised(type(model).load(save(model, tmp_path, statistics=None)))
+        sign = was_trained_normalised(type(model).load(save(model, tmp_path, statistics=None)))
         exact = normalisation.get("norm_obs", False)
         if dtype is None:
             assert sign == exact

@@ -13,7 +13,7 @@ from filtergym.agents import training_run
 from filtergym.agents.search import (
     VALIDATIONS,
     Search,
-    ended_trials,
+    finished_trials,
     read_space,
     run_folder,
     search_hyperparameters,
@@ -50,7 +50,7 @@ def pretended(run, session):
 
 
 def outcome(study):
-    return [(trial.params, trial.value, trial.state.name) for trial in ended_trials(study)]
+    return [(trial.params, trial.value, trial.state.name) for trial in finished_trials(study)]
 
 
 @pytest.mark.parametrize("how", ["crash", "wish"])
@@ -68,7 +68,7 @@ def test_a_resumed_search_equals_one_that_never_stopped(how, tmp_path):
 
     folder = tmp_path / "parts"
     try:
-        assert len(ended_trials(search_hyperparameters(search(), folder, 14, interrupted))) == 2
+        assert len(finished_trials(search_hyperparameters(search(), folder, 14, interrupted))) == 2
     except KeyboardInterrupt:
         assert how == "crash"
     assert len(outcome(search_hyperparameters(search(), folder, 14, pretended))) == 14
@@ -81,7 +81,7 @@ def test_a_resumed_search_equals_one_that_never_stopped(how, tmp_path):
 
 def test_a_trial_is_worth_its_lowest_costs_and_the_best_is_written(tmp_path):
     study = search_hyperparameters(search(), tmp_path, 5, pretended)
-    for trial in ended_trials(study):
+    for trial in finished_trials(study):
         each = [load_run(run_folder(tmp_path, trial.number, seed)) for seed in (0, 1)]
         assert trial.value == pytest.approx(sum(map(cost_of, each)) / 2, rel=1e-12)
         assert each[0].hyperparameters["hidden_size"] == json.loads(trial.params["hidden_size"])
@@ -104,7 +104,7 @@ def test_trials_that_fall_behind_are_pruned(tmp_path):
         return pretended(run, replace(session, validated=keep))
 
     study = search_hyperparameters(search(seeds=(0,)), tmp_path, 20, train)
-    states = [trial.state.name for trial in ended_trials(study)]
+    states = [trial.state.name for trial in finished_trials(study)]
     assert "PRUNED" not in states[:8]
     assert {"PRUNED", "COMPLETE"} == set(states[8:])
     for state, steps in zip(states, told, strict=True):
@@ -122,7 +122,7 @@ def test_what_cannot_be_trained_with_is_no_reason_to_stop_but_at_the_beginning(t
 
     failing, lines = {3}, []
     study = search_hyperparameters(search(seeds=(0,)), tmp_path / "later", 4, train, report=lines.append)
-    assert [trial.state.name for trial in ended_trials(study)] == [
+    assert [trial.state.name for trial in finished_trials(study)] == [
         "COMPLETE",
         "COMPLETE",
         "PRUNED",

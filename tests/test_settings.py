@@ -22,15 +22,15 @@ from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
-from filtergym.agents.settings import merged, parsed_settings, read_config
+from filtergym.agents.settings import merged, parse_settings, read_config
 from filtergym.agents.training_run import (
     RunOptions,
     Session,
     TrainingEpisodes,
     load_run,
     new_run,
-    opened_run,
-    stored_hyperparameters,
+    open_run,
+    read_hyperparameters,
 )
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -74,7 +74,7 @@ def trained(run, folder, **keywords):
     ],
 )  # fmt: skip
 def test_settings_are_yaml(word, env, algo):
-    assert parsed_settings([word]) == (env, algo)
+    assert parse_settings([word]) == (env, algo)
 
 
 @pytest.mark.parametrize(
@@ -82,12 +82,12 @@ def test_settings_are_yaml(word, env, algo):
 )
 def test_other_forms_are_refused(word):
     with pytest.raises(ValueError, match=r"--set needs env\.NAME=VALUE or algo\.NAME=VALUE"):
-        parsed_settings([word])
+        parse_settings([word])
 
 
 def test_what_is_no_yaml_is_refused():
     with pytest.raises(ValueError, match="cannot read the value"):
-        parsed_settings(["env.gains=[0.2"])
+        parse_settings(["env.gains=[0.2"])
 
 
 def test_mappings_are_merged_key_by_key():
@@ -113,7 +113,7 @@ PLAIN = "env: {range_sigma: 70.0}\nalgo: {n_envs: 4, gamma: 0.9, policy_kwargs: 
 def test_shipped_then_config_then_settings_then_options(text, tmp_path):
     config = tmp_path / "mine.yml"
     config.write_text(text)
-    shipped = stored_hyperparameters(ID, "ppo")
+    shipped = read_hyperparameters(ID, "ppo")
     run = new_run(problem_of(ID), RunOptions("ppo", config=config))
     assert run.envs == 4
     assert run.hyperparameters["gamma"] == 0.9
@@ -217,8 +217,8 @@ def test_training_leaves_the_record_of_its_hyperparameters_alone(tmp_path):
     def asked(**more):
         return new_run(problem_of(ID), replace(options, **more))
 
-    trained(opened_run(tmp_path, asked(), False), tmp_path)
-    opened_run(tmp_path, asked(), True)
+    trained(open_run(tmp_path, asked(), False), tmp_path)
+    open_run(tmp_path, asked(), True)
     assert load_run(tmp_path).hyperparameters == asked().hyperparameters
 
 
@@ -228,19 +228,19 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
     run = new_run(
         problem_of(ID), RunOptions(algorithm, "gain", 240, 4, overrides=SMALL[algorithm], keywords=keywords)
     )
-    run = trained(opened_run(tmp_path, run, False), tmp_path)
+    run = trained(open_run(tmp_path, run, False), tmp_path)
     kept = load_run(tmp_path)
     assert kept.hyperparameters["env_kwargs"] == keywords
     for word in ("env.range_sigma=60.0", "env.horizon=40", "env.reward="):
         assert f"--set {word}" in kept.command.replace("'", "")
-    assert parsed_settings(words_of(kept.command))[0] == keywords
+    assert parse_settings(words_of(kept.command))[0] == keywords
     dataset = evaluate(ID, ["imm"], episodes=8, split="validation", range_sigma=60.0, horizon=40)
     assert kept.validation[0]["paper_cost"] == pytest.approx(float(dataset["cost"].mean()), rel=1e-12)
     # The same again goes on, other settings are refused, and none are those of the run.
     again = new_run(
         problem_of(ID), RunOptions(algorithm, "gain", 480, 4, overrides=SMALL[algorithm], keywords=keywords)
     )
-    opened_run(tmp_path, again, True)
+    open_run(tmp_path, again, True)
     other = new_run(
         problem_of(ID),
         RunOptions(
@@ -248,9 +248,9 @@ def test_a_run_keeps_its_settings_and_validates_and_exports_with_them(algorithm,
         ),
     )
     with pytest.raises(ValueError, match=r"hyperparameters.env_kwargs.range_sigma 60.0, not 61.0"):
-        opened_run(tmp_path, other, True)
+        open_run(tmp_path, other, True)
     none = new_run(problem_of(ID), RunOptions(algorithm, "gain", 480, 4))
-    run = opened_run(tmp_path, none, True, same=True)
+    run = open_run(tmp_path, none, True, same=True)
     assert run.hyperparameters == kept.hyperparameters
     assert trained(run, tmp_path, resume=True).steps_done >= 480
     # What is exported is checked under the same parameters; an evaluation is of whatever it is asked for.
@@ -330,14 +330,14 @@ def test_training_on_a_mixture(algorithm, tmp_path):
     def asked(**more):
         return new_run(problem_of(ID), replace(options, **more))
 
-    run = trained(opened_run(tmp_path, asked(steps=160), False), tmp_path)
+    run = trained(open_run(tmp_path, asked(steps=160), False), tmp_path)
     assert load_run(tmp_path).scenario == "random:0.75,cruise:0.25"
     costs = [
         weight * evaluate(ID, ["imm"], name, episodes=8, split="validation", horizon=20)["cost"].mean().item()
         for name, weight in mixture.items()
     ]
     assert run.validation[0]["paper_cost"] == pytest.approx(sum(costs), rel=1e-12)
-    resumed = opened_run(tmp_path, asked(steps=400), True)
+    resumed = open_run(tmp_path, asked(steps=400), True)
     assert trained(resumed, tmp_path, resume=True).steps_done >= 400
     assert export_run(tmp_path, tmp_path / "agent.safetensors").scenario == run.scenario
 

@@ -446,14 +446,14 @@ def test_urban_errors_have_the_stated_quantiles():
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
         s = truth._replace(cn0=wide + cn0, multipath=wide, hold=wide)
         s = s._replace(faults=s.faults._replace(urban=numpy.ones(N)))
-        s = task.world._reflected(s, noise())
+        s = task.world._reflect(s, noise())
         assert (s.multipath >= 0.0).all()
         # 160,000 draws: four standard errors of the quantiles.
         assert numpy.median(s.multipath) == pytest.approx(median, abs=0.02 * median + 0.15)
         assert numpy.quantile(s.multipath, 0.95) == pytest.approx(upper, rel=0.03)
         assert s.hold.min() >= 48.0
         assert s.hold.max() <= 199.0
-        held = task.world._reflected(s, noise())
+        held = task.world._reflect(s, noise())
         assert (held.multipath == s.multipath).all()
 
 

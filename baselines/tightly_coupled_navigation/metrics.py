@@ -95,14 +95,14 @@ def gather(run: xarray.Dataset) -> Gathered:
     in_motion = numpy.arange(true_mode.shape[1]) >= begin[:, None]
     outside = lasting((run["rate_outside_aperture"].values > 0.0) & in_motion)
     each |= {
-        "switches": _counted(switches(true_mode, run["mode_probability"].values), len(true_mode), step),
+        "switches": _count_changes(switches(true_mode, run["mode_probability"].values), len(true_mode), step),
         "lost": numpy.asarray(outside.any(axis=1)),
         "lost_after": (outside.argmax(axis=1) - begin + 1.0) * step,
     }
     return Gathered(each)
 
 
-def _counted(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
+def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
     """Number of changes, of those that were missed, and seconds waited for the others, from and to each hypothesis.
 
     Returns:

@@ -25,7 +25,9 @@ class Track(NamedTuple):
     """True hypothesis at the last measurement, ``(N,)``."""
 
 
-def _replaced(matrix: Array, variance: float, task: TightlyCoupledNavigation, lanes: Array) -> Array:
+def _replace_acceleration(
+    matrix: Array, variance: float, task: TightlyCoupledNavigation, lanes: Array
+) -> Array:
     """Covariance ``(17, 17, N)`` with an acceleration that has nothing to do with the past in some lanes."""
     xp = task.xp
     part = [1.0 if gnss_ins.ACCELERATION.start <= i < gnss_ins.ACCELERATION.stop else 0.0 for i in range(17)]
@@ -59,7 +61,9 @@ class _KnownMode:
         moved = xp.concat(
             [track.mean[:8], xp.where(lanes, 0.0 * track.mean[8:11], track.mean[8:11]), track.mean[11:]]
         )
-        return track._replace(mean=moved, covariance=_replaced(track.covariance, variance, self.task, lanes))
+        return track._replace(
+            mean=moved, covariance=_replace_acceleration(track.covariance, variance, self.task, lanes)
+        )
 
     def predicted(self, truth: Truth, track: Track, noises: Array, variance: float) -> Track:
         """Prediction to the present measurement.

@@ -20,7 +20,7 @@ from ..measurement_noise import MeasurementNoise, Mehra, SageHusa, VariationalBa
 from ..table import Variant
 
 
-def told_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
+def likelihood_of(measurement: Measurement, log_likelihood: Array, nis: Array, xp: Any) -> Likelihood:
     """How well the readings were predicted; NaN in a dropout of all sensors."""
     count = ordered_sum(measurement.available)
     there = count > 0.0
@@ -131,7 +131,7 @@ class AdaptiveKalman:
     def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, gusts as designed."""
         after, log_likelihood, nis, *_ = self.filtered(memory, measurement, 1.0)
-        likelihood = told_of(measurement, log_likelihood, nis, self.xp)
+        likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
         return after.mean, packed_covariance.unpack(after.covariance, self.n), after, likelihood
 
 
@@ -166,7 +166,7 @@ class AdaptiveGusts(AdaptiveKalman):
         )
         level = adaptation.faded(level, sample, self.forgetting)
         level = level._replace(value=self.xp.clip(level.value, *self.limits))
-        likelihood = told_of(measurement, log_likelihood, nis, self.xp)
+        likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
         return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level), likelihood
 
 
@@ -224,7 +224,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         after = GustModels(tuple(step.filter for step in steps), probabilities)
         nis = weighted_sum(probabilities, xp.stack([step.nis for step in steps]))
         density = imm.log_mixture_density(log_predicted, likelihoods)
-        likelihood = told_of(measurement, density, nis, xp)
+        likelihood = likelihood_of(measurement, density, nis, xp)
         return *imm.combine(*self.stacked(after.filters), probabilities), after, likelihood
 
     def stacked(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:

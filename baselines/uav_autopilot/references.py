@@ -10,7 +10,7 @@ from ...envs.uav_autopilot.task import UavAutopilot
 from ...envs.uav_autopilot.world import Measurement, Start, Truth
 from ...evaluation.competitors import Likelihood
 from ...filters import packed_covariance
-from .estimators import told_of
+from .estimators import likelihood_of
 
 
 class TrueState:
@@ -101,7 +101,7 @@ class Matched(_ToldTheNoise):
             measurement.available,
         )
         covariance = packed_covariance.unpack(updated.covariance, len(self.task.components))
-        likelihood = told_of(measurement, updated.log_likelihood, updated.squared_distance, self.xp)
+        likelihood = likelihood_of(measurement, updated.log_likelihood, updated.squared_distance, self.xp)
         return updated.mean, covariance, Initial(updated.mean, updated.covariance), likelihood
 
 

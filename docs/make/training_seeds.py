@@ -27,13 +27,13 @@ from filtergym.evaluation.metrics import mean_over_time, reported_components, sc
 from filtergym.evaluation.parallel import Workers, check_workers
 from filtergym.evaluation.statistics import ALL, Statistic
 from filtergym.evaluation.store import Store, Work
-from filtergym.evaluation.summary import Asked, reduce_episodes
+from filtergym.evaluation.summary import EvaluationRequest, reduce_episodes
 from filtergym.papers.grid import Grid, markdown_table
 from pictures import draw_learning_curves
 from scipy.special import stdtrit
 
 from filtergym.names import find_competitor
-from filtergym.reports.tables import shown_components, with_interval
+from filtergym.reports.tables import select_components, with_interval
 from filtergym.reports.work import meaning_of, stem_of
 
 
@@ -243,7 +243,7 @@ def episode_means(
     """
     store = store or Store()
     found: dict[str, PolicyMeans | None] = {}
-    missing: list[tuple[str, Asked, Work | None]] = []
+    missing: list[tuple[str, EvaluationRequest, Work | None]] = []
     for name, (asked, work) in _asked_of(study, scenario).items():
         found[name] = store.read(work, PolicyMeans)
         if found[name] is None:
@@ -268,7 +268,7 @@ def episode_means(
     return EpisodeMeans(cost, squares, units)
 
 
-def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work | None]]:
+def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
     """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
     problem = study.problem
     makers = {member.name: find_competitor(problem, str(member.agent), study.trust) for member in study.runs}
@@ -278,7 +278,7 @@ def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     members = {member.name: member for member in study.runs}
     horizon = make_task(problem.id, None, scenario).horizon
-    found: dict[str, tuple[Asked, Work | None]] = {}
+    found: dict[str, tuple[EvaluationRequest, Work | None]] = {}
     for name, maker in makers.items():
         member = members.get(name)
         # A learned estimator has a filter of its own, and steers nothing.
@@ -291,7 +291,7 @@ def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[Asked, Work
             content = json.dumps([meaning, agent, name, repr(experiment), _own_digest()])
             work = Work(f"{stem_of(experiment)}.seeds", content)
         # An agent's name may be that of a competitor.
-        found[name] = Asked(experiment, "agent" if member else name, maker, horizon=horizon), work
+        found[name] = EvaluationRequest(experiment, "agent" if member else name, maker, horizon=horizon), work
     return found
 
 
@@ -301,7 +301,7 @@ def _own_digest() -> str:
     return files_digest([Path(__file__).parent])
 
 
-def _means_of(asked: Asked, tick: Callable[[int], None]) -> PolicyMeans:
+def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMeans:
     part = reduce_episodes(asked, _mean_statistics, tick)
     results, units = part.reduction.results(), reported_components(part.head)
     cost = results.pop(("cost",))
@@ -312,7 +312,7 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
     """Declare the mean cost of every episode, and the mean square of every component that is shown."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
-    for component in shown_components(list(reported_components(run))):
+    for component in select_components(list(reported_components(run))):
         squares = squared_errors(run, component, groups_of(run))[:, first - 1 : last]
         yield Statistic((component, "mean_square"), squares.mean(axis=1), sample=ALL)
 

@@ -198,7 +198,7 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
         """Block of what was done before."""
         raise NotImplementedError
 
-    def none_seen(self, zero: Array) -> Innovations:
+    def no_innovations(self, zero: Array) -> Innovations:
         """Innovations at the start of the track, of the shape of ``zero``."""
         return Innovations(zero, zero, zero, zero + 1.0, zero, zero + 1.0)
 
@@ -282,7 +282,7 @@ class NoiseBank(_KalmanBucyBank):
             coloured=zero,
             covariance=covariance,
             deviation=zero[0],
-            seen=self.none_seen(zero),
+            seen=self.no_innovations(zero),
             action=self.xp.stack([zero[0]] * len(NOISES)),
         )
 
@@ -367,7 +367,7 @@ class GainBank(_KalmanBucyBank):
         """Start where INS and reference agree."""
         zero = 0.0 * initial.mean
         variance = ins_gnss.PlainVariance(zero, zero, zero, zero)
-        return Steered(initial.mean, variance, self.none_seen(zero), zero, zero)
+        return Steered(initial.mean, variance, self.no_innovations(zero), zero, zero)
 
     def predict(self, state: Steered, measurement: Measurement) -> Steered:
         """Predict by the increment of the INS."""
@@ -459,7 +459,7 @@ class SchemeBank(_KalmanBucyBank):
             drift=zero,
             coloured=zero,
             covariance=p.modelled_prior(zero[0]),
-            seen=self.none_seen(each),
+            seen=self.no_innovations(each),
             weights=each[:, 0],
         )
 

@@ -108,7 +108,7 @@ class Maneuvered(Course):
     def advance(self, flight: Maneuvers, scan: Array, motion: Motion) -> Motion:
         """Go straight, and add what the manoeuvre adds that is flown in the scan period."""
         T, (position, before) = self.parameters.sampling_interval, motion
-        effect = self._picked(flight, flight.effect, scan)
+        effect = self._pick(flight, flight.effect, scan)
         acceleration = effect[4:]
         position = (position + T * before) + (0.5 * T**2) * acceleration
         velocity = before + T * acceleration
@@ -125,13 +125,13 @@ class Maneuvered(Course):
         T = self.parameters.sampling_interval
         time = T * (1.0 - early)
         turn, acceleration = (
-            self._picked(flight, flight.turn, scan) / T,
-            self._picked(flight, flight.acceleration, scan),
+            self._pick(flight, flight.turn, scan) / T,
+            self._pick(flight, flight.acceleration, scan),
         )
         position, velocity = after(time, turn, before, self.task)
         return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
 
-    def _picked(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
+    def _pick(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
         """Values ``(..., manoeuvres, N)`` of the manoeuvre that is flown in the scan period that ends with a scan."""
         active = self.xp.astype((scan >= flight.first) & (scan <= flight.last), values.dtype)
         # Manoeuvres do not overlap, so at most one term of the sum differs from zero.
@@ -169,7 +169,7 @@ class StatedManeuver(Maneuvered):
         return flight, (position, velocity)
 
 
-def _drawn_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
+def _draw_start(draws: Draws, p: ManeuveringTargetParameters) -> Motion:
     """Draw where a random flight begins, and with which velocity."""
     xp = draws.xp
     start_range, azimuth = draws.uniform("start_range", p.start_range), draws.uniform("azimuth", CIRCLE)
@@ -187,7 +187,7 @@ class RandomManeuvers(Maneuvered):
         """Draw a start and manoeuvres."""
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         slots = p.maneuver_count[1]
-        position, velocity = _drawn_start(draws, p)
+        position, velocity = _draw_start(draws, p)
         flown = xp.arange(slots, device=self.task.device)[:, None] < draws.integer(
             "maneuver_count", p.maneuver_count
         )
@@ -233,7 +233,7 @@ class RandomStraight(Course):
 
     def begin(self, draws: Draws, ones: Array) -> tuple[None, Motion]:
         """Draw a start; the number of manoeuvres takes a number though it is zero."""
-        motion = _drawn_start(draws, self.parameters)
+        motion = _draw_start(draws, self.parameters)
         draws.unit("maneuver_count")
         return None, motion
 

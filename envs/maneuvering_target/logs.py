@@ -87,7 +87,7 @@ def read_log(columns: Columns) -> TrackLog:
     )
 
 
-def scanned_regularly(recording: Recording, p: ManeuveringTargetParameters) -> bool:
+def has_regular_scans(recording: Recording, p: ManeuveringTargetParameters) -> bool:
     """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
     there = numpy.isfinite(recording.seconds)
     said = recording.measurements

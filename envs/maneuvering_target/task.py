@@ -17,7 +17,7 @@ from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .kalman_net import KalmanNetBank
-from .logs import FARTHEST_RANGE, LOG_FORMAT, scanned_regularly
+from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
 from .parameters import ManeuveringTargetParameters
 from .scenarios import SCENARIOS
 from .world import RadarWorld
@@ -134,7 +134,7 @@ class ManeuveringTarget(Task):
         count = len(self.parameters.gains)
         self.flights = self.parameters.track_scans
         self.regular = self.parameters.regular and (
-            self.recording is None or scanned_regularly(self.recording, self.parameters)
+            self.recording is None or has_regular_scans(self.recording, self.parameters)
         )
         """Whether every scan sees the target, all of them one ``sampling_interval`` apart."""
         self.modes = tuple(f"mode_{j + 1}" for j in range(count))

@@ -96,7 +96,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         before, glint = (truth.position, truth.velocity), uniforms[self.scans.row_uniforms :]
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
-        measured = self._measured(position, self.glint.amplified(errors, glint, self.xp))
+        measured = self._measure(position, self.glint.amplified(errors, glint, self.xp))
         variance = self._variances(measured)
         if not p.regular:
             seen = available > 0.0
@@ -111,7 +111,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Of a measurement of a position, m^2, ``(2, N)``."""
         return polar.cartesian_variances(position, self.parameters.range_sigma, self.bearing_sigma)
 
-    def _measured(self, position: Array, errors: Array) -> Array:
+    def _measure(self, position: Array, errors: Array) -> Array:
         """Measured position, m, ``(2, N)``, from errors in units of their standard deviations."""
         xp, p = self.xp, self.parameters
         if not p.polar_measurements:

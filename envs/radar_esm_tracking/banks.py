@@ -171,7 +171,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         zero = zeros[0]
         log_predicted = self.log_prior + zero
         no_counts = xp.stack([zero[0]] * self.task.types)
-        used, used_counts, refused_counts = self._counted(no_counts, no_counts, initial.first)
+        used, used_counts, refused_counts = self._count_decisions(no_counts, no_counts, initial.first)
         probabilities = imm.mode_posterior(log_predicted, self._esm_log_likelihood(used, initial.first))
         return Filters(
             mean=mean,
@@ -212,7 +212,9 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             covariance = xp.take(channels.covariance, column, axis=-1)
             log_predicted = imm.log_probabilities(f.believed) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
-        used, used_counts, refused_counts = self._counted(f.used_counts, f.refused_counts, measurement)
+        used, used_counts, refused_counts = self._count_decisions(
+            f.used_counts, f.refused_counts, measurement
+        )
         return Filters(
             mean,
             covariance,
@@ -220,8 +222,8 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             innovation,
             log_squared,
             log_likelihood,
-            self._averaged(f.average_innovation, innovation),
-            self._averaged(f.average_log_squared, log_squared),
+            self._average(f.average_innovation, innovation),
+            self._average(f.average_log_squared, log_squared),
             f.accumulated + log_likelihood,
             used,
             used_counts,
@@ -231,11 +233,11 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             f.believed,
         )
 
-    def _averaged(self, old: Array, new: Array) -> Array:
+    def _average(self, old: Array, new: Array) -> Array:
         """Exponential average with a new value taken in."""
         return self.forgetting * old + (1.0 - self.forgetting) * new
 
-    def _counted(
+    def _count_decisions(
         self, used_counts: Array, refused_counts: Array, measurement: Measurement
     ) -> tuple[Array, Array, Array]:
         """Whether the gate (6) lets this scan's decision pass, and the counts with it."""

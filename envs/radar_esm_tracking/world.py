@@ -160,7 +160,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             silence_end=silence_end,
             second_emitter=second_emitter,
         )
-        first = self._measured(truth, normals[1:3], normals[3:], draws.unit("first_intercept", 3))
+        first = self._measure(truth, normals[1:3], normals[3:], draws.unit("first_intercept", 3))
         mean = xp.stack([first.radar[0], first.radar[1], zero])
         return truth, Start(mean, self.start_covariance + zero, first)
 
@@ -201,14 +201,14 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
             on = xp.where(truth.radiating, noise[10] >= truth.silence_start, noise[10] < truth.silence_end)
             truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
         radar = self.glint.amplified(noise[3:5], noise[11:], xp)
-        return truth, self._measured(truth, radar, noise[5:7], noise[7:10])
+        return truth, self._measure(truth, radar, noise[5:7], noise[7:10])
 
     # --- the sensors
 
     def _looks(self, scan: Array) -> Array:
         return scan % self.parameters.esm_period == 0
 
-    def _measured(self, truth: Truth, errors: Array, bearings: Array, uniforms: Array) -> Measurement:
+    def _measure(self, truth: Truth, errors: Array, bearings: Array, uniforms: Array) -> Measurement:
         """Measure and listen.
 
         Args:

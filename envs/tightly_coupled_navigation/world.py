@@ -324,7 +324,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         xp, p, task, m = self.xp, self.parameters, self.task, len(self.task.sensor_variance)
         step = truth.step + 1
         k = xp.astype(step, noise.dtype)
-        state, mode, jumped = self._moved(truth, k, noise[: gnss_ins.SIZE])
+        state, mode, jumped = self._move(truth, k, noise[: gnss_ins.SIZE])
         noise = noise[gnss_ins.SIZE :]
         ins_angles = self.true_angles + state[gnss_ins.ATTITUDE_ERROR]
         position, velocity = task.satellites_at(step)
@@ -340,7 +340,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
             ones, pseudoranges=seen, rates=xp.where(self._during(faults.no_rates, k), 0.0, seen)
         )
         if p.urban:
-            truth = self._reflected(truth, noise[m:])
+            truth = self._reflect(truth, noise[m:])
         # A stick at the first measurement has no last reading to hold.
         stuck = self._during(faults.stuck, k) & (k > 1.0)
         measured = exact + task.sensor_sigma * factor * noise[:m]
@@ -378,7 +378,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """One number for each reading: what is said of its group of sensors, else one."""
         return self.xp.concat([groups.get(s.name, ones[s.readings]) for s in self.task.sensors])
 
-    def _moved(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
+    def _move(self, truth: Truth, k: Array, normals: Array) -> tuple[Array, Array, Array]:
         """State at step k, the hypothesis it follows, and whether its acceleration has jumped."""
         xp, p, task, legs = self.xp, self.parameters, self.task, truth.legs
         T, count = p.sampling_interval, legs.start.shape[0]
@@ -424,7 +424,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         state = xp.concat([x, bias[None], v, drift[None], a, attitude, rate])
         return state, xp.astype(mode, xp.int64), xp.astype(jumped, normals.dtype)
 
-    def _reflected(self, truth: Truth, noise: Array) -> Truth:
+    def _reflect(self, truth: Truth, noise: Array) -> Truth:
         """C/N0 walks between its limits; where a multipath error has run out, a new one is drawn by the C/N0 now.
 
         Args:

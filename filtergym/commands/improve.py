@@ -10,7 +10,7 @@ from rich.progress import Progress, TaskID
 
 from ..agents import training_run
 from ..agents.export import export_run
-from ..agents.settings import THROUGH_THE_FILTER, parsed_settings
+from ..agents.settings import THROUGH_THE_FILTER, parse_settings
 from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
 from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
@@ -135,7 +135,7 @@ def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[P
         line = bar.add_task("training", total=sum(training.run.steps for training in waiting.values()))
         work = list(waiting.values())
         sizes = [training.run.steps for training in work]
-        for i, lines in workers.run(_trained, work, sizes, lambda done: bar.update(line, advance=done)):
+        for i, lines in workers.run(_train, work, sizes, lambda done: bar.update(line, advance=done)):
             folder = folders[i]
             if not training_run.holds_run(folder):
                 raise ValueError(
@@ -149,7 +149,7 @@ def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[P
     return found
 
 
-def _trained(training: _Training, tick: Any) -> list[str]:
+def _train(training: _Training, tick: Any) -> list[str]:
     """Train in a process of its own; returns what there is to say."""
     lines: list[str] = []
     _trainer(training.run.algorithm)(training.run, replace(training.session, report=lines.append))
@@ -235,7 +235,7 @@ def train(
         )
     if seeds is None and not (jobs == 1 and cluster is None):
         raise ValueError("a run is trained in one process: --jobs and --cluster share the runs of --seeds")
-    keywords, hyperparameters = parsed_settings(set_ or [])
+    keywords, hyperparameters = parse_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward
 
@@ -255,19 +255,19 @@ def train(
         gated,
     )
 
-    def asked(number: int) -> TrainingRun:
+    def make_run(number: int) -> TrainingRun:
         return training_run.new_run(problem, replace(options, seed=number))
 
     # Every run is opened before any is trained, so that a wrong word costs nothing.
     runs: dict[Path, tuple[TrainingRun, bool]] = {}
     if seeds is None:
         same = not (keywords or hyperparameters or config)
-        runs[out] = training_run.opened_run(out, asked(seed or 0), resume, same), resume
+        runs[out] = training_run.open_run(out, make_run(seed or 0), resume, same), resume
     else:
         for number in whole_numbers("--seeds", seeds):
             folder = out.with_name(f"{out.name}-{number}")
             begun = training_run.holds_run(folder)
-            run = training_run.opened_run(folder, asked(number), begun)
+            run = training_run.open_run(folder, make_run(number), begun)
             if begun and not run.finished and algo not in THROUGH_THE_FILTER:
                 training_run.check_trust(
                     f"{folder} goes on from a checkpoint that is loaded with pickle", trust
@@ -328,7 +328,7 @@ def search(
         raise ValueError(
             f"searching needs more packages: pip install 'filtergym[agents,search]' ({error})"
         ) from error
-    keywords, hyperparameters = parsed_settings(set_ or [])
+    keywords, hyperparameters = parse_settings(set_ or [])
     if algo not in training_run.FILES:
         raise nearest("algorithm", algo, training_run.FILES)
     problem = problem_of(environment)

@@ -32,7 +32,7 @@ from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
-from ..names import asked_of, competitors_of, find_competitor, is_learned, tidy_records
+from ..names import competitors_of, evaluation_requests, find_competitor, is_learned, tidy_records
 from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
 from ..reports.export import latex_table, records_as_csv
@@ -40,7 +40,7 @@ from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
-from ..reports.tables import datasets_table, flights_table, recorded_table, results_tables
+from ..reports.tables import datasets_table, flights_table, recording_table, results_tables
 from ..reports.work import work_of
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
@@ -63,7 +63,7 @@ from .terminal import (
     import_environments,
     one_of,
     pair,
-    parsed_settings,
+    parse_settings,
     progress_bar,
 )
 
@@ -183,7 +183,7 @@ def evaluate_policies(
 
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
-    keywords = parsed_settings(settings or [])
+    keywords = parse_settings(settings or [])
     formats = check_formats(format or ["png"])
     check_columns(columns)
     if recording is not None and scenario is not None:
@@ -226,7 +226,7 @@ def evaluate_policies(
     task = make_task(problem.id, control, flown, **keywords)
     measurements = len(set(names)) * episodes * task.horizon
     errors = measurements * len(task.components) * 8
-    refusal = _unwritten(errors, errors, netcdf)
+    refusal = _size_warning(errors, errors, netcdf)
     # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
     everything = bool(task.flights) or estimates is not None or (out is not None and not refusal)
     experiment = problem.experiment(
@@ -253,7 +253,7 @@ def evaluate_policies(
             makers = competitors_of(problem, names, trust)
             dataset = run_experiment(experiment, makers, tick, workers)
         else:
-            asked = asked_of(problem, experiment, names, trust)
+            asked = evaluation_requests(problem, experiment, names, trust)
             work = [] if out is None else [work_of(one) for one in asked]
             found = dict(summaries(asked, workers, tick, store, work))
     if everything:
@@ -269,13 +269,13 @@ def evaluate_policies(
         each = dataset.sizes["episode"] <= MOST_RECORDINGS
     of_flights = flight_records(dataset) if each else []
     tables = [flights_table(dataset, of_flights, records, console.width)] if of_flights else []
-    tables += results_tables(records, problem.knows, console.width) if judged else [recorded_table(records)]
+    tables += results_tables(records, problem.knows, console.width) if judged else [recording_table(records)]
     if json is not None:
         write_records(json, [*records, *of_flights])
     if out is not None and curves is not None:
         whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
         if not refusal:
-            refusal = _unwritten(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
+            refusal = _size_warning(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
         with whole_files(out) as waiting:
             write_records(waiting / "records.json", [*records, *of_flights])
             records_as_csv(waiting / "records.csv", [*records, *of_flights])
@@ -308,7 +308,7 @@ def evaluate_policies(
         console.print(f"estimates in {estimates}", soft_wrap=True)
 
 
-def _unwritten(size: int, largest: int, asked: bool | None) -> str:
+def _size_warning(size: int, largest: int, asked: bool | None) -> str:
     """Say why a dataset of so many bytes, and so many in its largest variable, is no NetCDF file; empty if it is."""
     if asked is False:
         return "--no-netcdf"
@@ -341,7 +341,7 @@ def record_scenario(
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
     cls = task_class(environment)
-    keywords = parsed_settings(settings or [])
+    keywords = parse_settings(settings or [])
     check_names(cls, keywords)
     if out.suffix != ".nc":
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
@@ -407,7 +407,7 @@ def write_offline(
     Example: filtergym offline filtergym/ManeuveringTarget-v0 --policy imm --policy random --episodes 500
     """
     cls = task_class(environment)
-    keywords = parsed_settings(settings or [])
+    keywords = parse_settings(settings or [])
     policies = policy or default_policies(cls.id, control)
     known = parameter_names(cls)
     task = make_task(cls.id, None, scenario, **{n: value for n, value in keywords.items() if n in known})

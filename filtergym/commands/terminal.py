@@ -253,7 +253,7 @@ def command_line() -> str:
     return shlex.join(["filtergym", *sys.argv[1:]])
 
 
-def parsed_settings(settings: list[str]) -> dict[str, Any]:
+def parse_settings(settings: list[str]) -> dict[str, Any]:
     """Turn ``name=value`` into keywords; a value is a Python literal, or else a word."""
     keywords: dict[str, Any] = {}
     for setting in settings:

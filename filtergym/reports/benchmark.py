@@ -18,14 +18,14 @@ from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.store import UNFINISHED, Store
-from ..evaluation.summary import Asked, Summary, combine_summaries, summaries
-from ..names import asked_of
+from ..evaluation.summary import EvaluationRequest, Summary, combine_summaries, summaries
+from ..names import evaluation_requests
 from .results import (
     RESULTS,
     Result,
-    drawn_components,
+    components_to_draw,
+    select_competitors,
     settings_of,
-    shown_competitors,
     thinned,
     track_of,
     write_results,
@@ -136,8 +136,8 @@ def result_of(
     cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
-    shown = shown_competitors(records, paper, reference, learned)
-    components, plane = drawn_components(groups_of(dataset), dataset["component"].values.tolist())
+    shown = select_competitors(records, paper, reference, learned)
+    components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
         problem.id,
@@ -196,7 +196,7 @@ def run_benchmark(
     tick = started(sum(cell.measurements for cell in wanted))
     results: list[Result | None] = [None] * len(wanted)
     # What is asked for, and the cell that it belongs to.
-    asked: list[tuple[Asked, int]] = []
+    asked: list[tuple[EvaluationRequest, int]] = []
     found: list[dict[str, Summary]] = [{} for _ in wanted]
     for i, cell in enumerate(wanted):
         experiment = cell.problem.experiment(
@@ -208,7 +208,7 @@ def run_benchmark(
             backend=backend,
             threads=threads,
         )
-        everyone = asked_of(cell.problem, experiment, cell.policies)
+        everyone = evaluation_requests(cell.problem, experiment, cell.policies)
         asked += [(one, i) for one in everyone]
     told = 0
 

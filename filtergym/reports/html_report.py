@@ -21,7 +21,7 @@ from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .headline import headline
 from .ranking import origin, ranking_sentence, verdict
-from .results import Result, Settings, stored_datasets
+from .results import Result, Settings, serialise_datasets
 from .tables import against_paper, consistency_word, main_components, ranked, score_text, with_interval
 
 HTML = Path(__file__).parent / "html"
@@ -54,7 +54,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HTML), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters["marked"] = _marked
+    environment.filters["marked"] = _mark_code
     script, plotly = (HTML / "report.js").read_text(encoding="utf-8"), get_plotlyjs()
     groups: dict[str, list[Result]] = {}
     for result in results:
@@ -63,7 +63,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         {
             "id": id,
             "anchor": f"e{number}",
-            "dots": _packed(_dots(group)) if len(group) > 1 else None,
+            "dots": _pack(_dots(group)) if len(group) > 1 else None,
             "paper": group[0].paper,
             "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
         }
@@ -78,7 +78,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         first=results[0].records[0],
         style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),
         script=markupsafe.Markup(script),
-        plotly=_packed_text(plotly),
+        plotly=_pack_text(plotly),
         hashes=[_hash(plotly), _hash(script)],
     )
 
@@ -87,16 +87,16 @@ def _hash(script: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def _packed(values: Any) -> str:
+def _pack(values: Any) -> str:
     """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
-    return _packed_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
+    return _pack_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
 
 
-def _packed_text(text: str) -> str:
+def _pack_text(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
 
 
-def _marked(text: str) -> markupsafe.Markup:
+def _mark_code(text: str) -> markupsafe.Markup:
     """Words between backticks as code, everything escaped."""
     parts = re.split(r"`([^`]*)`", text)
     pieces = [
@@ -120,12 +120,12 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "header": header,
         "rows": rows,
         "figures": _figures(result),
-        "data": _packed(
+        "data": _pack(
             {
                 "lines": _lines(result, group),
                 "paper": result.paper,
                 "ranking": _differences(result),
-                **stored_datasets(result),
+                **serialise_datasets(result),
             }
         ),
     }

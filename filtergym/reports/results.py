@@ -90,7 +90,7 @@ def settings_of(command: str) -> Settings:
     return Settings(command, versions)
 
 
-def shown_competitors(
+def select_competitors(
     records: Sequence[Record], paper: str, reference: str, learned: Sequence[str]
 ) -> list[str]:
     """Return at most ``MOST_SHOWN`` names whose curves tell most.
@@ -177,7 +177,7 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
     return found
 
 
-def drawn_components(
+def components_to_draw(
     groups: Mapping[str, Sequence[str]], components: Sequence[str]
 ) -> tuple[list[str], bool]:
     """Return what a track is drawn of: two components of a group that has several, as a plane; else the first three."""
@@ -202,11 +202,11 @@ def _as_json(result: Result) -> dict[str, Any]:
     return {
         **result._asdict(),
         "records": [record._asdict() for record in result.records],
-        **stored_datasets(result),
+        **serialise_datasets(result),
     }
 
 
-def stored_datasets(result: Result) -> dict[str, Any]:
+def serialise_datasets(result: Result) -> dict[str, Any]:
     """Curves and track as JSON can say them."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
@@ -231,7 +231,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
         settings = restored(Settings, values.get("settings"))
         if not isinstance(values.get("results"), list):
             raise ValueError("it holds no list of results")
-        return [_restored(fields) for fields in values["results"]], settings
+        return [_restore(fields) for fields in values["results"]], settings
     except (OSError, ValueError) as error:
         raise ValueError(f"cannot read the results in {path}: {error}") from error
 
@@ -251,7 +251,7 @@ def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
     return results, Settings("\n".join(commands), read[0][1].versions)
 
 
-def _restored(fields: Any) -> Result:
+def _restore(fields: Any) -> Result:
     if not isinstance(fields, dict) or not isinstance(fields.get("records"), list):
         raise ValueError("a result needs its fields, and a list of records among them")
     records = [restored(Record, record) for record in fields["records"]]

@@ -87,10 +87,10 @@ def main_components(records: Sequence[Any]) -> list[str]:
     names = [
         r.component for r in records if r.policy == first.policy and r.metric == "rmse" and r.window == "all"
     ]
-    return shown_components(names)
+    return select_components(names)
 
 
-def shown_components(names: Sequence[str]) -> list[str]:
+def select_components(names: Sequence[str]) -> list[str]:
     """Of components and groups of them: the groups where there are any, else the first three."""
     # One namesake is no group: "range" is not made of "range_rate".
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
@@ -214,7 +214,7 @@ def _widest(table: Table) -> int:
 _MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False)
 
 
-def recorded_table(records: Sequence[Any]) -> Table:
+def recording_table(records: Sequence[Any]) -> Table:
     """Compare competitors on measurements whose truth nobody knows: what they expected of each.
 
     Args:

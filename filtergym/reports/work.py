@@ -9,10 +9,10 @@ from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import short_name
 from ..evaluation.evaluate import Experiment
 from ..evaluation.store import Work
-from ..evaluation.summary import Asked
+from ..evaluation.summary import EvaluationRequest
 
 
-def work_of(asked: Asked) -> Work | None:
+def work_of(asked: EvaluationRequest) -> Work | None:
     """Return the piece of work that the summary of a competitor is; None where nothing is kept of it."""
     experiment = asked.experiment
     meaning = meaning_of(problem_of(experiment.environment), asked.name)

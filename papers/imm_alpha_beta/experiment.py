@@ -9,7 +9,7 @@ from ...envs.catalogue import make_task
 from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...evaluation.parallel import Workers
-from ...evaluation.rollout import started_lanes
+from ...evaluation.rollout import start_lanes
 from ...evaluation.seeds import episode_seeds
 from ..measured import evaluated, means
 from ..reproduction import Progress, gathered, later
@@ -104,7 +104,7 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
     """
     task: Any = make_task(ManeuveringTarget.id, "gain", scenario, **keywords)
     starts: list[Initial] = []
-    lanes = started_lanes(
+    lanes = start_lanes(
         task, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
     )
     kept = []
