@@ -171,7 +171,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
     def spoilt(*_, **__):
         raise ValueError("no ink")
 
-    monkeypatch.setattr("filtergym.commands.measure.save", spoilt)
+    monkeypatch.setattr("filtergym.commands.evaluation.save", spoilt)
     assert run(monkeypatch, *words, "--out", tmp_path / "none") == 2
     assert not (tmp_path / "none").exists()
     capsys.readouterr()
@@ -182,7 +182,7 @@ def test_an_evaluation_writes_everything_or_nothing(tmp_path, monkeypatch, capsy
 
 
 def test_results_that_do_not_fit_are_left_out_and_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("filtergym.commands.measure.MOST_BYTES", 1000)
+    monkeypatch.setattr("filtergym.commands.evaluation.MOST_BYTES", 1000)
     words = ("evaluate", ENV, "--scenario", "paper", "--policy", "imm", "--episodes", 4, "--out", tmp_path)
     assert run(monkeypatch, *words) == 0
     assert not (tmp_path / "results.nc").exists()

@@ -47,9 +47,9 @@ def dataset():
 @pytest.fixture
 def run(monkeypatch, capsys, tmp_path, dataset):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.commands.measure.run_experiment", lambda *_, **__: dataset)
+    monkeypatch.setattr("filtergym.commands.evaluation.run_experiment", lambda *_, **__: dataset)
     monkeypatch.setattr(
-        "filtergym.commands.measure.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
+        "filtergym.commands.evaluation.evaluation_figures", lambda *_, **__: [("figure", Drawn())]
     )
 
     def command(*words, output=None, program=main):
@@ -114,8 +114,8 @@ def test_an_output_that_has_a_folders_name_is_refused_before_the_work(run, tmp_p
     def unexpected(*_, **__):
         raise AssertionError("the work began")
 
-    monkeypatch.setattr("filtergym.commands.measure.run_experiment", unexpected)
-    monkeypatch.setattr("filtergym.commands.measure.summaries", unexpected)
+    monkeypatch.setattr("filtergym.commands.evaluation.run_experiment", unexpected)
+    monkeypatch.setattr("filtergym.commands.evaluation.summaries", unexpected)
     monkeypatch.setattr("filtergym.reports.benchmark.summaries", unexpected)
     monkeypatch.setattr("filtergym.commands.improve.tune", unexpected)
     shipped, best = PRETRAINED / "ManeuveringTarget-v0" / "bptt", tmp_path / "run" / "best"
@@ -148,7 +148,7 @@ def test_a_full_disk_is_one_sentence_and_leaves_the_results_before(run, tmp_path
         path.write_bytes(b"half")
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr("filtergym.commands.measure.save", no_space)
+    monkeypatch.setattr("filtergym.commands.evaluation.save", no_space)
     code, error = run(*EVALUATE, "--seed", 1, "--out", "out")
     assert (code, error) == (2, "Error: cannot write to folder out: No space left on device\n")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

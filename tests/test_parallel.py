@@ -163,7 +163,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
 def test_a_large_evaluation_goes_on_where_it_ended(command, tmp_path, monkeypatch):
     """What is done is not done again, unless something that it depends on has changed."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("filtergym.commands.measure.LARGE", 1)  # too large for results.nc
+    monkeypatch.setattr("filtergym.commands.evaluation.LARGE", 1)  # too large for results.nc
     words = ("evaluate", ENV, "--policy", "imm", "--policy", "known-turn", "--episodes", 4, "--out", "out")
     assert command(*words)[0] == 0
     whole = (tmp_path / "out/records.json").read_text()

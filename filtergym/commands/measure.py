@@ -13,35 +13,23 @@ from ..envs.catalogue import (
     check_names,
     make_task,
     parameter_names,
-    read_recording,
     task_class,
 )
-from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
-from ..envs.recording_files import is_recording
-from ..evaluation.competitors import RANKED, kind_of
-from ..evaluation.curves import curves_of
-from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
-from ..evaluation.estimates import check_estimates, write_estimates
-from ..evaluation.evaluate import run_experiment
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
-from ..evaluation.metrics import flight_records
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record
-from ..evaluation.store import UNFINISHED, Store
-from ..evaluation.summary import combine_summaries, summaries
-from ..names import competitors_of, evaluation_requests, find_competitor, is_learned, tidy_records
+from ..names import find_competitor, is_learned
 from ..offline import default_policies, write_datasets
-from ..reports.benchmark import Cell, all_records, result_of, run_benchmark
+from ..reports.benchmark import Cell, all_records, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
-from ..reports.records import write_records
-from ..reports.results import RESULTS, Result, settings_of, write_results
-from ..reports.tables import datasets_table, flights_table, recording_table, results_tables
-from ..reports.work import work_of
+from ..reports.results import RESULTS, Result, settings_of
+from ..reports.tables import datasets_table, results_tables
+from .evaluation import FlightOptions, Outputs, find_data, find_names, run, write
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -62,15 +50,9 @@ from .terminal import (
     console,
     import_environments,
     one_of,
-    pair,
     parse_settings,
     progress_bar,
 )
-
-LARGE = 200_000_000
-"""Bytes of a file that nobody expects without having asked for it."""
-MOST_RECORDINGS = 40
-"""Of which a table tells one by one."""
 
 
 def list_environments(
@@ -184,54 +166,16 @@ def evaluate_policies(
     Example: filtergym evaluate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --policy adaptive
     """
     keywords = parse_settings(settings or [])
-    formats = check_formats(format or ["png"])
-    check_columns(columns)
-    if recording is not None and scenario is not None:
-        raise ValueError("--recording takes the place of --scenario: leave one of them out")
-    named = task_class(environment).scenarios if environment else {}
-    flown: Any = scenario
-    if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
-        limits = pair("--speeds", speeds)
-        flown = read_recording(recording or scenario, environment, speeds=limits, **keywords)
-        environment = flown.environment
-    if environment is None:
-        raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
-    problem = problem_of(environment)
-    if not isinstance(flown, Recording) and scenario not in named and names_flights(scenario):
-        flown = read_flights(
-            scenario,
-            None if site is None else pair("--site", site),
-            longest_gap=longest_gap,
-            speeds=pair("--speeds", speeds),
-            fewest_scans=fewest_scans,
-            smoothing=smoothing,
-        )
-    elif site is not None:
-        raise ValueError(f"--site is for flights from files, and {scenario or recording!r} is none")
-    known = problem.baselines
-    if out is not None:
-        writable_folder(out)
-    if json is not None:
-        writable_file(json)
-    if estimates is not None:
-        check_estimates(estimates)
-        writable_file(estimates)
-    names = policy or list(known.benchmark or known.names)
+    outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
+    options = FlightOptions(site, longest_gap, speeds, smoothing, fewest_scans)
+    problem, data = find_data(environment, scenario, recording, options, keywords)
+    outputs.check()
+    names = find_names(problem, data, policy)
     learned = [name for name in names if is_learned(problem, name)]
-    if isinstance(flown, Recording):
-        episodes = len(flown.names)
-        if not policy:  # references and bounds are told what a recording does not hold
-            names = [name for name in names if kind_of(find_competitor(problem, name)) in RANKED]
     check_names(problem.task, keywords)
-    task = make_task(problem.id, control, flown, **keywords)
-    measurements = len(set(names)) * episodes * task.horizon
-    errors = measurements * len(task.components) * 8
-    refusal = _size_warning(errors, errors, netcdf)
-    # Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
-    everything = bool(task.flights) or estimates is not None or (out is not None and not refusal)
     experiment = problem.experiment(
-        flown,
-        episodes,
+        data,
+        len(data.names) if isinstance(data, Recording) else episodes,
         seed,
         split,
         control,
@@ -242,86 +186,10 @@ def evaluate_policies(
         strict=strict,
         keywords=keywords,
     )
-    curves, store = None, Store(None if out is None else out / UNFINISHED)
-    with Workers(jobs, cluster) as workers, progress_bar() as bar:
-        line = bar.add_task("evaluating", total=measurements)
-
-        def tick(done: int) -> None:
-            bar.update(line, advance=done)
-
-        if everything:
-            makers = competitors_of(problem, names, trust)
-            dataset = run_experiment(experiment, makers, tick, workers)
-        else:
-            asked = evaluation_requests(problem, experiment, names, trust)
-            work = [] if out is None else [work_of(one) for one in asked]
-            found = dict(summaries(asked, workers, tick, store, work))
-    if everything:
-        records = tidy_records(dataset)
-        curves = None if out is None else curves_of(dataset)
-    else:
-        records, curves, dataset = combine_summaries([found[i] for i in range(len(found))])
-    if estimates is not None:
-        write_estimates(estimates, dataset)
-    judged = dataset.attrs["truth"]
-    each = "flight" in dataset.coords and judged
-    if each and dataset.attrs["recorded"]:
-        each = dataset.sizes["episode"] <= MOST_RECORDINGS
-    of_flights = flight_records(dataset) if each else []
-    tables = [flights_table(dataset, of_flights, records, console.width)] if of_flights else []
-    tables += results_tables(records, problem.knows, console.width) if judged else [recording_table(records)]
-    if json is not None:
-        write_records(json, [*records, *of_flights])
-    if out is not None and curves is not None:
-        whole = dataset.drop_dims("drawn_episode", errors="ignore")  # the track is for the report alone
-        if not refusal:
-            refusal = _size_warning(whole.nbytes, max(v.nbytes for v in whole.data_vars.values()), netcdf)
-        with whole_files(out) as waiting:
-            write_records(waiting / "records.json", [*records, *of_flights])
-            records_as_csv(waiting / "records.csv", [*records, *of_flights])
-            write_text(waiting / "table.tex", "\n".join(map(latex_table, tables)))
-            if not refusal:
-                write_dataset(waiting / "results.nc", whole)
-            for name, figure in evaluation_figures(curves, columns, learned=learned):
-                for suffix in formats:
-                    save(figure, waiting / f"{name}.{suffix}")
-            if judged:
-                result, made = (
-                    result_of(problem, dataset, records, curves, learned),
-                    settings_of(command_line()),
-                )
-                write_results(waiting / RESULTS, [result], made)
-        store.clear()
-    for table in tables:
-        console.print(table)
-    for note in notes_of(dataset):
-        console.print(note, highlight=False, soft_wrap=True)
-    if out is not None:
-        console.print(
-            f"figures, records and {RESULTS} in {out}" if judged else f"figures and records in {out}"
-        )
-        if judged:
-            make_report([result], made, out / REPORT)
-        if refusal:
-            console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
-    if estimates is not None:
-        console.print(f"estimates in {estimates}", soft_wrap=True)
-
-
-def _size_warning(size: int, largest: int, asked: bool | None) -> str:
-    """Say why a dataset of so many bytes, and so many in its largest variable, is no NetCDF file; empty if it is."""
-    if asked is False:
-        return "--no-netcdf"
-    if largest > MOST_BYTES:
-        return (
-            "it is too large for NetCDF's classic format. From Python, "
-            "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
-        )
-    return (
-        f"it would have more than {LARGE / 1e6:.0f} MB; --netcdf writes it"
-        if size > LARGE and not asked
-        else ""
-    )
+    task = make_task(problem.id, control, data, **keywords)
+    with Workers(jobs, cluster) as workers:
+        outcome = run(problem, task, experiment, names, outputs, workers, trust)
+    write(problem, outcome, outputs, learned)
 
 
 def record_scenario(

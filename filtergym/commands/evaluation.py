@@ -1,0 +1,282 @@
+"""The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xarray
+from rich.table import Table
+
+from ..baselines.problem import Problem, problem_of
+from ..envs.catalogue import read_recording, task_class
+from ..envs.flights import names_flights, read_flights
+from ..envs.recording import Recording
+from ..envs.recording_files import is_recording
+from ..envs.task import Task
+from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.curves import curves_of
+from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
+from ..evaluation.estimates import check_estimates, write_estimates
+from ..evaluation.evaluate import Experiment, run_experiment
+from ..evaluation.figures import evaluation_figures
+from ..evaluation.files import whole_files, writable_file, writable_folder, write_text
+from ..evaluation.metrics import flight_records
+from ..evaluation.parallel import Workers
+from ..evaluation.print_layout import check_columns, check_formats, save
+from ..evaluation.store import UNFINISHED, Store
+from ..evaluation.summary import combine_summaries, summaries
+from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
+from ..reports.benchmark import result_of
+from ..reports.export import latex_table, records_as_csv
+from ..reports.records import write_records
+from ..reports.results import RESULTS, Result, settings_of, write_results
+from ..reports.tables import flights_table, recording_table, results_tables
+from ..reports.work import work_of
+from .shown import REPORT, make_report
+from .terminal import command_line, console, pair, progress_bar
+
+LARGE = 200_000_000
+"""Bytes of a file that nobody expects without having asked for it."""
+MOST_RECORDINGS = 40
+"""Of which a table tells one by one."""
+
+
+class FlightOptions(NamedTuple):
+    """How flights are read from files, as options of a command."""
+
+    site: str | None
+    longest_gap: float
+    speeds: str
+    smoothing: float
+    fewest_scans: int
+
+
+class Outputs(NamedTuple):
+    """What an evaluation writes, and where."""
+
+    folder: Path | None
+    """For records, a table, the whole result and figures."""
+    netcdf: bool | None
+    """Whether the whole result is written; None: unless it is large."""
+    formats: Sequence[str]
+    """Of figures."""
+    columns: int
+    """Of a page, that figures are wide."""
+    records: Path | None
+    estimates: Path | None
+
+    def check(self) -> None:
+        """Raise ValueError for what cannot be written."""
+        check_formats(list(self.formats))
+        check_columns(self.columns)
+        if self.folder is not None:
+            writable_folder(self.folder)
+        if self.records is not None:
+            writable_file(self.records)
+        if self.estimates is not None:
+            check_estimates(self.estimates)
+            writable_file(self.estimates)
+
+
+def find_data(
+    environment: str | None,
+    scenario: str | None,
+    recording: str | None,
+    options: FlightOptions,
+    keywords: Mapping[str, Any],
+) -> tuple[Problem, Any]:
+    """Return the problem, and the scenario: its name, flights, or a recording.
+
+    Raises:
+        ValueError: if nothing names the environment, or a file cannot be read.
+    """
+    if recording is not None and scenario is not None:
+        raise ValueError("--recording takes the place of --scenario: leave one of them out")
+    named = task_class(environment).scenarios if environment else {}
+    if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
+        speeds = pair("--speeds", options.speeds)
+        found = read_recording(recording or str(scenario), environment, speeds=speeds, **keywords)
+        if options.site is not None:
+            raise _no_flights(recording or scenario)
+        return problem_of(found.environment), found
+    if environment is None:
+        raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
+    problem = problem_of(environment)
+    if scenario in named or not names_flights(scenario):
+        if options.site is not None:
+            raise _no_flights(scenario)
+        return problem, scenario
+    return problem, read_flights(
+        scenario,
+        None if options.site is None else pair("--site", options.site),
+        longest_gap=options.longest_gap,
+        speeds=pair("--speeds", options.speeds),
+        fewest_scans=options.fewest_scans,
+        smoothing=options.smoothing,
+    )
+
+
+def _no_flights(name: str | None) -> ValueError:
+    return ValueError(f"--site is for flights from files, and {name!r} is none")
+
+
+def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> list[str]:
+    """Return the names of who is evaluated: those that are given, or those of the quick benchmark.
+
+    Args:
+        problem: whose they are.
+        data: of :func:`find_data`. References and bounds are told what a recording does not hold.
+        policies: names that are given.
+    """
+    known = problem.baselines
+    names = list(policies or known.benchmark or known.names)
+    if policies or not isinstance(data, Recording):
+        return names
+    return [name for name in names if kind_of(find_competitor(problem, name)) in RANKED]
+
+
+class Outcome(NamedTuple):
+    """What an evaluation has found."""
+
+    dataset: xarray.Dataset
+    records: list[Any]
+    curves: Any
+    """For figures; None where none are drawn."""
+    refusal: str
+    """Why the whole result is not written; empty where it is."""
+    store: Store
+    """Keeps what is done until all is written."""
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether errors and costs are known."""
+        return bool(self.dataset.attrs["truth"])
+
+    @property
+    def flights(self) -> list[Any]:
+        """Records of every flight, where few enough are told apart."""
+        each = "flight" in self.dataset.coords and self.has_truth
+        if each and self.dataset.attrs["recorded"]:
+            each = self.dataset.sizes["episode"] <= MOST_RECORDINGS
+        return flight_records(self.dataset) if each else []
+
+    def tables(self, problem: Problem, flights: list[Any]) -> list[Table]:
+        """Return what is printed, widest first."""
+        tables = [flights_table(self.dataset, flights, self.records, console.width)] if flights else []
+        if not self.has_truth:
+            return [*tables, recording_table(self.records)]
+        return [*tables, *results_tables(self.records, problem.knows, console.width)]
+
+
+def run(
+    problem: Problem,
+    task: Task,
+    experiment: Experiment,
+    names: Sequence[str],
+    outputs: Outputs,
+    workers: Workers,
+    trust: bool,
+) -> Outcome:
+    """Run the competitors of these names.
+
+    Every number of every episode is kept only where it is asked for, or must be: flights are told one by one.
+
+    Args:
+        problem: whose they are.
+        task: with the data.
+        experiment: over what they run.
+        names: of competitors.
+        outputs: what will be written.
+        workers: who share the work.
+        trust: load models that can execute code.
+    """
+    measurements = len(set(names)) * experiment.episodes * task.horizon
+    size = measurements * len(task.components) * 8
+    refusal = _size_warning(size, size, outputs.netcdf)
+    store = Store(None if outputs.folder is None else outputs.folder / UNFINISHED)
+    whole = outputs.folder is not None and not refusal
+    with progress_bar() as bar:
+        line = bar.add_task("evaluating", total=measurements)
+
+        def tick(done: int) -> None:
+            bar.update(line, advance=done)
+
+        if task.flights or outputs.estimates is not None or whole:
+            dataset = run_experiment(experiment, competitors_of(problem, names, trust), tick, workers)
+            curves = None if outputs.folder is None else curves_of(dataset)
+            return Outcome(dataset, tidy_records(dataset), curves, refusal, store)
+        requests = evaluation_requests(problem, experiment, names, trust)
+        work = [] if outputs.folder is None else [work_of(one) for one in requests]
+        found = dict(summaries(requests, workers, tick, store, work))
+    records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
+    return Outcome(dataset, records, summary_curves, refusal, store)
+
+
+def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[str]) -> None:
+    """Write what was asked for, print the tables, and say where the files are.
+
+    Args:
+        problem: that was evaluated.
+        outcome: of :func:`run`.
+        outputs: what is written.
+        learned: names that are learned.
+    """
+    flights = outcome.flights
+    tables, records = outcome.tables(problem, flights), [*outcome.records, *flights]
+    if outputs.estimates is not None:
+        write_estimates(outputs.estimates, outcome.dataset)
+    if outputs.records is not None:
+        write_records(outputs.records, records)
+    results: list[Result] = []
+    settings = settings_of(command_line())
+    refusal = outcome.refusal
+    if outputs.folder is not None and outcome.curves is not None:
+        if outcome.has_truth:
+            results = [result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned)]
+        whole = outcome.dataset.drop_dims(
+            "drawn_episode", errors="ignore"
+        )  # the track is for the report alone
+        if not refusal:  # a summary has no variables
+            largest = max(v.nbytes for v in whole.data_vars.values())
+            refusal = _size_warning(whole.nbytes, largest, outputs.netcdf)
+        with whole_files(outputs.folder) as place:
+            write_records(place / "records.json", records)
+            records_as_csv(place / "records.csv", records)
+            write_text(place / "table.tex", "\n".join(map(latex_table, tables)))
+            if not refusal:
+                write_dataset(place / "results.nc", whole)
+            for name, figure in evaluation_figures(outcome.curves, outputs.columns, learned=learned):
+                for suffix in outputs.formats:
+                    save(figure, place / f"{name}.{suffix}")
+            if results:
+                write_results(place / RESULTS, results, settings)
+        outcome.store.clear()
+    for table in tables:
+        console.print(table)
+    for note in notes_of(outcome.dataset):
+        console.print(note, highlight=False, soft_wrap=True)
+    if outputs.folder is not None:
+        what = f"figures, records and {RESULTS}" if results else "figures and records"
+        console.print(f"{what} in {outputs.folder}")
+        if results:
+            make_report(results, settings, outputs.folder / REPORT)
+        if refusal:
+            console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
+    if outputs.estimates is not None:
+        console.print(f"estimates in {outputs.estimates}", soft_wrap=True)
+
+
+def _size_warning(size: int, largest: int, asked: bool | None) -> str:
+    """Say why a dataset of so many bytes, and so many in its largest variable, is no NetCDF file; empty if it is."""
+    if asked is False:
+        return "--no-netcdf"
+    if largest > MOST_BYTES:
+        return (
+            "it is too large for NetCDF's classic format. From Python, "
+            "evaluate(...).to_netcdf(path, engine='h5netcdf') writes it"
+        )
+    return (
+        f"it would have more than {LARGE / 1e6:.0f} MB; --netcdf writes it"
+        if size > LARGE and not asked
+        else ""
+    )
