@@ -228,10 +228,10 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
     if outputs.records is not None:
         write_records(outputs.records, records)
     results: list[Result] = []
-    settings = settings_of(command_line())
     refusal = outcome.refusal
     if outputs.folder is not None and outcome.curves is not None:
         if outcome.has_truth:
+            settings = settings_of(command_line())
             results = [result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned)]
         whole = outcome.dataset.drop_dims(
             "drawn_episode", errors="ignore"

@@ -168,8 +168,8 @@ def evaluate_policies(
     keywords = parse_settings(settings or [])
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
     options = FlightOptions(site, longest_gap, speeds, smoothing, fewest_scans)
-    problem, data = find_data(environment, scenario, recording, options, keywords)
     outputs.check()
+    problem, data = find_data(environment, scenario, recording, options, keywords)
     names = find_names(problem, data, policy)
     learned = [name for name in names if is_learned(problem, name)]
     check_names(problem.task, keywords)
