@@ -65,7 +65,7 @@ def to_sb3(
             "observation='asymmetric'"
         )
     if residual_to is not None:
-        check_residual(vector_env.task, residual_to)
+        check_residual(vector_env.model, residual_to)
     return TaskVecEnv(vector_env, staggered, residual_to, gate)
 
 

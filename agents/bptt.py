@@ -25,7 +25,7 @@ import torch
 from ..envs.backend import host_array
 from ..envs.catalogue import find_mixture
 from ..envs.environment import TaskVectorEnv
-from ..envs.task import Task
+from ..envs.model import Model
 from ..evaluation.seeds import episode_seeds
 from .gate import Gate, as_trained
 from .learned_estimator import EstimatorMaker
@@ -200,8 +200,8 @@ def _environment(run: TrainingRun) -> TaskVectorEnv:
             raise ValueError(
                 f"algorithm {run.algorithm!r} learns mixtures of scenarios on torch only: leave out the backend"
             )
-        tasks = [run.make_task(name) for name in mixture]
-        if len({task.horizon for task in tasks}) > 1:
+        models = [run.make_model(name) for name in mixture]
+        if len({model.task.horizon for model in models}) > 1:
             raise ValueError(
                 f"algorithm {run.algorithm!r} learns from episodes of one length, not from {run.scenario}: "
                 "set env.horizon"
@@ -230,7 +230,7 @@ class Descent:
     """
 
     def __init__(self, run: TrainingRun) -> None:
-        space = run.make_task().action_space
+        space = run.make_model().action_space
         if not isinstance(space, gymnasium.spaces.Box):
             raise ValueError(
                 f"algorithm {run.algorithm!r} needs the gradient of continuous actions, but control {run.control!r} "
@@ -243,7 +243,7 @@ class Descent:
         self.env.reset(seed=episode_seeds("train", run.seed, run.envs))
         first_action = self.values.get("first_action")
         self.policy = RecurrentPolicy(
-            len(self.env.task.fields), space, self.values["hidden_size"], first_action
+            len(self.env.model.fields), space, self.values["hidden_size"], first_action
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
         self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
@@ -252,7 +252,7 @@ class Descent:
     def flight(self) -> Callable[[Callable[[], None]], float]:
         """Return what flies an episode in every environment, descends its gradient and returns its mean cost."""
         env, policy, truncation = self.env, self.policy, self.values["truncation"]
-        gate, largest = Gate(env.task) if self.run.gated else None, self.values.get("max_action_grad")
+        gate, largest = Gate(env.model) if self.run.gated else None, self.values.get("max_action_grad")
         if env.backend == "compiled":
             return Unrolled(
                 env, policy, truncation, _reward_to_descend(self.run), gate, largest
@@ -275,8 +275,8 @@ class Descent:
         """Return the agent as the bookkeeping takes it."""
         run, policy = self.run, self.policy
 
-        def agent(task: Task) -> LearnedPolicy:
-            return as_trained(task, LearnedPolicy(task, policy.arrays(), "tanh"), gated=run.gated)
+        def agent(model: Model) -> LearnedPolicy:
+            return as_trained(model, LearnedPolicy(model, policy.arrays(), "tanh"), gated=run.gated)
 
         def save_agent(place: Path) -> None:
             write_arrays(place / "agent.safetensors", policy.arrays(), run, "tanh")

@@ -13,7 +13,7 @@ import numpy
 
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem
-from ..envs.task import Task
+from ..envs.model import Model
 from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, expose_spaces, kind_of, made
 from .residual import ResidualPolicy, policy_to_correct
 
@@ -31,18 +31,18 @@ class PaperAction(ConstantPolicy):
         ValueError: if the control has no such action.
     """
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.control = task.control  # type: ignore[misc]  # made for it
-        own, space = getattr(task, "paper_policy", None), task.action_space
-        if own is not None and own.control == task.control:
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.control = model.control  # type: ignore[misc]  # made for it
+        own, space = getattr(model.task, "paper_policy", None), model.action_space
+        if own is not None and own.control == model.control:
             self.action = tuple(own.action)
         elif isinstance(space, gymnasium.spaces.Box) and (space.low < 0.0).all() and (space.high > 0.0).all():
             self.action = (0.0,) * space.shape[0]
         else:
             raise ValueError(
-                f"control {task.control!r} of {task.id} has no constant action that is the paper's: give the gate a "
-                "fallback, or choose another control"
+                f"control {model.control!r} of {model.task.id} has no constant action that is the paper's: give the "
+                "gate a fallback, or choose another control"
             )
 
 
@@ -59,9 +59,9 @@ class Gate:
     """Decides between an action and the fallback's.
 
     Args:
-        task: whose observations it is shown.
-        fallback: a policy, or what makes one for the task; default: :class:`PaperAction`.
-        alarm: an object with a method ``hear`` (:class:`.Alarm`), or what makes one for the task; default: that of the
+        model: whose observations it is shown.
+        fallback: a policy, or what makes one for the model; default: :class:`PaperAction`.
+        alarm: an object with a method ``hear`` (:class:`.Alarm`), or what makes one for the model; default: that of the
             environment's baselines, or :class:`.InnovationAlarm`.
         window: decisions for which an alarm opens the gate, that at which it speaks among them; default: the alarm's.
 
@@ -70,14 +70,14 @@ class Gate:
     """
 
     def __init__(
-        self, task: Task, fallback: Any = None, alarm: Any = None, window: int | None = None
+        self, model: Model, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
-        alarm = alarm or Problem.of(type(task)).baselines.alarm or InnovationAlarm
-        self.alarm: Alarm = made(alarm, task)
-        self.fallback: Any = check_competitor("fallback", made(fallback or PaperAction, task), "policy")
-        own = getattr(self.fallback, "control", task.control)
-        if own != task.control:
-            raise ValueError(f"the fallback is made for control {own!r}, but the task has {task.control!r}")
+        alarm = alarm or Problem.of(type(model.task)).baselines.alarm or InnovationAlarm
+        self.alarm: Alarm = made(alarm, model)
+        self.fallback: Any = check_competitor("fallback", made(fallback or PaperAction, model), "policy")
+        own = getattr(self.fallback, "control", model.control)
+        if own != model.control:
+            raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
         self.window = self.alarm.window if window is None else window
         if self.window < 1:
             raise ValueError(f"window must be at least one decision, got {self.window!r}")
@@ -118,8 +118,8 @@ class Gated(Policy):
     """A policy behind a :class:`Gate`.
 
     Args:
-        task: of all of them.
-        policy: anything with Stable-Baselines3's ``predict``, or what makes it for the task.
+        model: of all of them.
+        policy: anything with Stable-Baselines3's ``predict``, or what makes it for the model.
         fallback: as of :class:`Gate`.
         alarm: likewise.
         window: likewise.
@@ -129,15 +129,15 @@ class Gated(Policy):
     """
 
     def __init__(
-        self, task: Task, policy: Any, fallback: Any = None, alarm: Any = None, window: int | None = None
+        self, model: Model, policy: Any, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
-        super().__init__(task)
-        self.control = task.control  # type: ignore[misc]  # made for it
-        self.policy = check_competitor("policy", made(policy, task), "policy")
-        own = getattr(self.policy, "control", task.control)
-        if own != task.control:
-            raise ValueError(f"the policy is made for control {own!r}, but the task has {task.control!r}")
-        self.gate = Gate(task, fallback, alarm, window)
+        super().__init__(model)
+        self.control = model.control  # type: ignore[misc]  # made for it
+        self.policy = check_competitor("policy", made(policy, model), "policy")
+        own = getattr(self.policy, "control", model.control)
+        if own != model.control:
+            raise ValueError(f"the policy is made for control {own!r}, but the task has {model.control!r}")
+        self.gate = Gate(model, fallback, alarm, window)
         expose_spaces(self, self.policy)
 
     def begin(self, seeds: Sequence[int]) -> tuple[Any, GateMemory]:
@@ -153,7 +153,7 @@ class Gated(Policy):
 
 
 class PolicyMaker:
-    """Makes for a task a policy with others around it.
+    """Makes for a model a policy with others around it.
 
     Args:
         maker: of the policy inside, or that policy.
@@ -163,15 +163,15 @@ class PolicyMaker:
 
     kind = "policy"
 
-    def __init__(self, maker: Any, wrap: Callable[[Task, Any], Any], control: str | None = None) -> None:
+    def __init__(self, maker: Any, wrap: Callable[[Model, Any], Any], control: str | None = None) -> None:
         self.maker, self.wrap = maker, wrap
         expose_spaces(self, maker, "control", "task_keywords")
         if control is not None:
             self.control = control
 
-    def __call__(self, task: Task) -> Any:
+    def __call__(self, model: Model) -> Any:
         """Make it."""
-        return self.wrap(task, made(self.maker, task))
+        return self.wrap(model, made(self.maker, model))
 
 
 def gated(name: str, maker: Any) -> PolicyMaker:
@@ -190,11 +190,11 @@ def gated(name: str, maker: Any) -> PolicyMaker:
     return PolicyMaker(maker, Gated)
 
 
-def as_trained(task: Task, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
+def as_trained(model: Model, agent: Any, residual_to: str = "", gated: bool = False) -> Any:
     """Return an agent as it acts in its training run.
 
     Args:
-        task: of the run.
+        model: of the run.
         agent: the network alone.
         residual_to: name of the policy that it corrects, if there is one; a gate then holds back the correction.
         gated: whether it acts behind a gate.
@@ -202,7 +202,7 @@ def as_trained(task: Task, agent: Any, residual_to: str = "", gated: bool = Fals
     Raises:
         ValueError: if that cannot be.
     """
-    corrected = policy_to_correct(task, residual_to) if residual_to else None
+    corrected = policy_to_correct(model, residual_to) if residual_to else None
     if corrected is not None:
-        agent = ResidualPolicy(task, corrected, agent)
-    return Gated(task, agent, fallback=corrected) if gated else agent
+        agent = ResidualPolicy(model, corrected, agent)
+    return Gated(model, agent, fallback=corrected) if gated else agent

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ..compiler.functions import mapped
+from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from ..envs.task import Episode, Task
+from ..envs.task import Task
 from ..evaluation.competitors import Kind, Policy
 
 
@@ -28,24 +29,24 @@ class LearnedEstimator:
     """A trained bank with its network, see :class:`~..evaluation.competitors.Estimator`.
 
     Args:
-        network: a policy made for the task under the bank's name, on NumPy.
+        network: a policy made for the bank, on NumPy.
     """
 
     kind: ClassVar[Kind] = "estimator"
 
     def __init__(self, network: Policy) -> None:
-        self.network, self.task = network, network.task
+        self.network, self.model = network, network.model
 
     def start(self, initial: Any, N: int) -> Filtered:
         """Start the filter where everyone starts."""
-        return Filtered(self.task.bank.start(initial), None)
+        return Filtered(self.model.filter.start(initial), None)
 
     def update(self, measurement: Any, memory: Filtered) -> tuple[Array, Array, Filtered]:
         """Predict, show the network what comes of it, and update as it answers."""
-        bank = self.task.bank
+        bank: Any = self.model.filter
         measurement = mapped(numpy.nan_to_num, measurement)  # banks weigh values by their availability
         state = bank.predict(memory.bank, measurement)
-        shown = self.task.observe(Episode(None, measurement, state))
+        shown = self.model.observe(Episode(None, measurement, state))
         action, network = self.network.predict(shown.T, memory.network)
         # In double: arithmetic with constants would stay in the network's precision.
         state = bank.act(state, measurement, action.T.astype(float))
@@ -57,14 +58,14 @@ class EstimatorMaker:
 
     Args:
         bank: name of the filter in ``task.trained_banks``.
-        policy: what makes the network for the task under that name.
+        policy: what makes the network for a model of that bank.
     """
 
     kind: ClassVar[Kind] = "estimator"
 
-    def __init__(self, bank: str, policy: Callable[[Task], Policy]) -> None:
+    def __init__(self, bank: str, policy: Callable[[Model], Policy]) -> None:
         self.bank, self.policy = bank, policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
         """Make it on NumPy, whatever the task computes on."""
-        return LearnedEstimator(self.policy(task.on_numpy().under(self.bank)))
+        return LearnedEstimator(self.policy(Model(task, self.bank).on_numpy()))

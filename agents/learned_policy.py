@@ -16,6 +16,7 @@ from typing import Any
 import numpy
 
 from ..envs.catalogue import short_name
+from ..envs.model import Model
 from ..envs.task import Task
 from ..evaluation.competitors import Policy
 from ..evaluation.files import whole_file
@@ -58,27 +59,27 @@ class LearnedPolicy(Policy):
     """A network with fixed weights, with or without memory.
 
     Args:
-        task: whose observations it is shown.
+        model: whose observations it is shown.
         arrays: float32, named as in the module's description.
         output: one of ``OUTPUTS``.
         activation: between layers, "tanh" or "relu".
-        fields: names of what it takes of an observation, in its order; default: all that the task shows.
+        fields: names of what it takes of an observation, in its order; default: all that the model shows.
 
     Raises:
-        ValueError: if the task does not show one of the fields.
+        ValueError: if the model does not show one of the fields.
     """
 
     def __init__(
         self,
-        task: Task,
+        model: Model,
         arrays: Mapping[str, numpy.ndarray],
         output: str,
         activation: str = "tanh",
         fields: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(task)
-        self.control = task.control  # type: ignore[misc]  # as it was trained
-        self.columns = slice(None) if fields is None else task.columns(fields)
+        super().__init__(model)
+        self.control = model.control  # type: ignore[misc]  # as it was trained
+        self.columns = slice(None) if fields is None else model.columns(fields)
         self.arrays, self.output = arrays, output
         self.activation = ACTIVATIONS[activation]
         self.layers = [
@@ -104,7 +105,7 @@ class LearnedPolicy(Policy):
                 x = self.activation(x)
         if self.output == "argmax":
             return x.argmax(axis=1), state
-        space: Any = self.task.action_space
+        space: Any = self.model.action_space
         if self.output == "clip":
             return numpy.clip(x, space.low, space.high), state
         return space.low + (space.high - space.low) * 0.5 * (1.0 + numpy.tanh(x)), state
@@ -143,12 +144,12 @@ def write_arrays(
     """Write a learned policy and the record of the run that it comes from."""
     from safetensors.numpy import save
 
-    task = run.make_task()
+    model = run.make_model()
     header = {
-        "environment": task.id,
+        "environment": model.task.id,
         "control": run.control,
-        "interface": str(task.interface),
-        "fields": json.dumps([field.name for field in task.fields]),
+        "interface": str(model.task.interface),
+        "fields": json.dumps([field.name for field in model.fields]),
         "output": output,
         "activation": activation,
         "run": json.dumps(asdict(run)),
@@ -224,7 +225,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
 
 
 class _Stored:
-    """Makes the policy of a file for a task; what an evaluation calls."""
+    """Makes the policy of a file for a model; what an evaluation calls."""
 
     def __init__(self, path: Path) -> None:
         self.arrays, self.header = _read(path)
@@ -232,33 +233,33 @@ class _Stored:
         self.control = self.header["control"]
         self.around = self.header["run"].get("residual_to", ""), self.header["run"].get("gated", False)
 
-    def __call__(self, task: Task) -> Policy:
+    def __call__(self, model: Model) -> Policy:
         """Make it, with what was around it in training."""
-        if self.header["interface"] != str(task.interface):
+        if self.header["interface"] != str(model.task.interface):
             raise ValueError(
-                f"{self.path} was trained when fields or actions of {task.id} meant something else (its interface "
-                f"{self.header['interface']}, now {task.interface}): train it again"
+                f"{self.path} was trained when fields or actions of {model.task.id} meant something else (its "
+                f"interface {self.header['interface']}, now {model.task.interface}): train it again"
             )
         try:
             network = LearnedPolicy(
-                task, self.arrays, self.header["output"], self.header["activation"], self.header["fields"]
+                model, self.arrays, self.header["output"], self.header["activation"], self.header["fields"]
             )
         except ValueError as error:
             raise ValueError(
-                f"{self.path} was trained on other fields than {task.id} shows: {error}"
+                f"{self.path} was trained on other fields than {model.task.id} shows: {error}"
             ) from None
-        space: Any = task.action_space
+        space: Any = model.action_space
         count = int(space.n) if hasattr(space, "n") else space.shape[0]
         if (self.header["output"] == "argmax") != hasattr(space, "n") or self.header["answers"] != count:
             raise ValueError(
                 f"{self.path} answers with {self.header['output']} of {self.header['answers']} numbers, which is no "
-                f"action of control {task.control!r}: {space}"
+                f"action of control {model.control!r}: {space}"
             )
-        return as_trained(task, network, *self.around)
+        return as_trained(model, network, *self.around)
 
 
 def load_policy(cls: type[Task], path: Path) -> _Stored | EstimatorMaker:
-    """Load a learned policy or estimator of an environment from a file: what makes it for a task.
+    """Load a learned policy or estimator of an environment from a file: what makes it.
 
     Raises:
         ValueError: if the file is not one, or it is of another environment.

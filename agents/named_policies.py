@@ -15,7 +15,7 @@ def shipped_agents(id: str) -> list[str]:
 
 
 def learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
-    """Return what makes a learned policy for a task, or None if the name means nothing here.
+    """Return what makes a learned policy, or None if the name means nothing here.
 
     Args:
         cls: the environment.

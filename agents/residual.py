@@ -12,32 +12,32 @@ import numpy
 
 from ..baselines.problem import Problem
 from ..envs.environment import TaskEnv
-from ..envs.task import Task
+from ..envs.model import Model
 from ..evaluation.competitors import Policy, expose_spaces, kind_of, made
 
 
-def check_residual(task: Task, policy: Any) -> None:
+def check_residual(model: Model, policy: Any) -> None:
     """Raise ValueError if actions of this task and policy cannot be added."""
-    if not isinstance(task.action_space, gymnasium.spaces.Box):
+    if not isinstance(model.action_space, gymnasium.spaces.Box):
         raise ValueError(
-            f"a residual action is added: control {task.control!r} has {task.action_space}, choose another"
+            f"a residual action is added: control {model.control!r} has {model.action_space}, choose another"
         )
-    own = getattr(policy, "control", task.control)
-    if own != task.control:
-        raise ValueError(f"the policy is made for control {own!r}, but the environment has {task.control!r}")
+    own = getattr(policy, "control", model.control)
+    if own != model.control:
+        raise ValueError(f"the policy is made for control {own!r}, but the environment has {model.control!r}")
 
 
-def policy_to_correct(task: Task, name: str) -> Any:
+def policy_to_correct(model: Model, name: str) -> Any:
     """Make the policy that an agent corrects in a training run.
 
     Args:
-        task: of both.
+        model: of both.
         name: one of the environment's own policies, tuned or not.
 
     Raises:
         ValueError: for an unknown name, what does not act, acts under parameters of its own, or cannot be corrected.
     """
-    maker = Problem.of(type(task)).competitor(name)
+    maker = Problem.of(type(model.task)).competitor(name)
     if kind_of(maker) != "policy":
         raise ValueError(f"{name!r} is of kind {kind_of(maker)} and has no actions that could be corrected")
     if getattr(maker, "task_keywords", {}):
@@ -45,8 +45,8 @@ def policy_to_correct(task: Task, name: str) -> Any:
             f"policy {name!r} acts under parameters of its own, and an agent trains under the environment's: choose "
             "another policy to correct"
         )
-    check_residual(task, maker)
-    return made(maker, task)
+    check_residual(model, maker)
+    return made(maker, model)
 
 
 class ResidualActions(gymnasium.Wrapper):
@@ -65,7 +65,7 @@ class ResidualActions(gymnasium.Wrapper):
         inner: Any = env.unwrapped
         if not isinstance(inner, TaskEnv):
             raise ValueError(f"ResidualActions takes an environment of filtergym, got {type(inner).__name__}")
-        check_residual(inner.task, policy)
+        check_residual(inner.model, policy)
         self.policy = policy
         self._shown: Any = None
         self._memory: Any = None
@@ -95,7 +95,7 @@ class ResidualPolicy(Policy):
     """A policy and the agent that corrects it, as one policy for an evaluation.
 
     Args:
-        task: of both.
+        model: of both.
         policy: the one that is corrected.
         agent: the correction.
 
@@ -103,10 +103,10 @@ class ResidualPolicy(Policy):
         ValueError: if actions cannot be added.
     """
 
-    def __init__(self, task: Task, policy: Any, agent: Any) -> None:
-        super().__init__(task)
-        check_residual(task, policy)
-        self.control = task.control  # type: ignore[misc]
+    def __init__(self, model: Model, policy: Any, agent: Any) -> None:
+        super().__init__(model)
+        check_residual(model, policy)
+        self.control = model.control  # type: ignore[misc]
         self.policy, self.agent = policy, agent
         expose_spaces(self, agent)
 

@@ -27,7 +27,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 
-from ..envs.task import Task
+from ..envs.model import Model
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
 from .gate import Gate, PolicyMaker, as_trained
@@ -86,9 +86,9 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
         **run.hyperparameters.get("env_kwargs", {}),
     )
     run.backend = env.unwrapped.backend
-    task = env.unwrapped.task
-    corrected = policy_to_correct(task, run.residual_to) if run.residual_to else None
-    adapted = to_sb3(env, residual_to=corrected, gate=Gate(task, corrected) if run.gated else None)
+    inner = env.unwrapped.model
+    corrected = policy_to_correct(inner, run.residual_to) if run.residual_to else None
+    adapted = to_sb3(env, residual_to=corrected, gate=Gate(inner, corrected) if run.gated else None)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
     return adapted
 
@@ -113,13 +113,13 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
         write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
 
 
-def as_kept(agent: Sb3Policy, algorithm: str, task: Task) -> LearnedPolicy | Sb3Policy:
+def as_kept(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
     """Return an agent as :func:`save_agent` keeps it and an evaluation finds it: several times as fast as the model.
 
     The model itself, if a learned policy cannot hold it.
     """
     try:
-        return LearnedPolicy(task, *network_arrays(agent, algorithm))
+        return LearnedPolicy(model, *network_arrays(agent, algorithm))
     except ValueError:
         return agent
 
@@ -180,7 +180,7 @@ def load_checkpoint(
 
 def check_algorithm(run: TrainingRun) -> None:
     """Raise ValueError if the algorithm does not fit the control's action space."""
-    space = run.make_task().action_space
+    space = run.make_model().action_space
     if not isinstance(space, SPACES[run.algorithm]):
         fitting = [name for name, kinds in SPACES.items() if isinstance(space, kinds)]
         raise ValueError(

@@ -24,22 +24,22 @@ from typing import Any, NamedTuple, NotRequired, TypedDict
 import numpy
 
 from ..baselines.problem import Problem, problem_of
-from ..envs.backend import task_on
+from ..envs.backend import make_model
 from ..envs.catalogue import (
     catalogue,
     find_mixture,
     find_scenario,
     import_task,
     importable_name,
-    make_task,
     nearest,
     parameter_names,
     task_class,
 )
 from ..envs.environment import DTYPES
+from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.reward import REWARDS
-from ..envs.task import Episode, Task
+from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.competitors import kind_of
 from ..evaluation.files import find_folder, settle_folder, whole_folder, writable_folder, write_text
@@ -127,9 +127,9 @@ class TrainingRun:
         known = parameter_names(self.problem.task)
         return {n: value for n, value in self.hyperparameters.get("env_kwargs", {}).items() if n in known}
 
-    def make_task(self, scenario: str | None = None) -> Task:
-        """Make the task that is trained on, in one of its scenarios."""
-        return make_task(self.problem.id, self.control, scenario, **self.task_keywords)
+    def make_model(self, scenario: str | None = None) -> Model:
+        """Make the model that is trained on, in one of its scenarios."""
+        return make_model(self.problem.task, self.control, scenario, **self.task_keywords)
 
     @property
     def finished(self) -> bool:
@@ -250,9 +250,9 @@ def _check_environment(
     """Raise ValueError if the environment of a run cannot be made."""
     known = parameter_names(problem.task)
     parameters = {name: value for name, value in keywords.items() if name in known}
-    tasks = [make_task(problem.id, control, name, **parameters) for name in scenarios]
+    models = [make_model(problem.task, control, name, **parameters) for name in scenarios]
     if options.residual_to or options.gated:
-        _check_around(options, tasks)
+        _check_around(options, models)
     for name, words in (("reward", REWARDS), ("dtype", DTYPES)):
         if name in keywords and keywords[name] not in words:
             raise nearest(name, keywords[name], words)
@@ -263,10 +263,10 @@ def _without_point(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _check_around(options: RunOptions, tasks: Sequence[Task]) -> None:
+def _check_around(options: RunOptions, models: Sequence[Model]) -> None:
     """Raise ValueError if an agent cannot correct that policy, or act inside the gate."""
     algorithm, residual_to = options.algorithm, options.residual_to
-    if len(tasks) > 1:
+    if len(models) > 1:
         raise ValueError(
             "a policy to correct and a gate are made for the parameters of one scenario: train on one, not on a mixture"
         )
@@ -278,9 +278,9 @@ def _check_around(options: RunOptions, tasks: Sequence[Task]) -> None:
         raise ValueError(
             "algorithm 'bptt' has no gradient of the policy that would be corrected: choose ppo, recurrent-ppo or sac"
         )
-    corrected = policy_to_correct(tasks[0], residual_to) if residual_to else None
+    corrected = policy_to_correct(models[0], residual_to) if residual_to else None
     if options.gated:
-        Gate(tasks[0], corrected)
+        Gate(models[0], corrected)
 
 
 def controls_of(cls: type[Task], algorithm: str) -> tuple[str, ...]:
@@ -528,8 +528,8 @@ def _settings_in_words(run: TrainingRun) -> Iterator[str]:
     yield from differing("algo", values, shipped)
 
 
-def _cost(task: Task, episode: Episode) -> dict[str, numpy.ndarray]:
-    return {"cost": task.cost(episode)}
+def _cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+    return {"cost": model.cost(episode)}
 
 
 class TrainingEpisodes:
@@ -545,31 +545,30 @@ class TrainingEpisodes:
     """
 
     def __init__(self, run: TrainingRun, episodes: int, backend: str = "auto") -> None:
-        self.id, self.keywords, self.backend = run.problem.id, run.task_keywords, backend
+        self.problem, self.keywords, self.backend = run.problem, run.task_keywords, backend
         self.weights = find_mixture(run.problem.task, run.scenario) or {run.scenario: 1.0}
         self.seeds = episode_seeds("validation", 0, episodes)
-        self._tasks: dict[tuple[str | None, str, str], Task] = {}
+        self._models: dict[tuple[str | None, str, str], Model] = {}
 
-    def _task(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Task:
-        """Return a task that is made once: compiling it takes time."""
+    def _model(self, control: str | None, scenario: str, keywords: Mapping[str, Any]) -> Model:
+        """Return a model that is made once: compiling it takes time."""
         key = control, scenario, repr(keywords)
-        if key not in self._tasks:
-            self._tasks[key] = task_on(
-                self.backend, self.id, control, scenario, **{**keywords, **self.keywords}
-            )
-        return self._tasks[key]
+        if key not in self._models:
+            cls, parameters = self.problem.task, {**keywords, **self.keywords}
+            self._models[key] = make_model(cls, control, scenario, backend=self.backend, **parameters)
+        return self._models[key]
 
     def means(
         self,
         competitor: Any,
         control: str | None = None,
-        report: Callable[[Task, Episode], dict[str, numpy.ndarray]] = _cost,
+        report: Callable[[Model, Episode], dict[str, numpy.ndarray]] = _cost,
         episodes: int | None = None,
     ) -> dict[str, numpy.ndarray]:
         """Return what is reported, as means over every episode, ``(episodes,)``.
 
         Args:
-            competitor: policy, estimator or reference, or what makes it for a task.
+            competitor: policy, estimator or reference, or what makes it.
             control: in which it acts; default: its own.
             report: as of :func:`.run_competitor`, with one number for every episode.
             episodes: fly the first of them only.
@@ -578,8 +577,8 @@ class TrainingEpisodes:
         control = control or getattr(competitor, "control", None)
         total: dict[str, Any] = {}
         for scenario, weight in self.weights.items():
-            task = self._task(control, scenario, getattr(competitor, "task_keywords", {}))
-            series = run_competitor(task, competitor, kind, self.seeds[:episodes], report)
+            model = self._model(control, scenario, getattr(competitor, "task_keywords", {}))
+            series = run_competitor(model, competitor, kind, self.seeds[:episodes], report)
             for name, values in series.items():
                 mean = numpy.ascontiguousarray(values).mean(axis=1)
                 total[name] = total.get(name, 0.0) + weight * mean

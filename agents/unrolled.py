@@ -176,12 +176,12 @@ class Unrolled:
         lanes: Any = env.fleet.only
         self._env, self._lanes, self._interval = env, lanes, env.task.decision_interval
         self._truncation, self._largest = min(truncation, env.last_decision), largest
-        self._rollout = Rollout(env.task, reward, lanes.width, self._truncation * self._interval)
+        self._rollout = Rollout(env.model, reward, lanes.width, self._truncation * self._interval)
         self._policy = UnrolledPolicy(policy, env.num_envs, self._truncation)
         self._gate: Any = gate
         self._gate_memory: Any = None
         self._opened = numpy.ones((self._truncation, env.num_envs))
-        fields = env.task.fields
+        fields = env.model.fields
         self._mean = [i for i, field in enumerate(fields) if field.over_interval == "mean"]
         self._last = [i for i, field in enumerate(fields) if field.over_interval != "mean"]
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
-from ..envs.task import Task
+from ..envs.model import Model
 
 LARGER = 3.0
 """Factor on the variance of innovations that an alarm looks for; others are found too, some decisions later."""
@@ -76,7 +76,7 @@ class Alarm:
     """Base of the alarms: subclasses say how likely something is wrong.
 
     Args:
-        task: whose observations it is shown.
+        model: whose observations it is shown.
     """
 
     window: ClassVar[int] = 30
@@ -84,9 +84,10 @@ class Alarm:
     false_alarms: ClassVar[float] = 0.02
     """Most false alarms in an episode, where filters and sensors are as modelled."""
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
-        self.decisions = max(task.horizon // task.decision_interval, 1)
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.task: Any = model.task
+        self.decisions = max(self.task.horizon // self.task.decision_interval, 1)
 
     def measurements(self, before: numpy.ndarray) -> numpy.ndarray:
         """Measurements that an observation tells of, ``(N, 1)``: since the last one, or at an episode's start, one.
@@ -136,17 +137,17 @@ class InnovationAlarm(Alarm):
         ValueError: if the task shows no ``innovation``.
     """
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         try:
-            self.innovation = task.reader("innovation")
+            self.innovation = model.reader("innovation")
         except ValueError as error:
             raise ValueError(
-                f"{task.id} shows no 'innovation' under control {task.control!r} that tells whether something is "
+                f"{self.task.id} shows no 'innovation' under control {model.control!r} that tells whether something is "
                 "wrong: give an alarm, in its baselines or to the gate"
             ) from error
         try:
-            self.available: Any = task.reader("available")
+            self.available: Any = model.reader("available")
         except ValueError:
             self.available = lambda observation: numpy.ones((len(observation), 1))
 

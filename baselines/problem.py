@@ -85,7 +85,7 @@ class Problem:
         return [*self.baselines.names, *self.tuned]
 
     def competitor(self, name: str) -> Any:
-        """Return what makes one of its own policies or estimators, tuned or not, references or bounds for a task.
+        """Return what makes one of its own policies or estimators, tuned or not, references or bounds.
 
         Raises:
             ValueError: if there is no such name.

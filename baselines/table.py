@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy
 
-from ..envs.task import Task
+from ..envs.model import Model
 from ..evaluation.competitors import ConstantPolicy, Policy
 from .alarm import Alarm
 
@@ -75,7 +75,7 @@ class Variant(functools.partial[Any]):
         Args:
             make: the class.
             description: a sentence for the page of the environment.
-            **arguments: of the class, after the task.
+            **arguments: of the class, after the problem.
         """
         variant = super().__new__(cls, make, **arguments)
         variant.__doc__ = description
@@ -88,24 +88,24 @@ class Variant(functools.partial[Any]):
 class PaperAction(ConstantPolicy):
     """The paper's algorithm as an action that never changes; subclasses name its control."""
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.action = task.paper_policy.action
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.action = model.task.paper_policy.action
 
 
 class ConstantMode(Policy):
     """One of the modes, never changed.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         mode: its number; a negative one counts from the last.
     """
 
     control = "mode"
 
-    def __init__(self, task: Task, mode: int) -> None:
-        super().__init__(task)
-        self.mode = mode if mode >= 0 else len(task.modes) + mode
+    def __init__(self, model: Model, mode: int) -> None:
+        super().__init__(model)
+        self.mode = mode if mode >= 0 else len(model.task.modes) + mode
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Name the mode for every episode."""

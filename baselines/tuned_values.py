@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..envs.catalogue import nearest, short_name
-from ..envs.task import Task
 from ..evaluation.competitors import Kind
 from ..evaluation.files import write_text
 from ..evaluation.stored import fits, read_json
@@ -39,16 +38,16 @@ class TunedPolicy(NamedTuple):
 
     task_keywords: dict[str, Any]
     control: str | None
-    make: Callable[[Task], Any]
+    make: Callable[[Any], Any]
 
     @property
     def kind(self) -> Kind:
         """What it makes."""
         return "policy" if self.control else "estimator"
 
-    def __call__(self, task: Task) -> Any:
-        """Make the policy or estimator for a task."""
-        return self.make(task)
+    def __call__(self, problem: Any) -> Any:
+        """Make the policy for a model, or the estimator for a task."""
+        return self.make(problem)
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,7 @@ class TunedValues:
         return values
 
     def competitor(self, policy: str) -> TunedPolicy:
-        """Return what makes a policy with its stored values for a task.
+        """Return what makes a policy or estimator with its stored values.
 
         Raises:
             ValueError: if it cannot be tuned, or never was.

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..envs.backend import task_on
+from ..envs.backend import make_model
 from ..envs.catalogue import find_scenario, make_task, nearest, short_name
-from ..envs.task import Episode, Scenario, Task
+from ..envs.model import Episode, Model
+from ..envs.task import Scenario
 from ..evaluation.parallel import Workers, check_workers
 from ..evaluation.rollout import Progress, rollout
 from ..evaluation.seeds import episode_seeds
@@ -28,8 +29,8 @@ FEWEST = 16
 """Episodes that a process is given at once: of fewer the work is less than what sending it takes."""
 
 
-def _cost(task: Task, episode: Episode) -> numpy.ndarray:
-    return task.cost(episode)
+def _cost(model: Model, episode: Episode) -> numpy.ndarray:
+    return model.cost(episode)
 
 
 class Candidate(NamedTuple):
@@ -46,11 +47,10 @@ class Candidate(NamedTuple):
 def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
     """Cost of every measurement of every episode, ``(time, episodes)``."""
     keywords, make = candidate.tunable.apply(candidate.values)
-    task = task_on(
-        candidate.backend, candidate.problem.id, candidate.tunable.control, candidate.scenario, **keywords
-    )
+    cls, control = candidate.problem.task, candidate.tunable.control
+    model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
     # Made already, so that no program is compiled for a candidate that is tried once.
-    run = rollout(task, make(task), candidate.seeds, _cost)
+    run = rollout(model, make(model if control else model.task), candidate.seeds, _cost)
     return numpy.stack([numpy.asarray(cost[: len(candidate.seeds)]) for cost, _ in run])
 
 
@@ -173,7 +173,7 @@ def tune(
         raise nearest("tunable policy", policy, problem.baselines.tunable)
     tunable = problem.baselines.tunable[policy]
     chosen = _scenario(problem, search.scenario)
-    task = make_task(problem.id, tunable.control, chosen.name)
+    task = make_task(problem.task, chosen.name)
     steps = search.episodes * (task.horizon // task.decision_interval)
     evaluations = search.budget // steps
     population = 4 * len(tunable.limits) + 4

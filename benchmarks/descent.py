@@ -42,8 +42,8 @@ def made(run: TrainingRun, backend: str, envs: int, dtype: torch.dtype) -> tuple
     )  # fmt: skip
     observation = torch.as_tensor(env.reset(seed=0)[0])
     torch.manual_seed(0)
-    space: Any = env.task.action_space
-    policy = RecurrentPolicy(len(env.task.fields), space, run.hyperparameters["hidden_size"]).to(dtype)
+    space: Any = env.model.action_space
+    policy = RecurrentPolicy(len(env.model.fields), space, run.hyperparameters["hidden_size"]).to(dtype)
     policy.mean.copy_(observation.mean(0))
     policy.scale.copy_(observation.std(0).clamp_min(0.3))
     if backend == "compiled":

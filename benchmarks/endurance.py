@@ -66,7 +66,7 @@ def endure(
     while done < steps:
         observation, reward, *_ = env.step(actions(env.single_action_space, generator, size))
         done += size
-        covariance = env.task.covariance(env.fleet.only.state)
+        covariance = env.model.covariance(env.fleet.only.state)
         finite = numpy.isfinite(observation).all(-1) & numpy.isfinite(reward)
         finite &= numpy.isfinite(covariance).all((0, 1))
         failed["not finite"] += int((~finite).sum())

@@ -47,7 +47,7 @@ from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Sessio
 from filtergym.baselines.catalogue import baselines_of, package_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
-from filtergym.envs.catalogue import catalogue, find_scenario, make_task, short_name
+from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTED
 from filtergym.evaluation.evaluate import Experiment
@@ -200,7 +200,7 @@ def training_units(id: str, algorithm: str, folder: Path) -> Units:
     folder.mkdir(parents=True)
     run = new_run(problem_of(id), RunOptions(algorithm))
     steps, values = run.steps, run.hyperparameters
-    task = make_task(id, run.control)
+    task = make_task(run.problem.task)
     per_update = run.envs * int(values.get("n_steps", task.horizon // task.decision_interval))
     if "learning_starts" in values:  # learning has begun when the clock starts
         begin = int(values["learning_starts"]) + 20 * run.envs
@@ -246,7 +246,7 @@ def tuning_seconds(id: str, name: str, kept: dict[str, Any]) -> float:
     middle = {value: 0.5 * (low + high) for value, (low, high) in tunable.limits.items()}
     mean_cost(Candidate(problem_of(id), scenario, tunable, tunable.start, seeds))
     seconds = spent(lambda: mean_cost(Candidate(problem_of(id), scenario, tunable, middle, seeds)))[1]
-    task = make_task(id, tunable.control, find_scenario(catalogue()[id], scenario).name)
+    task = make_task(catalogue()[id], scenario)
     candidates = kept["environment_steps"] / (CANDIDATE * (task.horizon // task.decision_interval))
     return (candidates + 8.0) * seconds
 

@@ -32,10 +32,10 @@ def arguments() -> argparse.Namespace:
 def actions(
     env: gymnasium.vector.VectorEnv, kind: str, generator: numpy.random.Generator
 ) -> Iterator[numpy.ndarray]:
-    space, task = env.unwrapped.single_action_space, env.unwrapped.task
+    space, model = env.unwrapped.single_action_space, env.unwrapped.model
     discrete = isinstance(space, gymnasium.spaces.Discrete)
-    paper = task.paper_policy
-    own = task.control == paper.control
+    paper = model.task.paper_policy
+    own = model.control == paper.control
     while True:
         if kind == "random":
             if discrete:

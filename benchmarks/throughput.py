@@ -52,7 +52,7 @@ import peer_imm
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Specialised
 from filtergym.compiler.program import Graph
-from filtergym.envs.backend import task_on
+from filtergym.envs.backend import make_model
 from filtergym.envs.catalogue import catalogue
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.reward import cost_reward
@@ -189,11 +189,11 @@ def compiled_costs() -> Costs:
 
 def compiled_floor(id: str, control: str, costs: Costs) -> float | None:
     """Steps per second if a step took only the arithmetic of its programs."""
-    task: Any = task_on("auto", id, control)
-    if task.backend != "compiled":
+    model: Any = make_model(catalogue()[id], control, backend="auto")
+    if model.backend != "compiled":
         return None
-    parts = task.programs.later
-    halves = [parts.act, parts.advance, parts.predict, task.programs.reported(cost_reward)]
+    parts = model.programs.later
+    halves = [parts.act, parts.advance, parts.predict, model.programs.reported(cost_reward)]
     names = [step.operation for special in halves for step in special.program.steps]
     functions = sum(name in FUNCTIONS or name == "pow" for name in names)
     operations = sum(name not in ("input", "constant") for name in names) - functions

@@ -7,7 +7,8 @@ import numpy
 
 from ..compiler.namespace import NotTraceable
 from .catalogue import make_task, nearest
-from .compiled import AVAILABLE, compiled, warn_of
+from .compiled import AVAILABLE, CompiledModel, warn_of
+from .model import Model
 from .observation import Array
 from .parameters import Limits, check
 from .task import Task
@@ -15,27 +16,27 @@ from .task import Task
 BACKENDS = ("auto", "compiled", "numpy", "torch")
 
 
-def task_on(
-    backend: str,
-    id: str,
+def make_model(
+    cls: type[Task],
     control: str | None = None,
     scenario: Any = None,
     *,
+    backend: str = "numpy",
     device: Any = None,
     threads: int = 1,
     **keywords: Any,
-) -> Task:
-    """Make a task that computes on a backend; ``task.backend`` says on which.
+) -> Model:
+    """Make a task with the bank of a control in the loop; ``model.backend`` says what computes its steps.
 
     Args:
+        cls: the task.
+        control: what the action steers; default: the first of the task's controls.
+        scenario: as :func:`~.catalogue.find_scenario` takes it.
         backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
             traced, else NumPy.
-        id: environment id; what follows is that of :func:`~.catalogue.make_task`.
-        control: likewise.
-        scenario: likewise.
         device: of torch, such as "cuda:1".
         threads: how many share the lanes of the compiled backend.
-        **keywords: parameters of the task.
+        **keywords: parameters of the task. A keyword wins over the scenario, the scenario over the default.
 
     Raises:
         ValueError: for an unknown name or backend, a parameter out of its limits, a device that is not there, less
@@ -44,15 +45,18 @@ def task_on(
     """
     check("threads", threads, int, Limits(at_least=1))
     xp, device = array_backend(backend, device)
-    task = make_task(id, control, scenario, xp, device, **keywords)
+    control = cls.controls[0] if control is None else control
+    if control not in (*cls.controls, *cls.trained_banks):
+        raise nearest("control", control, cls.controls)
+    task = make_task(cls, scenario, xp, device, **keywords)
     if backend == "compiled" or (backend == "auto" and AVAILABLE):
         try:
-            return compiled(task, threads)
+            return CompiledModel(task, control, threads)
         except NotTraceable as error:
             if backend == "compiled":
                 raise ValueError(f"{task.id} cannot be compiled: {error}") from error
             warn_of(task.id, error)
-    return task
+    return Model(task, control)
 
 
 def array_backend(backend: str, device: Any = None) -> tuple[ModuleType, Any]:

@@ -370,14 +370,14 @@ def _read_recording(
         )
     else:
         recording = read_columns(file, task_class(environment), keywords)
-    task = make_task(recording.environment, scenario=recording)
+    task = make_task(task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))
 
 
 def find_scenario(
     cls: type[Task],
-    scenario: ScenarioChoice,
+    scenario: ScenarioChoice | Scenario,
     keywords: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """Return a scenario by name (default: the environment's own), or make one from a user's trajectory.
@@ -417,9 +417,8 @@ def find_scenario(
 
 
 def make_task(
-    id: str,
-    control: str | None = None,
-    scenario: ScenarioChoice = None,
+    cls: type[Task],
+    scenario: ScenarioChoice | Scenario = None,
     xp: ModuleType = numpy,
     device: Any = None,
     **keywords: Any,
@@ -427,8 +426,7 @@ def make_task(
     """Make a task.
 
     Args:
-        id: environment id.
-        control: what the action steers; default: the first of the environment's controls.
+        cls: of which.
         scenario: as :func:`find_scenario` takes it.
         xp: array namespace, NumPy or ``array_api_compat.torch``.
         device: where a torch task keeps its arrays.
@@ -437,13 +435,8 @@ def make_task(
     Raises:
         ValueError: for an unknown name or a parameter out of its limits.
     """
-    cls = task_class(id)
-    control = cls.controls[0] if control is None else control
-    if control not in (*cls.controls, *cls.trained_banks):
-        raise nearest("control", control, cls.controls)
     chosen = find_scenario(cls, scenario, keywords)
-    parameters = cls.Parameters(**{**chosen.parameters, **keywords})
-    return cls(parameters, control, xp, device, chosen.recording)
+    return cls(cls.Parameters(**{**chosen.parameters, **keywords}), xp, device, chosen.recording)
 
 
 def register() -> None:

@@ -1,9 +1,10 @@
-"""Tasks whose steps are compiled: the same functions, traced once and run as code of the processor.
+"""Models whose steps are compiled: the same functions, traced once and run as code of the processor.
 
-:func:`compiled` returns a task that is used like any other; its methods run native code. :class:`Stepper` goes
+:class:`CompiledModel` is used like any other; its methods run native code. :class:`Stepper` goes
 further where episodes are only stepped: it keeps the episodes in its own memory, bound to the code once and for all.
 """
 
+import copy
 import functools
 import importlib.util
 import itertools
@@ -32,15 +33,14 @@ from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from .draws import Draws
 from .filter import Filter, Input
+from .model import Episode, Model
 from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
-from .task import Episode, Task
+from .task import Task
 
 AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether steps can be compiled here."""
-REPORTS = ("observe", "mean", "cost", "charge", "error", "covariance", "track", "records")
-"""Methods of a task that are compiled as they are."""
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
 REMEMBERED = 8
@@ -49,7 +49,7 @@ MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
 
 
-Report = Callable[[Task, Episode], Any]
+Report = Callable[[Model, Episode], Any]
 """Function of a task and its episodes after the action: nested tuples or dictionaries of arrays."""
 
 
@@ -57,37 +57,37 @@ Report = Callable[[Task, Episode], Any]
 # what is long, world and filter, is compiled once for all of them.
 
 
-def _update(task: Task, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
+def _update(model: Model, truth: Any, state: Any, measurement: Any, action: Array) -> tuple[Any, Any]:
     """Filter after the measurement, and what it gives back to the world."""
-    after = task.filter.update(state, Input(measurement, truth, action))
-    return after, task.filter.feedback(after, measurement)
+    after = model.filter.update(state, Input(measurement, truth, action))
+    return after, model.filter.feedback(after, measurement)
 
 
-def _advance(task: Task, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
+def _advance(model: Model, truth: Any, feedback: Any, noise: Array) -> tuple[Any, Any]:
     """Truth at the next measurement, and the measurement."""
-    return task.world.advance(truth, noise, feedback)
+    return model.task.world.advance(truth, noise, feedback)
 
 
-def _predict(task: Task, state: Any, measurement: Any) -> tuple[Any, Array]:
+def _predict(model: Model, state: Any, measurement: Any) -> tuple[Any, Array]:
     """Filter at the measurement, and what is shown of it."""
-    predicted = task.filter.predict(state, measurement)
-    return predicted, task.observe(Episode(None, measurement, predicted))
+    predicted = model.filter.predict(state, measurement)
+    return predicted, model.observe(Episode(None, measurement, predicted))
 
 
-def _begin_world(task: Task, uniforms: Array, normals: Array) -> tuple[Any, Any]:
+def _begin_world(model: Model, uniforms: Array, normals: Array) -> tuple[Any, Any]:
     """Truth at the start of the track, and the initial estimate."""
-    return task.world.begin(Draws(uniforms, task.xp), normals)
+    return model.task.world.begin(Draws(uniforms, model.task.xp), normals)
 
 
-def _start_filter(task: Task, initial: Any, truth: Any) -> tuple[Any, Any]:
+def _start_filter(model: Model, initial: Any, truth: Any) -> tuple[Any, Any]:
     """Filter at the start of the track, and what it gives back to the world."""
-    state = task.filter.begin(Input(initial, truth))
-    return state, task.filter.feedback(state, initial)
+    state = model.filter.begin(Input(initial, truth))
+    return state, model.filter.feedback(state, initial)
 
 
-def _feedback(task: Task, state: Any, measurement: Any) -> Any:
+def _feedback(model: Model, state: Any, measurement: Any) -> Any:
     """What a filter gives back to the world."""
-    return task.filter.feedback(state, measurement)
+    return model.filter.feedback(state, measurement)
 
 
 class Parts(NamedTuple):
@@ -101,12 +101,12 @@ class Parts(NamedTuple):
 
 
 def stepped(
-    kind: str, task: Task, episode: Episode, action: Array, noise: Array
+    kind: str, model: Model, episode: Episode, action: Array, noise: Array
 ) -> tuple[Episode, Array, Array]:
     """A whole step: episodes at the next measurement, the reward of the action, and the observation."""
-    after = task.act(episode, action)
-    following = task.measure(after, noise)
-    return following, OWN_PAY[kind](task, after), task.observe(following)
+    after = model.act(episode, action)
+    following = model.measure(after, noise)
+    return following, OWN_PAY[kind](model, after), model.observe(following)
 
 
 class _Once:
@@ -131,7 +131,7 @@ class Programs:
         of_world: what is traced of the same task with another filter; the world is the same.
     """
 
-    def __init__(self, traced: Task, graph: Graph, of_world: "Programs | None" = None) -> None:
+    def __init__(self, traced: Model, graph: Graph, of_world: "Programs | None" = None) -> None:
         self.traced = traced
         self.graph = graph
         self.refused: set[Any] = set()
@@ -140,7 +140,7 @@ class Programs:
         self._of_world = of_world or self
         self._with_filter: dict[Any, Programs] = {}
 
-    def with_filter(self, make: Callable[[Task], Filter]) -> "Programs":
+    def with_filter(self, make: Callable[[Model], Filter]) -> "Programs":
         """Return what is traced of the task with another filter; kept for the next time.
 
         Raises:
@@ -187,7 +187,7 @@ class Programs:
         """World at the start of the track."""
         if self._of_world is not self:
             return self._of_world.world_begun
-        noise = self.traced.noise
+        noise = self.traced.task.noise
         uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
         return self.function(_begin_world).specialised(uniforms, normals)
 
@@ -225,7 +225,7 @@ class Programs:
     @property
     def row(self) -> numpy.ndarray:
         """Noise of a measurement."""
-        return numpy.zeros((self.traced.noise.normals + self.traced.noise.row_uniforms, 8))
+        return numpy.zeros((self.traced.task.noise.normals + self.traced.task.noise.row_uniforms, 8))
 
     def _parts(self, truth: Any, state: Any, feedback: Any) -> Parts:
         space = self.traced.action_space
@@ -248,44 +248,88 @@ class Programs:
         return self.function(report).specialised(self.later.episode)
 
 
-class _Compiled(Task):
-    """Put in front of a task's class; see :func:`compiled`."""
+def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a method of a model run as code of the processor."""
 
-    original: Task
-    programs: Programs
-    threads: int
+    @functools.wraps(method)
+    def run(self: "CompiledModel", episode: Episode) -> Any:
+        return self.run(method, episode)
+
+    return run
+
+
+class CompiledModel(Model):
+    """A model whose methods run as code of the processor.
+
+    Args:
+        task: on NumPy arrays.
+        control: what the action steers.
+        threads: how many share the lanes.
+
+    Raises:
+        NotTraceable: if a step is no straight line of arithmetic.
+        ImportError: without llvmlite.
+    """
+
+    observe = _compile(Model.observe)
+    mean = _compile(Model.mean)
+    cost = _compile(Model.cost)
+    charge = _compile(Model.charge)
+    error = _compile(Model.error)
+    covariance = _compile(Model.covariance)
+    track = _compile(Model.track)
+    records = _compile(Model.records)
+
+    def __init__(self, task: Task, control: str, threads: int = 1) -> None:
+        if not AVAILABLE:
+            raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
+        super().__init__(task, control)
+        # Parameters that hold arrays are traced each time.
+        trace = _remembered if _hashes(task.parameters) else _trace
+        self.programs: Programs = trace(type(task), task.parameters, control, task.recording)
+        self.threads = threads
+        self._plain = Model(task, control)
 
     def __reduce__(self) -> Any:
-        return compiled, (self.original, self.threads)
+        return type(self), (self.task, self.control, self.threads)
 
-    def under(self, control: str) -> Task:
+    @property
+    def backend(self) -> str:
+        """What computes its steps."""
+        return "compiled"
+
+    def under(self, control: str) -> Model:
         """Return the same problem with another control."""
-        return compiled(self.original.under(control), self.threads)
+        return CompiledModel(self.task, control, self.threads)
 
-    def on_numpy(self) -> Task:
+    def on_numpy(self) -> Model:
         """Return the same problem on NumPy arrays, not compiled."""
-        return self.original
+        return self._plain
 
-    def with_filter(self, make: Callable[[Task], Filter]) -> Task:
+    def with_filter(self, make: Callable[[Model], Filter]) -> "CompiledModel":
         """Return the same problem with another filter in place of the bank.
 
         Args:
-            make: makes the filter for a task, on NumPy's arrays and on traced ones.
+            make: makes the filter for a model, on NumPy's arrays and on traced ones.
 
         Raises:
             NotTraceable: if the filter is no straight line of arithmetic, and does not say so.
         """
-        return _wrap(self.original.with_filter(make), self.programs.with_filter(make), self.threads)
+        other = copy.copy(self)
+        other._plain = self._plain.with_filter(make)
+        other._take_filter(other._plain.filter)
+        other.programs = self.programs.with_filter(make)
+        return other
 
     def run(self, function: Callable[..., Any], *parts: Any) -> Any:
-        """Call ``function(task, *parts)`` as code of the processor, or with NumPy where it cannot be traced."""
+        """Call ``function(model, *parts)`` as code of the processor, or with NumPy where it cannot be traced."""
         if function not in self.programs.refused:
             try:
                 return self.programs.function(function)(*parts, threads=self.threads)
             except NotTraceable as error:
                 self.programs.refused.add(function)
-                warn_of(f"{function.__qualname__} of {self.id}", error)
-        return function(self.original, *parts)
+                warn_of(f"{function.__qualname__} of {self.task.id}", error)
+        return function(self._plain, *parts)
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
@@ -312,34 +356,10 @@ class _Compiled(Task):
         return episode._replace(filter=self.programs.updated(*arguments, threads=self.threads)[0])
 
 
-def _method(name: str) -> Callable[..., Any]:
-    def method(self: _Compiled, *parts: Any) -> Any:
-        return self.run(getattr(type(self.original), name), *parts)
-
-    method.__name__, method.__doc__ = name, getattr(Task, name).__doc__
-    return method
-
-
-for _name in REPORTS:
-    setattr(_Compiled, _name, _method(_name))
-
-
-@functools.cache
-def _class_of(cls: type[Task]) -> type[_Compiled]:
-    return type(cls.__name__, (_Compiled, cls), {"__module__": cls.__module__, "__doc__": cls.__doc__})
-
-
-def _wrap(task: Task, programs: Programs, threads: int) -> Task:
-    other: _Compiled = object.__new__(_class_of(type(task)))
-    other.__dict__.update(task.__dict__)
-    other.backend, other.original, other.programs, other.threads = "compiled", task, programs, threads
-    return other
-
-
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
     graph = Graph()
     with namespace.tracing(graph):
-        programs = Programs(cls(parameters, control, namespace, None, recording), graph)
+        programs = Programs(Model(cls(parameters, namespace, None, recording), control), graph)
     _ = programs.later
     return programs
 
@@ -355,24 +375,6 @@ def _hashes(value: Any) -> bool:
     return True
 
 
-def compiled(task: Task, threads: int = 1) -> Task:
-    """Return a task whose methods run as code of the processor.
-
-    Args:
-        task: on NumPy arrays.
-        threads: how many share the lanes.
-
-    Raises:
-        NotTraceable: if a step is no straight line of arithmetic.
-        ImportError: without llvmlite.
-    """
-    if not AVAILABLE:
-        raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
-    # Parameters that hold arrays are traced each time.
-    trace = _remembered if _hashes(task.parameters) else _trace
-    return _wrap(task, trace(type(task), task.parameters, task.control, task.recording), threads)
-
-
 def warn_of(what: str, error: BaseException) -> None:
     """Warn that something runs with NumPy, and name the line that is to blame."""
     found: BaseException = error.__cause__ or error
@@ -385,24 +387,24 @@ def warn_of(what: str, error: BaseException) -> None:
     warnings.warn(f"{what} is not compiled and runs with NumPy: {error}{line}", stacklevel=2)
 
 
-def can_step(task: Any, report: Report) -> bool:
-    """Whether a task's steps are compiled, and a report on them can be."""
-    if task.backend != "compiled" or task.filter.in_python or report in task.programs.refused:
+def can_step(model: Any, report: Report) -> bool:
+    """Whether a model's steps are compiled, and a report on them can be."""
+    if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:
-        task.programs.reported(report)
+        model.programs.reported(report)
     except NotTraceable as error:
-        task.programs.refused.add(report)
-        warn_of(f"{report.__qualname__} of {task.id}", error)
+        model.programs.refused.add(report)
+        warn_of(f"{report.__qualname__} of {model.task.id}", error)
         return False
     return True
 
 
 class Stepper:
-    """Episodes of a compiled task in memory of their own, stepped by actions.
+    """Episodes of a compiled model in memory of their own, stepped by actions.
 
     Args:
-        task: compiled.
+        model: compiled.
         report: made of every episode after the action.
         width: lanes, a multiple of eight.
 
@@ -410,11 +412,11 @@ class Stepper:
         action: applied at every step, ``(..., width)``.
     """
 
-    def __init__(self, task: Any, report: Report, width: int) -> None:
-        update, advance, predict, episode = task.programs.later
-        tell = task.programs.reported(report)
+    def __init__(self, model: Any, report: Report, width: int) -> None:
+        update, advance, predict, episode = model.programs.later
+        tell = model.programs.reported(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
-        self.width, self._threads, self._task = width, task.threads, task
+        self.width, self._threads, self._model = width, model.threads, model
         count = itertools.count()
         self._template, self._kinds = mapped(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -435,11 +437,11 @@ class Stepper:
         written = memory(update.outputs)
         nothing = numpy.zeros((advance.inputs[-1].rows, width))
         self._calls, self._begin = [], []
-        world, start = task.programs.begun
+        world, start = model.programs.begun
         self._drawn = memory(world.inputs)
         initial = memory(world.outputs[truths:])
-        begun = task.programs.first
-        knows = bool(task.filter.knows)
+        begun = model.programs.first
+        knows = bool(model.filter.knows)
         for now, then in ((first, second), (second, first)):
             truth, measurement = now[:truths], now[truths : truths + measured]
             given = [*(truth if knows else []), *now[truths + measured :], *measurement, self.action]
@@ -478,7 +480,7 @@ class Stepper:
             memory[..., lanes] = values[..., : len(lanes)]
         if self._given:
             self._show_in(self._shown.copy())
-        self._shown[lanes] = self._task.observe(episode)[:, : len(lanes)].T
+        self._shown[lanes] = self._model.observe(episode)[:, : len(lanes)].T
 
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""

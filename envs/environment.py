@@ -14,10 +14,11 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from .backend import host_array, is_tensor, task_on, tensor_on
+from .backend import host_array, is_tensor, make_model, tensor_on
 from .catalogue import ScenarioChoice, check_names, find_mixture, find_scenario, nearest, task_class
 from .fleet import Course, Fleet, check_alike
 from .lanes import Lanes, mean_of
+from .model import Model
 from .observation import Array, Field
 from .parameters import Limits, check, frozen
 from .privileged import context_shapes, in_sigmas
@@ -132,7 +133,7 @@ class EnvOptions:
 class _EnvBase:
     """What both environments share: a task, its spaces, and the reward."""
 
-    task: Task
+    model: Model
     """Where scenarios are mixed: of the single environment the one that is flown, of a vector the first."""
     fleet: Fleet
     options: EnvOptions
@@ -142,6 +143,11 @@ class _EnvBase:
     reset_options: ClassVar[tuple[str, ...]] = ("scenario", "parameters")
     """Names that ``options`` of a reset may have."""
     _spec: EnvSpec | None = None
+
+    @property
+    def task(self) -> Task:
+        """What the model is of."""
+        return self.model.task
 
     def _set_options(self, task: str, options: EnvOptions, names: Iterable[str]) -> None:
         """Keep the options; refuse an unknown environment or parameter before anything is made."""
@@ -162,7 +168,7 @@ class _EnvBase:
 
     def _open(
         self,
-        make: Callable[..., Task],
+        make: Callable[..., Model],
         scenario: Any,
         keywords: Mapping[str, Any],
         count: int,
@@ -171,7 +177,7 @@ class _EnvBase:
         """Make the lanes.
 
         Args:
-            make: makes a task of a scenario and parameters.
+            make: makes a model of a scenario and parameters.
             scenario: as the user has named it.
             keywords: parameters of the task.
             count: number of lanes.
@@ -179,9 +185,13 @@ class _EnvBase:
         """
         self._make, self._keywords = make, dict(keywords)
         course = self._course(scenario, {})
-        if not all(task.has_truth for task in course.tasks):
+        if not all(model.task.has_truth for model in course.models):
             self._disable_reward(course)
-        self.task, self._first_course, beside_paper = course.tasks[0], course, self.reward_kind == "relative"
+        self.model, self._first_course, beside_paper = (
+            course.models[0],
+            course,
+            self.reward_kind == "relative",
+        )
         self.fleet = Fleet(count, course, beside_paper, longest)
         self.last_decision = self.fleet.decisions_per_episode
         self._scaled_errors: Array = None
@@ -213,23 +223,27 @@ class _EnvBase:
         mixture = find_mixture(self._class, scenario)
         choices = [scenario] if mixture is None else list(mixture)
         found = [find_scenario(self._class, choice, keywords) for choice in choices]
-        tasks = tuple(self._make(one, **keywords) for one in found)
+        models = tuple(self._make(one, **keywords) for one in found)
         names = tuple(one.name for one in found)
         course = Course(
             scenario,
             dict(parameters),
-            tasks,
+            models,
             names,
             (1.0,) if mixture is None else tuple(mixture.values()),
         )
-        if hasattr(self, "task") and self.reward_kind != "none" and not all(t.has_truth for t in tasks):
+        if (
+            hasattr(self, "model")
+            and self.reward_kind != "none"
+            and not all(t.task.has_truth for t in models)
+        ):
             raise ValueError(
                 f"{_no_truth(course)}, and this environment gives rewards: make another one of it"
             )
-        first = getattr(self, "task", tasks[0])
-        for task, name in zip(tasks, names, strict=True):
-            check_alike(first, task, name)
-            if self.privileged and context_shapes(task) != context_shapes(first):
+        first = getattr(self, "model", models[0])
+        for model, name in zip(models, names, strict=True):
+            check_alike(first, model, name)
+            if self.privileged and context_shapes(model.task) != context_shapes(first.task):
                 raise ValueError(
                     f"scenario {name!r} has a context of another shape than this environment shows its critics: leave "
                     "it out, or make the environment without observation='asymmetric'"
@@ -270,7 +284,7 @@ class _EnvBase:
         def box(size: int) -> gymnasium.spaces.Box:
             return gymnasium.spaces.Box(-numpy.inf, numpy.inf, (size,), numpy.dtype(self.options.dtype).type)
 
-        measured = box(len(self.task.fields))
+        measured = box(len(self.model.fields))
         if not self.privileged:
             return measured
         context = sum(math.prod(shape) for shape in context_shapes(self.task).values())
@@ -300,7 +314,7 @@ class _EnvBase:
         """Context of all lanes, batch first, and which of them has each part of it."""
         found = []
         for (part,) in self.fleet.parts():
-            context, xp = part.task.context(part.state), part.task.xp
+            context, xp = part.model.context(part.state), part.task.xp
             found.append({name: xp.moveaxis(v[..., : part.count], -1, 0) for name, v in context.items()})
         return self._gather_reports(found)
 
@@ -344,7 +358,7 @@ class _EnvBase:
     @property
     def backend(self) -> str:
         """What computes the steps: "compiled", "numpy" or "torch"."""
-        return self.task.backend
+        return self.model.backend
 
     # --- a step
 
@@ -394,7 +408,7 @@ class _EnvBase:
     @property
     def observation_fields(self) -> tuple[Field, ...]:
         """Name, unit and scale of every component of the observation."""
-        return self.task.fields
+        return self.model.fields
 
 
 class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
@@ -412,7 +426,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         render_mode: None, "rgb_array" or "human".
         detailed_info: whether ``info`` carries truth, measurement, estimate, covariance (:meth:`.Task.track`), error,
             cost and what else an evaluation records.
-        backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.task_on`.
+        backend: "auto" (default), "compiled" or "numpy"; see :func:`~.backend.make_model`.
         dtype: of observations and rewards: "float64" (default), or "float32", to which they are rounded when they are
             given out.
         context: whether ``info["context"]`` tells what was drawn for the episode and what of it holds now
@@ -451,13 +465,15 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
             raise ValueError("backend 'torch' is for many episodes at once: use gymnasium.make_vec")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        self._open(functools.partial(task_on, backend, task, control), scenario, keywords, 1, None)
+        self._open(
+            functools.partial(make_model, self._class, control, backend=backend), scenario, keywords, 1, None
+        )
         self.render_mode = render_mode
         self._late: LatePicture | None = None
         if render_mode is not None:
             self._picture_of(self._first_course.names[0])
         self.observation_space = self._observation_space()
-        self.action_space = self.task.action_space
+        self.action_space = self.model.action_space
 
     def _picture_of(self, scenario: str) -> None:
         """Draw episodes of the present task, of a scenario of this name."""
@@ -466,7 +482,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
 
         assert self.render_mode is not None
         self._late = rendering.LatePicture(
-            rendering.EpisodePicture(self.task, scenario, self.render_mode, FRAMES_PER_SECOND)
+            rendering.EpisodePicture(self.model, scenario, self.render_mode, FRAMES_PER_SECOND)
         )
 
     def reset(
@@ -489,10 +505,10 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         ahead = None if self._late is None else copy.deepcopy(self.np_random)
         self.fleet.restart()
         self._forget_errors([0])
-        self.task = self.fleet.task_of(0)
+        self.model = self.fleet.model_of(0)
         if self._late is not None and ahead is not None:
             self.fleet.course_of(0).drawn(ahead)  # comes before the episode
-            if self._late.task is not self.task:
+            if self._late.model is not self.model:
                 self._late.close()
                 self._picture_of(self.fleet.scenario_of(0))
         if self._late is not None and ahead is not None:
@@ -578,7 +594,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             mixture, ``{"random": 0.8, "paper": 0.2}``.
         reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative"; default: the environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
-        backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.task_on`; or "torch": observations,
+        backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
             same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and
             observations back to actions that require them, over all steps since the last reset; pass detached
@@ -647,7 +663,9 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise nearest("render_mode", render_mode, self.metadata["render_modes"])
-        make = functools.partial(task_on, backend, task, control, device=device, threads=threads)
+        make = functools.partial(
+            make_model, self._class, control, backend=backend, device=device, threads=threads
+        )
         self._open(make, scenario, keywords, num_envs, None if max_episode_steps == -1 else max_episode_steps)
         self.device = self.task.device
         self.autoreset_mode = autoreset_mode
@@ -662,9 +680,9 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                     "a vector of environments that mix scenarios cannot be drawn: use gymnasium.make, or one scenario"
                 )
             name = self._first_course.names[0]
-            self.pictures = rendering.EpisodePictures(self.task, name, num_envs, FRAMES_PER_SECOND)
+            self.pictures = rendering.EpisodePictures(self.model, name, num_envs, FRAMES_PER_SECOND)
         self.single_observation_space = self._observation_space()
-        self.single_action_space = self.task.action_space
+        self.single_action_space = self.model.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._finished = numpy.zeros(num_envs, dtype=bool)

@@ -124,7 +124,16 @@ class Filter(ABC, Generic[TaskT, Measurement, State]):
 
 
 class Bank(Filter[TaskT, Measurement, State]):
-    """A filter that an action steers: the filters of a task under one control."""
+    """A filter that an action steers: the filters of a task under one control.
+
+    Args:
+        task: the estimation problem.
+        control: name under which the task offers this bank; several may share one class.
+    """
+
+    def __init__(self, task: TaskT, control: str) -> None:
+        super().__init__(task)
+        self.control = control
 
     @property
     @abstractmethod

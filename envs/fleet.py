@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import numpy
 
 from .lanes import Lanes
+from .model import Model
 from .observation import Array
 from .recording import Recording
-from .reward import paper_task
+from .reward import paper_model
 from .specification import plain
-from .task import Task
 
 ROOM = 8
 """Places by which lanes grow: a multiple of the width that arrays are padded to."""
@@ -35,7 +35,7 @@ class Course(NamedTuple):
     """As it was asked for."""
     parameters: Mapping[str, Any]
     """Beside those that the environment was made with."""
-    tasks: tuple[Task, ...]
+    models: tuple[Model, ...]
     names: tuple[str, ...]
     """Of their scenarios."""
     weights: tuple[float, ...]
@@ -51,28 +51,28 @@ class Course(NamedTuple):
 
     def drawn(self, generator: numpy.random.Generator) -> int:
         """Number of the task of the next episode; one task takes no random number."""
-        if len(self.tasks) == 1:
+        if len(self.models) == 1:
             return 0
         chosen = int(numpy.searchsorted(numpy.cumsum(self.weights), generator.random(), side="right"))
-        return min(chosen, len(self.tasks) - 1)
+        return min(chosen, len(self.models) - 1)
 
 
-def check_alike(task: Task, other: Task, name: str) -> None:
+def check_alike(model: Model, other: Model, name: str) -> None:
     """Raise ValueError if episodes of another task would not fit the spaces of a task.
 
     Args:
-        task: whose spaces there are.
+        model: whose spaces there are.
         other: that is to be flown too.
         name: of its scenario, in errors.
     """
-    said: dict[str, Callable[[Task], Any]] = {
+    said: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
-        "decision_interval": lambda t: t.decision_interval,
-        "what is estimated": lambda t: t.components,
+        "decision_interval": lambda t: t.task.decision_interval,
+        "what is estimated": lambda t: t.task.components,
     }
     for what, of in said.items():
-        if of(task) != of(other):
+        if of(model) != of(other):
             raise ValueError(
                 f"scenario {name!r} with these parameters would change {what} of this environment, which stays as it "
                 "is made: make another environment"
@@ -104,8 +104,8 @@ class Fleet:
         """The lanes of the one task that all episodes are of, each in its own place; None where there are several."""
         self._sent = False
         """Whether lanes have courses that their episodes were not drawn from."""
-        if len(course.tasks) == 1:
-            self._parts, self._part[:] = [self._make_lanes(course.tasks[0], count)], 0
+        if len(course.models) == 1:
+            self._parts, self._part[:] = [self._make_lanes(course.models[0], count)], 0
         self._arrange()
 
     # --- who flies where
@@ -126,7 +126,7 @@ class Fleet:
     @property
     def mixed(self) -> bool:
         """Whether the coming episodes may be of several tasks."""
-        return len({id(task) for course in self._courses for task in course.tasks}) > 1
+        return len({id(model) for course in self._courses for model in course.models}) > 1
 
     def courses(self) -> list[Course]:
         """Return the different courses that lanes have."""
@@ -141,9 +141,9 @@ class Fleet:
         self._sent = self._sent or course is not self._courses[lane]
         self._courses[lane] = course
 
-    def task_of(self, lane: int) -> Task:
+    def model_of(self, lane: int) -> Model:
         """Return the task of a lane's episode."""
-        return self._parts[self._part[lane]].task
+        return self._parts[self._part[lane]].model
 
     def scenario_of(self, lane: int) -> str:
         """Name of the scenario of a lane's episode."""
@@ -152,19 +152,19 @@ class Fleet:
     @property
     def decisions_per_episode(self) -> int:
         """Decisions of the longest episode that there may be."""
-        tasks = {id(task): task for course in self.courses() for task in course.tasks}.values()
-        most = max(task.horizon // task.decision_interval for task in tasks)
+        models = {id(model): model for course in self.courses() for model in course.models}.values()
+        most = max(model.task.horizon // model.task.decision_interval for model in models)
         return most if self._longest is None else min(most, self._longest)
 
-    def _make_lanes(self, task: Task, count: int) -> Lanes:
-        return Lanes(task, count, paper_task(task) if self._beside_paper else None, longest=self._longest)
+    def _make_lanes(self, model: Model, count: int) -> Lanes:
+        return Lanes(model, count, paper_model(model) if self._beside_paper else None, longest=self._longest)
 
-    def _part_of(self, task: Task) -> Lanes:
+    def _part_of(self, model: Model) -> Lanes:
         """Lanes of a task, made when they are first asked for."""
         for part in self._parts:
-            if part.task is task or part.task.parameters == task.parameters:
+            if part.model is model or part.model.task.parameters == model.task.parameters:
                 return part
-        part = self._make_lanes(task, ROOM)
+        part = self._make_lanes(model, ROOM)
         for place in range(ROOM):
             part.seed(place, numpy.random.default_rng(0))
         part.restart()
@@ -173,11 +173,11 @@ class Fleet:
 
     def _arrange(self) -> None:
         """Forget lanes that nobody needs, and note where everybody is."""
-        needed = [task.parameters for course in self._courses for task in course.tasks]
+        needed = [model.task.parameters for course in self._courses for model in course.models]
         kept = [
             i
             for i, part in enumerate(self._parts)
-            if (self._part == i).any() or part.task.parameters in needed
+            if (self._part == i).any() or part.model.task.parameters in needed
         ]
         renumbered = {-1: -1, **{old: new for new, old in enumerate(kept)}}
         self._part = numpy.array([renumbered[int(part)] for part in self._part])
@@ -219,7 +219,7 @@ class Fleet:
         for lane in chosen:
             course = self._courses[lane]
             which = course.drawn(self.generators[lane])
-            part = self._part_of(course.tasks[which])
+            part = self._part_of(course.models[which])
             number = next(i for i, other in enumerate(self._parts) if other is part)
             fresh.setdefault(number, []).append(lane)
             self._names[lane] = course.names[which]
@@ -260,8 +260,8 @@ class Fleet:
                 numpy.array(values[0]) if self._whole is not None else numpy.concatenate(values)[self._where]
             )
         if self._whole is not None:
-            return self._whole.task.xp.asarray(values[0], copy=True)
-        return self._parts[0].task.xp.concat(list(values))[self._where]
+            return self._whole.model.task.xp.asarray(values[0], copy=True)
+        return self._parts[0].model.task.xp.concat(list(values))[self._where]
 
     def pay(self, action: Array, kind: str) -> Array:
         """Apply one decision and return its reward, see :meth:`.lanes.Lanes.pay`."""
@@ -305,7 +305,7 @@ class Fleet:
     def snapshot(self) -> dict[str, Any]:
         """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
         kept = {name: copy.deepcopy(getattr(self, name)) for name in _KEPT}
-        return {"count": self.count, **kept, "parts": [(p.task, p.count, p.snapshot()) for p in self._parts]}
+        return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go on from a snapshot of lanes of the same tasks.
@@ -317,9 +317,10 @@ class Fleet:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         for name in _KEPT:
             setattr(self, name, copy.deepcopy(snapshot[name]))
-        there = {(part.task, part.count): part for part in self._parts}
+        there = {(part.model, part.count): part for part in self._parts}
         self._parts = [
-            there.get((task, count)) or self._make_lanes(task, count) for task, count, _ in snapshot["parts"]
+            there.get((model, count)) or self._make_lanes(model, count)
+            for model, count, _ in snapshot["parts"]
         ]
         for part, (_, _, kept) in zip(self._parts, snapshot["parts"], strict=True):
             part.restore(kept)

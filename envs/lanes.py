@@ -1,4 +1,4 @@
-"""The engine: episodes of a task side by side, each fixed by its own generator.
+"""The engine: episodes of a model side by side, each fixed by its own generator.
 
 A *lane* is one episode after another, fed by one generator. Both Gymnasium faces and the evaluation drive
 this class; it owns the noise and knows nothing of spaces or autoreset.
@@ -7,8 +7,8 @@ this class; it owns the noise and knows nothing of spaces or autoreset.
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
 environment with the same seed bit for bit.
 
-**What steps them.** A compiled task whose report can be traced moves its episodes in memory of its own
-(:class:`~.compiled.Stepper`), any other by the task's functions (:class:`TaskStepper`), both by the same calls.
+**What steps them.** A compiled model whose report can be traced moves its episodes in memory of its own
+(:class:`~.compiled.Stepper`), any other by the model's functions (:class:`ModelStepper`), both by the same calls.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ import numpy
 from ..compiler.functions import mapped, padded_width
 from ..filters.ordered_sums import ordered_sum
 from .compiled import Report, Stepper, can_step
+from .model import Episode, Model
 from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
-from .task import Episode, Task
 
 
-def whole_episode(task: Task, episode: Episode) -> Episode:
+def whole_episode(model: Model, episode: Episode) -> Episode:
     """Report the state itself."""
     return episode
 
@@ -49,17 +49,17 @@ def _replace_lanes(old: Any, new: Any, lanes: Any) -> Any:
     return merged
 
 
-class TaskStepper:
-    """Episodes stepped by the functions of their task, in arrays that never change.
+class ModelStepper:
+    """Episodes stepped by the functions of their model, in arrays that never change.
 
     Args:
-        task: the estimation problem.
+        model: whose episodes they are.
         width: lanes, a multiple of eight.
-        report: function of task and episodes after the action; None makes no report.
+        report: function of model and episodes after the action; None makes no report.
     """
 
-    def __init__(self, task: Task, width: int, report: Report | None = None) -> None:
-        self.task, self.width, self.report_function = task, width, report
+    def __init__(self, model: Model, width: int, report: Report | None = None) -> None:
+        self.model, self.width, self.report_function = model, width, report
         self._episode: Any = None
         self._shown: Array = None
         """What is shown, ``(fields, width)``; None until it is computed."""
@@ -68,7 +68,7 @@ class TaskStepper:
 
     def begin(self, uniforms: Array, normals: Array, noise: NoiseRing) -> None:
         """Start new episodes everywhere and let their first measurement arrive."""
-        self.load(self.task.measure(self.task.begin(uniforms, normals), noise.row))
+        self.load(self.model.measure(self.model.begin(uniforms, normals), noise.row))
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes; what they show is observed from them unless it is given."""
@@ -77,7 +77,7 @@ class TaskStepper:
     def replace(self, episode: Episode, lanes: Any) -> None:
         """Put the first episodes of others in place of those in some lanes."""
         if self._shown is not None:
-            self._shown = _replace_lanes(self._shown, self.task.observe(episode), lanes)
+            self._shown = _replace_lanes(self._shown, self.model.observe(episode), lanes)
         self._episode = _replace_lanes(self._episode, episode, lanes)
 
     def episode(self) -> Episode:
@@ -86,25 +86,27 @@ class TaskStepper:
 
     def take(self, action: Array) -> None:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
-        xp, turned = self.task.xp, action.T if action.ndim == 2 else action
-        if not isinstance(self.task.action_space, gymnasium.spaces.Discrete):
+        xp, turned = self.model.task.xp, action.T if action.ndim == 2 else action
+        if not isinstance(self.model.action_space, gymnasium.spaces.Discrete):
             turned = xp.astype(turned, xp.float64, copy=False)
         missing = self.width - turned.shape[-1]
         if missing:
-            padding = xp.zeros((*turned.shape[:-1], missing), dtype=turned.dtype, device=self.task.device)
+            padding = xp.zeros(
+                (*turned.shape[:-1], missing), dtype=turned.dtype, device=self.model.task.device
+            )
             turned = xp.concat([turned, padding], axis=-1)
         self._action = turned
 
     def step(self, noise: NoiseRing) -> None:
         """Apply the action and go on to the next measurement."""
-        after = self.task.act(self._episode, self._action)
+        after = self.model.act(self._episode, self._action)
         if self.report_function is not None:
-            self._report = self.task.run(self.report_function, after)
+            self._report = self.model.run(self.report_function, after)
         row = noise.row
         if not isinstance(row, numpy.ndarray):
             # Autograd may keep it until the backward pass, when the ring has long been written over.
             row = row.clone()
-        self.load(self.task.measure(after, row))
+        self.load(self.model.measure(after, row))
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)``."""
@@ -113,7 +115,7 @@ class TaskStepper:
     def shown(self) -> Array:
         """What is shown, ``(fields, width)``."""
         if self._shown is None:
-            self._shown = self.task.observe(self._episode)
+            self._shown = self.model.observe(self._episode)
         return self._shown
 
     def computed_observation(self) -> Array:
@@ -122,12 +124,12 @@ class TaskStepper:
 
     def show_means(self, fields: Sequence[int], means: Array) -> None:
         """Show other values of some fields, ``(fields, width)``."""
-        task = self.task
-        fresh = task.constant([[1.0 if i in fields else 0.0] for i in range(len(task.fields))])
+        model, xp = self.model, self.model.task.xp
+        fresh = model.task.constant([[1.0 if i in fields else 0.0] for i in range(len(model.fields))])
         spread = [
-            means[list(fields).index(i)] if i in fields else 0.0 * means[0] for i in range(len(task.fields))
+            means[list(fields).index(i)] if i in fields else 0.0 * means[0] for i in range(len(model.fields))
         ]
-        self._shown = task.xp.where(fresh > 0.0, task.xp.stack(spread), self.shown())
+        self._shown = xp.where(fresh > 0.0, xp.stack(spread), self.shown())
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
@@ -137,10 +139,10 @@ class TaskStepper:
 
 
 class Lanes:
-    """``count`` episodes of a task side by side.
+    """``count`` episodes of a model side by side.
 
     Args:
-        task: the estimation problem; its namespace decides where arrays live.
+        model: task with a filter; the task's namespace decides where arrays live.
         count: number of lanes.
         paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
         begun: called with new episodes at the start of the track, before their first measurement.
@@ -153,20 +155,21 @@ class Lanes:
 
     def __init__(
         self,
-        task: Task,
+        model: Model,
         count: int,
-        paper: Task | None = None,
+        paper: Model | None = None,
         begun: Callable[[Episode], None] | None = None,
         longest: int | None = None,
     ) -> None:
-        self.task = task
+        self.model = model
+        self.task = task = model.task
         self.count = count
         self.width = padded_width(count)
         self.paper = paper
-        self._tasks = [task] if paper is None else [task, paper]
+        self._models = [model] if paper is None else [model, paper]
         self._begun = begun
         self._steppers: dict[Report, list[Stepper]] = {}
-        """Those of compiled tasks, by what they report."""
+        """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
         """Steppers that hold the episodes, of the task and of the paper's; none before the first episode."""
         self.noise = NoiseRing(task, count)
@@ -175,7 +178,7 @@ class Lanes:
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
         self._lengths = numpy.full(count, self.decisions_per_episode)
         """Decisions of each lane's episode."""
-        averaged = [i for i, f in enumerate(task.fields) if f.over_interval == "mean"]
+        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
         self._averaged = averaged if task.decision_interval > 1 else []
         """Fields that are shown as their means over a decision."""
 
@@ -206,9 +209,9 @@ class Lanes:
         # The padding lanes fly an average episode without noise.
         scenario, start = self._pad(uniforms, 0.5), self._pad(normals, 0.0)
         if self._begun is not None:
-            self._begun(task.begin(scenario, start))
+            self._begun(self.model.begin(scenario, start))
         if everyone:
-            self._moving = self._moving or self._by_tasks()
+            self._moving = self._moving or self._by_functions()
             for stepper in self._moving:
                 stepper.begin(scenario, start, self.noise)
             return
@@ -219,7 +222,7 @@ class Lanes:
             row = xp.concat(
                 [row, xp.zeros((row.shape[0], padding), dtype=row.dtype, device=task.device)], axis=1
             )
-        for each, stepper in zip(self._tasks, self._moving, strict=True):
+        for each, stepper in zip(self._models, self._moving, strict=True):
             stepper.replace(each.measure(each.begin(scenario, start), row), where)
 
     def pay(self, action: Array, kind: str) -> Array:
@@ -237,10 +240,10 @@ class Lanes:
 
         Args:
             action: batch first, as the action space has it.
-            report: function of a task and its episodes after the action; not made anew for each call.
+            report: function of a model and its episodes after the action; not made anew for each call.
 
         Returns:
-            The reports on every measurement that the decision held for, arrays ``(..., width)``: of the task, and of
+            The reports on every measurement that the decision held for, arrays ``(..., width)``: of the model, and of
             ``paper`` (None without).
         """
         steppers = self._reporting(report)
@@ -267,23 +270,23 @@ class Lanes:
 
     # --- what steps them
 
-    def _by_tasks(self) -> list[Any]:
-        """Steppers by the tasks' functions, without episodes."""
-        steppers = [TaskStepper(task, self.width) for task in self._tasks]
+    def _by_functions(self) -> list[Any]:
+        """Steppers by the models' functions, without episodes."""
+        steppers = [ModelStepper(model, self.width) for model in self._models]
         if self.paper is not None:
-            steppers[1].take(self.paper.constant([self.paper.paper_policy.action] * self.width))
+            steppers[1].take(self.paper.task.constant([self.paper.task.paper_policy.action] * self.width))
         return steppers
 
     def _reporting(self, report: Report) -> list[Any]:
         """Steppers that make a report, which hold the episodes from now on."""
         if self._moving is self._steppers.get(report):
             return self._moving
-        if report not in self._steppers and all(can_step(task, report) for task in self._tasks):
-            self._steppers[report] = [Stepper(task, report, self.width) for task in self._tasks]
+        if report not in self._steppers and all(can_step(model, report) for model in self._models):
+            self._steppers[report] = [Stepper(model, report, self.width) for model in self._models]
             if self.paper is not None:
-                self._steppers[report][1].action[...] = self.paper.constant(self.paper.paper_policy.action)[
-                    :, None
-                ]
+                self._steppers[report][1].action[...] = self.paper.task.constant(
+                    self.paper.task.paper_policy.action
+                )[:, None]
         before, after = self._moving, self._steppers.get(report)
         if after is None:
             self._settle()
@@ -296,9 +299,9 @@ class Lanes:
         return after
 
     def _settle(self) -> None:
-        """Let the tasks' functions step the episodes, in arrays of their own."""
-        if self._moving and not isinstance(self._moving[0], TaskStepper):
-            before, self._moving = self._moving, self._by_tasks()
+        """Let the models' functions step the episodes, in arrays of their own."""
+        if self._moving and not isinstance(self._moving[0], ModelStepper):
+            before, self._moving = self._moving, self._by_functions()
             for old, new in zip(before, self._moving, strict=True):
                 new.load(old.episode(), old.shown().copy() if self._averaged else None)
 
@@ -337,7 +340,7 @@ class Lanes:
         self._lengths = numpy.append(self._lengths, numpy.full(added, self.decisions_per_episode))
         self.noise.grow(count, index)
         self.count = self.width = count
-        self._steppers, self._moving = {}, self._by_tasks()
+        self._steppers, self._moving = {}, self._by_functions()
         self._load(parts)
 
     # --- copies, growth, gradients
@@ -370,7 +373,7 @@ class Lanes:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
         self.noise.restore(snapshot["noise"])
         self.decisions, self._lengths = snapshot["decisions"].copy(), snapshot["_lengths"].copy()
-        self._moving = self._by_tasks() if snapshot["episodes"] else []
+        self._moving = self._by_functions() if snapshot["episodes"] else []
         self._load(snapshot["episodes"])
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
@@ -383,5 +386,5 @@ class Lanes:
         return self.decisions >= self._lengths
 
     def observe(self) -> Array:
-        """Observation of every lane, batch first: ``(count, len(task.fields))``; the caller may keep it."""
+        """Observation of every lane, batch first: ``(count, len(model.fields))``; the caller may keep it."""
         return self._moving[0].observation(self.count)

@@ -133,7 +133,7 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     """
     log_format = cls.log_format
     if log_format is None:
-        measure_once(cls(cls.Parameters(**keywords), cls.controls[0]))  # says what a closed loop is
+        measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
     known = _ColumnNames({*TIME, RECORDING, *log_format.columns})
     if not path.name.endswith(FLIGHT_SUFFIXES):
@@ -205,7 +205,7 @@ def _side_by_side(
 ) -> Recording:
     """Put the recordings of a file, whose columns have these names, side by side; the environment reads ``columns``."""
     first, known = parts[0][0], parts[0][1].parameters
-    task = cls(cls.Parameters(**{**known, **keywords}), cls.controls[0])
+    task = cls(cls.Parameters(**{**known, **keywords}))
     true = [TRUTH + component.name for component in task.components]
     notes = tuple(ignored_columns(names, [*TIME, RECORDING, *columns, *true]))
     with_truth = first.has(*true)

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .draws import Draws
+from .model import Model
 from .observation import Array
 from .parameters import check, declared, frozen
 from .task import Scenario, Task, named_arrays
@@ -183,7 +184,7 @@ class Recording:
             raise ValueError(
                 f"horizon must be at most {longest}, the measurements of recording {self.name!r}, got {made.horizon}"
             )
-        self.check_fits(cls(made, cls.controls[0]))
+        self.check_fits(cls(made))
         return Scenario(
             self.name,
             "Recorded measurements.",
@@ -393,8 +394,8 @@ def measure_once(task: Task) -> tuple[Any, Any]:
     world = task.World(task)
     draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
     truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
-    bank = task.bank.start(initial)
-    if task.bank.feedback(bank, initial) is not None:
+    bank = Model(task, task.controls[0]).filter
+    if bank.feedback(bank.start(initial), initial) is not None:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
             "what the sensors said to one estimate is not what they would have said to another, and can be neither "
@@ -416,11 +417,10 @@ class RecordedWorld(World[Task, Replayed, Any]):
         self.recording = recording
         self.simulated = task.World(task)
         """The task's own world, which knows what an error costs."""
-        plain = type(task)(task.parameters, task.control)
-        self._initial, self._measurement = measure_once(plain)
+        self._initial, self._measurement = measure_once(type(task)(task.parameters))
         tables = recording.tables
         # Tables of NumPy are read by compiled code as they are.
-        kept = task.constant if task.backend == "torch" else numpy.asarray
+        kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray
         self.tables = Tables(
             {name: kept(values) for name, values in tables.measurements.items()},
             {name: kept(values) for name, values in tables.initial.items()},

@@ -10,7 +10,8 @@ import numpy
 
 from .catalogue import ADDED, catalogue, nearest, register
 from .failures import explain_errors
-from .task import Episode, Task
+from .model import Episode, Model
+from .task import Task
 
 ID = re.compile(r"[\w-]+/[\w.-]+-v\d+")
 WIDTH = 24
@@ -78,50 +79,56 @@ def _check_contract(cls: Any) -> None:
     expected = [n for n in Task.__annotations__ if n not in declared]
     for control in (*cls.controls, *cls.trained_banks):
         with explain_errors(f"{name} cannot be made with control {control!r}"):
-            task = cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters), control)
-        missing = [attribute for attribute in expected if not hasattr(task, attribute)]
+            model = Model(cls(cls.Parameters(**cls.scenarios[cls.default_scenario].parameters)), control)
+        missing = [attribute for attribute in expected if not hasattr(model.task, attribute)]
         if missing:
             raise ValueError(
-                f"{_named(task)} needs {', '.join(missing)}: attributes of the class, or set by its set_up"
+                f"{_named(model)} needs {', '.join(missing)}: attributes of the class, or set by its set_up"
             )
-        _check_action(task)
-        _check_episodes(task)
+        _check_action(model)
+        _check_episodes(model)
 
 
-def _check_action(task: Task) -> None:
+def _check_action(model: Model) -> None:
     """Raise ValueError for an action space, or an action of the paper's algorithm, that the engine cannot take."""
-    space: Any = task.action_space
+    space: Any = model.action_space
     flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
     if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
         raise ValueError(
-            f"{_named(task)} needs as action space a Box of shape (A,) with finite limits, or a Discrete from 0 on, "
+            f"{_named(model)} needs as action space a Box of shape (A,) with finite limits, or a Discrete from 0 on, "
             f"got {space}"
         )
-    paper = task.paper_policy
-    if paper.control not in task.controls:
-        raise nearest(f"control of paper_policy of {type(task).__name__}", paper.control, task.controls)
-    if paper.control == task.control and flat and len(paper.action) != space.shape[0]:
+    paper = model.task.paper_policy
+    if paper.control not in model.task.controls:
+        raise nearest(
+            f"control of paper_policy of {type(model.task).__name__}", paper.control, model.task.controls
+        )
+    if paper.control == model.control and flat and len(paper.action) != space.shape[0]:
         raise ValueError(
-            f"{_named(task)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
+            f"{_named(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
         )
 
 
-def _check_episodes(task: Task) -> None:
+def _check_episodes(model: Model) -> None:
     """Fly some episodes for two measurements on NumPy, and compare what the task computes with what it declares.
 
     Raises:
         ValueError: for the first that does not fit, or raises.
     """
-    random, noise, names = numpy.random.default_rng(0), task.noise, [c.name for c in task.components]
-    count, space = len(names), task.action_space
+    random, noise, names = (
+        numpy.random.default_rng(0),
+        model.task.noise,
+        [c.name for c in model.task.components],
+    )
+    count, space = len(names), model.action_space
 
     def measure(episode: Episode) -> Episode:
         normals = random.standard_normal((noise.normals, WIDTH))
         row = numpy.concatenate([normals, random.random((noise.row_uniforms, WIDTH))])
-        return ask("measure", task.measure, episode, row)
+        return ask("measure", model.measure, episode, row)
 
     def ask(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        with explain_errors(f"{_named(task)} fails in {what}"):
+        with explain_errors(f"{_named(model)} fails in {what}"):
             return function(*arguments)
 
     def check(what: str, values: Any, shape: tuple[int, ...] | None = None, finite: bool = True) -> None:
@@ -134,47 +141,47 @@ def _check_episodes(task: Task) -> None:
                 else type(values).__name__
             )
             raise ValueError(
-                f"{_named(task)}: {what} must be numbers of shape {expected}, {WIDTH} episodes on the last axis, "
+                f"{_named(model)}: {what} must be numbers of shape {expected}, {WIDTH} episodes on the last axis, "
                 f"got {got}"
             )
         if finite and not numpy.isfinite(values).all():
-            raise ValueError(f"{_named(task)}: {what} must be finite")
+            raise ValueError(f"{_named(model)}: {what} must be finite")
 
     uniforms, normals = random.random((noise.uniforms, WIDTH)), numpy.zeros((noise.initial_normals, WIDTH))
-    start = ask("begin", task.begin, uniforms, normals)
+    start = ask("begin", model.begin, uniforms, normals)
     episode = measure(start)
-    for block in task.bank.blocks:
+    for block in model.filter.blocks:
         values = ask(f"block {block.name!r}", block.value, episode.filter, episode.measurement)
         check(f"block {block.name!r}", values)
         rows, fields = values.size // WIDTH, max(1, len(block.parts))
         if rows != fields:
             raise ValueError(
-                f"{_named(task)}: block {block.name!r} has {rows} rows for {fields} "
+                f"{_named(model)}: block {block.name!r} has {rows} rows for {fields} "
                 f"field{'s' if fields > 1 else ''}: name in its parts one ending for each row, got {block.parts!r}"
             )
-    shown = ask("observe", task.observe, episode)
-    check("the observation", shown, (len(task.fields),))
-    for quantity in task.bank.quantities:
-        values = ask(f"quantity {quantity.name!r}", task.reader(quantity.name), shown.T)
+    shown = ask("observe", model.observe, episode)
+    check("the observation", shown, (len(model.fields),))
+    for quantity in model.filter.quantities:
+        values = ask(f"quantity {quantity.name!r}", model.reader(quantity.name), shown.T)
         if numpy.shape(values)[:1] != (WIDTH,) or numpy.ndim(values) != 2:
             raise ValueError(
-                f"{_named(task)}: quantity {quantity.name!r} must have shape ({WIDTH}, parts), {WIDTH} episodes on the "
-                f"first axis, got {numpy.shape(values)}"
+                f"{_named(model)}: quantity {quantity.name!r} must have shape ({WIDTH}, parts), {WIDTH} episodes on "
+                f"the first axis, got {numpy.shape(values)}"
             )
     if isinstance(space, gymnasium.spaces.Box):
         action = numpy.tile(numpy.clip(0.0, space.low, space.high)[:, None], WIDTH)
     else:
         action = numpy.zeros(WIDTH, int)
-    episode = ask("act", task.act, episode, action)
+    episode = ask("act", model.act, episode, action)
     about = f" of the components {', '.join(names)}"
     shapes = {"mean": (count,), "covariance": (count, count), "error": (count,), "cost": (), "charge": ()}
     for name, shape in shapes.items():
-        values = ask(name, getattr(task, name), episode)
+        values = ask(name, getattr(model, name), episode)
         check(name + (about if shape else ""), values, shape)
-    for name, values in ask("records", task.records, episode).items():
+    for name, values in ask("records", model.records, episode).items():
         hypotheses = name == "mode_probability"
-        check(f"record {name!r}", values, (len(task.modes),) if hypotheses else (), finite=False)
-    for name, values in ask("context", task.context, episode).items():
+        check(f"record {name!r}", values, (len(model.task.modes),) if hypotheses else (), finite=False)
+    for name, values in ask("context", model.context, episode).items():
         check(f"context {name!r}", values)
     episode = measure(episode)  # with what the bank gives back
     before = dict([*_leaves("truth", start.truth), *_leaves("filter's state", start.filter)])
@@ -184,7 +191,7 @@ def _check_episodes(task: Task) -> None:
             first = numpy.shape(before.get(name, values))
             if first != values.shape:
                 raise ValueError(
-                    f"{_named(task)}: {name} must keep its shape, got {first} at the start of the track and "
+                    f"{_named(model)}: {name} must keep its shape, got {first} at the start of the track and "
                     f"{values.shape} after two measurements"
                 )
 
@@ -198,5 +205,5 @@ def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
         yield name, part
 
 
-def _named(task: Task) -> str:
-    return f"{type(task).__name__} with control {task.control!r}"
+def _named(model: Model) -> str:
+    return f"{type(model.task).__name__} with control {model.control!r}"

@@ -29,7 +29,8 @@ from matplotlib.ticker import MaxNLocator
 from ..compiler.functions import mapped, padded_width
 from .backend import host_array
 from .lanes import Lanes
-from .task import Array, Task
+from .model import Model
+from .observation import Array
 
 BLUE, VERMILLION, GREEN, SKY, ORANGE, PURPLE, BLACK, GREY = (
     "#0072B2", "#D55E00", "#009E73", "#56B4E9", "#E69F00", "#CC79A7", "#000000", "#8A8A8A",
@@ -107,7 +108,7 @@ class Picture:
     (:meth:`open`, :meth:`begin`, :meth:`draw`).
 
     Args:
-        task: whose episodes are drawn; its states hold lane 0 of a batch that is padded to several.
+        model: whose episodes are drawn; its states hold lane 0 of a batch that is padded to several.
     """
 
     clock = "measurement"
@@ -117,8 +118,9 @@ class Picture:
     strip_columns = 0
     """Columns of strips; 0 for as many as their number asks for."""
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.task: Any = model.task
 
     def records(self, state: Any) -> dict[str, float]:
         """Values that the history keeps of a state after the action, beside errors, sigmas and actions."""
@@ -126,12 +128,12 @@ class Picture:
 
     def strips(self) -> Sequence[Strip]:
         """Error of every component with its reported band, and the action."""
-        shown = self.task.components[:MOST_COMPONENTS]
+        shown = self.model.task.components[:MOST_COMPONENTS]
         errors = [
             error_strip(f"error of {component.name.replace('_', ' ')}, {component.unit}", component.name, 1.0)
             for component in shown
         ]
-        space = self.task.action_space
+        space = self.model.action_space
         discrete = isinstance(space, gymnasium.spaces.Discrete)
         if isinstance(space, gymnasium.spaces.Discrete):
             count, limits = 1, (-0.2, float(space.n) - 0.8)
@@ -141,7 +143,7 @@ class Picture:
             margin = 0.05 * float(space.high.max() - space.low.min())
             limits = float(space.low.min()) - margin, float(space.high.max()) + margin
         named = {f"{i + 1}" if count > 1 else "action": f"action.{i}" for i in range(min(count, len(CURVES)))}
-        return [*errors, Strip(f"action, {self.task.control}", named, limits, steps=discrete)]
+        return [*errors, Strip(f"action, {self.model.control}", named, limits, steps=discrete)]
 
     def shows_observation(self) -> bool:
         """Whether a last strip shows every component of the observation as a colour."""
@@ -169,10 +171,9 @@ class Picture:
         """
 
 
-def picture_of(task: Task) -> Picture:
-    """Return the picture made for a task, or the general one."""
-    own = task.picture() if task.recording is None else None
-    return own or Picture(task)
+def picture_of(model: Model) -> Picture:
+    """Return the picture made for a model, or the general one."""
+    return model.picture() or Picture(model)
 
 
 class _StripPanel:
@@ -258,7 +259,7 @@ class EpisodePicture:
     """History and picture of one episode.
 
     Args:
-        task: whose episode it is.
+        model: whose episode it is.
         scenario: its scenario's name, for the title.
         mode: "rgb_array" or "human".
         frames_per_second: how fast a window shows them at most.
@@ -267,12 +268,12 @@ class EpisodePicture:
         gymnasium.error.Error: for "human" where no window can be opened.
     """
 
-    def __init__(self, task: Task, scenario: str, mode: str, frames_per_second: float) -> None:
-        self.task, self.scenario, self.mode = task, scenario, mode
+    def __init__(self, model: Model, scenario: str, mode: str, frames_per_second: float) -> None:
+        self.model, self.scenario, self.mode = model, scenario, mode
         self.frames_per_second = frames_per_second
         self.caption = ""
         """What the title says beside environment, scenario and control, such as the policy's name."""
-        self.picture = picture_of(task)
+        self.picture = picture_of(model)
         self.history: dict[str, list[float]] = {}
         self.observations: list[numpy.ndarray] = []
         self.count = 0
@@ -308,13 +309,13 @@ class EpisodePicture:
         Args:
             state: after the action; lane 0 is kept.
             action: ``(A,)`` or a scalar, what was applied.
-            observation: ``(len(task.fields),)``, what it answered.
+            observation: ``(len(model.fields),)``, what it answered.
         """
-        nothing = numpy.full(len(self.task.components), numpy.nan)
-        error = self.task.error(state)[:, 0] if self.task.has_truth else nothing
-        variance = numpy.diagonal(self.task.covariance(state)[:, :, 0])
+        nothing = numpy.full(len(self.model.task.components), numpy.nan)
+        error = self.model.error(state)[:, 0] if self.model.task.has_truth else nothing
+        variance = numpy.diagonal(self.model.covariance(state)[:, :, 0])
         sigma = numpy.sqrt(numpy.maximum(variance, 0.0))
-        names = [component.name for component in self.task.components]
+        names = [component.name for component in self.model.task.components]
         values = {
             **{f"error.{name}": value for name, value in zip(names, error, strict=True)},
             **{f"sigma.{name}": value for name, value in zip(names, sigma, strict=True)},
@@ -388,15 +389,15 @@ class EpisodePicture:
     @property
     def title(self) -> str:
         """Environment, scenario, control and the number of the measurement acted on last."""
-        name = self.task.id.rpartition("/")[2]
-        parts = [name, f"scenario {self.scenario}", f"control {self.task.control}"]
+        name = self.model.task.id.rpartition("/")[2]
+        parts = [name, f"scenario {self.scenario}", f"control {self.model.control}"]
         if self.caption:
             parts.append(self.caption)
-        return " · ".join([*parts, f"{self.picture.clock} {self.count} of {self.task.horizon}"])
+        return " · ".join([*parts, f"{self.picture.clock} {self.count} of {self.model.task.horizon}"])
 
     def _open(self) -> Figure:
         if self.mode == "human":
-            figure = _window(f"filtergym: {self.task.id}")
+            figure = _window(f"filtergym: {self.model.task.id}")
         else:
             figure = Figure(figsize=FIGURE_SIZE, dpi=DOTS_PER_INCH)
             FigureCanvasAgg(figure)
@@ -425,7 +426,7 @@ class EpisodePicture:
         self._panels = [_StripPanel(one, strip) for one, strip in zip(axes, strips, strict=False)]
         self._observation = None
         if with_observation:
-            self._observation = _ObservationPanel(axes[-1], len(self.task.fields), self.task.horizon)
+            self._observation = _ObservationPanel(axes[-1], len(self.model.fields), self.model.task.horizon)
         self._shades: list[Any] = []
         return figure
 
@@ -436,7 +437,7 @@ class EpisodePicture:
             shade.remove()
         self._shades = []
         for panel in self._panels:
-            panel.axes.set_xlim(0.5, self.task.horizon + 0.5)
+            panel.axes.set_xlim(0.5, self.model.task.horizon + 0.5)
             panel.axes.set_ylim(*panel.strip.limits)
             for first, last in self.picture.shaded():
                 self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
@@ -455,9 +456,9 @@ class LatePicture:
     """
 
     def __init__(self, picture: EpisodePicture) -> None:
-        self.task = picture.task
+        self.model = picture.model
         self._picture = picture
-        self._lanes = Lanes(picture.task, 1)
+        self._lanes = Lanes(picture.model, 1)
         self._generator: numpy.random.Generator | None = None
         """Of an episode that has not begun here."""
         self._actions: list[numpy.ndarray] = []
@@ -507,18 +508,18 @@ class EpisodePictures:
     """Pictures of the first few episodes of many side by side.
 
     Args:
-        task: whose episodes they are, of any backend.
+        model: whose episodes they are, of any backend.
         scenario: its scenario's name.
         count: number of episodes.
         frames_per_second: how fast a video shows them.
     """
 
-    def __init__(self, task: Task, scenario: str, count: int, frames_per_second: float) -> None:
+    def __init__(self, model: Model, scenario: str, count: int, frames_per_second: float) -> None:
         self.count = count
-        if task.backend == "torch":
-            task = task.on_numpy()
+        if model.backend == "torch":
+            model = model.on_numpy()
         self.pictures = [
-            EpisodePicture(task, scenario, "rgb_array", frames_per_second) for _ in range(min(count, DRAWN))
+            EpisodePicture(model, scenario, "rgb_array", frames_per_second) for _ in range(min(count, DRAWN))
         ]
         for i, picture in enumerate(self.pictures):
             picture.caption = f"sub-environment {i}"
@@ -535,7 +536,7 @@ class EpisodePictures:
         Args:
             state: of all episodes after the action.
             actions: what was applied, ``(count, ...)``.
-            observations: what it answered, ``(count, len(task.fields))``.
+            observations: what it answered, ``(count, len(model.fields))``.
         """
         for i, picture in enumerate(self.pictures):
             picture.keep(_alone(state, i), actions[i], observations[i].copy())

@@ -20,53 +20,55 @@ from collections.abc import Callable
 from typing import Any
 
 from ..filters.gaussian import log_density
+from .model import Model
 from .observation import Array
-from .task import Task
 
 COMPRESSED_BEYOND = 30.0
 """Charge, in units of the paper's average one, from which on the reward falls slowly."""
 
 
-def charge(task: Task, state: Any) -> Array:
+def charge(model: Model, state: Any) -> Array:
     """What the estimate is charged in the reward, in units of the paper's average charge, compressed, ``(N,)``."""
-    return COMPRESSED_BEYOND * task.xp.log1p(
-        task.charge(state) * (1.0 / (COMPRESSED_BEYOND * task.reward_unit))
+    return COMPRESSED_BEYOND * model.task.xp.log1p(
+        model.charge(state) * (1.0 / (COMPRESSED_BEYOND * model.task.reward_unit))
     )
 
 
-def cost_reward(task: Task, state: Any) -> Array:
+def cost_reward(model: Model, state: Any) -> Array:
     """Minus the compressed charge of the estimate, ``(N,)``."""
-    return -charge(task, state)
+    return -charge(model, state)
 
 
-def log_likelihood_reward(task: Task, state: Any) -> Array:
+def log_likelihood_reward(model: Model, state: Any) -> Array:
     """Log-density of the truth under what is reported, ``(N,)``."""
-    return log_density(task.error(state), task.covariance(state))[0]
+    return log_density(model.error(state), model.covariance(state))[0]
 
 
-def cost_and_likelihood_reward(task: Task, state: Any) -> Array:
+def cost_and_likelihood_reward(model: Model, state: Any) -> Array:
     """Both: minus the compressed charge, plus the log-density of a component, ``(N,)``."""
-    return cost_reward(task, state) + log_likelihood_reward(task, state) * (1.0 / len(task.components))
+    return cost_reward(model, state) + log_likelihood_reward(model, state) * (
+        1.0 / len(model.task.components)
+    )
 
 
-def no_reward(task: Task, state: Any) -> Array:
+def no_reward(model: Model, state: Any) -> Array:
     """Zero, ``(N,)``, where the truth is not known."""
-    return 0.0 * task.mean(state)[0]
+    return 0.0 * model.mean(state)[0]
 
 
-OWN_PAY: dict[str, Callable[[Task, Any], Array]] = {
+OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
     "cost": cost_reward,
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
     "relative": cost_reward,
     "none": no_reward,
 }
-"""Functions of a task and its episodes; from "relative" the same of the paper's algorithm is subtracted later. "none"
+"""Functions of a model and its episodes; from "relative" the same of the paper's algorithm is subtracted later. "none"
 is that of recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 
 
-def paper_task(task: Task) -> Task:
+def paper_model(model: Model) -> Model:
     """Return the same task under the control of the paper's algorithm."""
-    return task.under(task.paper_policy.control)
+    return model.under(model.task.paper_policy.control)

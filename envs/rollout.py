@@ -14,7 +14,7 @@ from ..compiler import namespace as traced
 from ..compiler.functions import Specialised, address_of, empty_lanes, leaves, mapped
 from ..compiler.gradients import pullback
 from .compiled import Programs, stepped
-from .task import Episode
+from .model import Episode
 
 AIMED = slice(1, 7, 2)
 """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of episodes, action and noise."""
@@ -67,10 +67,10 @@ def _compile(programs: Programs, kind: str) -> tuple[Specialised, Specialised]:
 
 
 class Rollout:
-    """Episodes of a compiled task under continuous actions, with the gradient of their rewards.
+    """Episodes of a compiled model under continuous actions, with the gradient of their rewards.
 
     Args:
-        task: compiled.
+        model: compiled.
         kind: of reward.
         width: lanes, a multiple of eight.
         measurements: that are kept at once.
@@ -85,16 +85,16 @@ class Rollout:
         action_adjoint: gradient with respect to the action, ``(A, width)``.
     """
 
-    def __init__(self, task: Any, kind: str, width: int, measurements: int) -> None:
-        forward, backward = _compile(task.programs, kind)
+    def __init__(self, model: Any, kind: str, width: int, measurements: int) -> None:
+        forward, backward = _compile(model.programs, kind)
         rows, actions, noise = (leaf.rows for leaf in forward.inputs)
         self._states = [empty_lanes((rows,), width) for _ in range(measurements + 1)]
         self._next = empty_lanes((rows,), width)
         self.action = numpy.zeros((measurements, actions, width))
         self.noise = numpy.zeros((measurements, noise, width))
-        self.reward, self.shown = numpy.empty(width), empty_lanes((len(task.fields),), width)
+        self.reward, self.shown = numpy.empty(width), empty_lanes((len(model.fields),), width)
         self.reward_adjoint = numpy.zeros(width)
-        self.shown_adjoint = numpy.zeros((len(task.fields), width))
+        self.shown_adjoint = numpy.zeros((len(model.fields), width))
         self.action_adjoint = numpy.zeros((actions, width))
         given = [self._states[0], self.action[0], self.noise[0]]
         self._forward = forward.bound(given, [self._next, self.reward, self.shown])

@@ -4,9 +4,9 @@ import functools
 from typing import Any, NamedTuple
 
 from .compiled import Report
+from .model import Episode, Model
 from .observation import Array
 from .reward import OWN_PAY
-from .task import Episode, Task
 
 
 class StepReport(NamedTuple):
@@ -36,13 +36,13 @@ def step_report(kind: str, errors: bool = False, details: bool = False, episode:
     """
     pay = OWN_PAY[kind]
 
-    def report(task: Task, state: Episode) -> StepReport:
-        found = StepReport(pay(task, state))
+    def report(model: Model, state: Episode) -> StepReport:
+        found = StepReport(pay(model, state))
         if errors:
-            found = found._replace(error=task.error(state), covariance=task.covariance(state))
+            found = found._replace(error=model.error(state), covariance=model.covariance(state))
         if details:
-            judged = {"error": task.error(state), "cost": task.cost(state)} if task.has_truth else {}
-            found = found._replace(details={**judged, **task.track(state), **task.records(state)})
+            judged = {"error": model.error(state), "cost": model.cost(state)} if model.task.has_truth else {}
+            found = found._replace(details={**judged, **model.track(state), **model.records(state)})
         return found._replace(episode=state) if episode else found
 
     return report

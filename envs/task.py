@@ -4,11 +4,11 @@ A *task* is one estimation problem, written once for N independent episodes side
 task with N = 1, the vector environment is the task with N, an evaluation is the task with N = Monte Carlo
 runs. A task knows nothing of Gymnasium and owns no random generator: numbers come in, states come out.
 
-It is made of two halves, and the :class:`Measurement <Episode>` is the only door between them:
+It is made of two halves, and the :class:`Measurement <.model.Episode>` is the only door between them:
 
 * the :class:`World` draws the episode, moves the truth and says what the sensors say;
 * a :class:`~.filter.Filter` predicts and estimates. A task brings a :class:`~.filter.Bank` for each control, which
-  also shows what it has found and is steered by an action; :meth:`Task.with_filter` puts any other filter in its
+  also shows what it has found and is steered by an action; :meth:`.Model.with_filter` puts any other filter in its
   place. No filter that competes receives the truth, nor anything else that the world keeps.
 
 The clock of every task:
@@ -16,7 +16,7 @@ The clock of every task:
 ====  ==============================================================  =========================
  1    the truth moves on; the sensors say where it seems to be        :meth:`World.advance`
  2    the filter predicts to that time; innovations and likelihoods   :meth:`Filter.predict`
- 3    the agent is shown them                                         :meth:`Task.observe`
+ 3    the agent is shown them                                         :meth:`.Model.observe`
  4    the filter takes *that same* measurement in, by the action      :meth:`Filter.update`
  5    the estimate is compared with the truth                         :meth:`World.cost`
 ====  ==============================================================  =========================
@@ -26,6 +26,9 @@ gives the initial estimate, :meth:`Filter.start` takes it. A reset is ``begin``,
 environment step is 4, 5, 1, 2, 3. So K actions need K + 1 measurements, and the last observation shows a
 real measurement that is not acted on.
 
+A :class:`Task` is what an author declares, with its parameters, the constants computed of them and its world. What runs
+is a :class:`~.model.Model`: a task with a filter in the loop.
+
 Arrays inside a task have the batch as their last axis and belong to the namespace ``task.xp`` (NumPy or
 torch). Truth, measurement and the filter's state are NamedTuples of arrays ``(..., N)`` and are never changed
 in place.
@@ -34,21 +37,19 @@ A closed loop adds one arrow back, from the estimate to the world, and names it:
 returns is given to the next :meth:`World.advance`. Each filter then flies a truth of its own, on the same noise.
 """
 
-import copy
 import importlib
 from abc import ABC
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
-import gymnasium
 import numpy
 
 from .draws import Draws
-from .filter import Bank, Filter, Input
+from .filter import Bank
 from .log_format import LogFormat
-from .observation import Array, Blocks, Field, Reader
+from .observation import Array
 from .world import World
 
 
@@ -101,17 +102,6 @@ class PaperPolicy(NamedTuple):
     action: tuple[float, ...]
 
 
-class Episode(NamedTuple):
-    """N episodes at one moment: all that the engine keeps between steps."""
-
-    truth: Any
-    """What is; the world's NamedTuple."""
-    measurement: Any
-    """What the sensors say; between ``begin`` and the first measurement the initial estimate."""
-    filter: Any
-    """State of the filter."""
-
-
 class Task(ABC):
     """One estimation problem for N independent episodes; see the module's description.
 
@@ -158,7 +148,6 @@ class Task(ABC):
     paper_policy: PaperPolicy
 
     parameters: Any
-    control: str
     horizon: int
     """Measurements acted on in one episode."""
     decision_interval: int
@@ -170,11 +159,9 @@ class Task(ABC):
     flights: tuple[int, ...] = ()
     """Where every episode flies one of several, measurements acted on in each of them, all multiples of
     ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
+    world: Any
+    """The :class:`~.world.World`, simulated or replayed."""
     noise: NoiseLayout
-    fields: tuple[Field, ...]
-    action_space: gymnasium.Space
-    backend: str
-    """What computes its steps: "numpy", "torch", or "compiled"."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -182,43 +169,22 @@ class Task(ABC):
             cls.controls = tuple(cls.banks)
 
     def __init__(
-        self,
-        parameters: Any,
-        control: str,
-        xp: ModuleType = numpy,
-        device: Any = None,
-        recording: Any = None,
+        self, parameters: Any, xp: ModuleType = numpy, device: Any = None, recording: Any = None
     ) -> None:
         self.parameters = parameters
         self.recording = recording
         self.has_truth = recording is None or recording.truth is not None
-        self.control = control
         self.horizon = parameters.horizon
         self.decision_interval = parameters.decision_interval
         self.xp = xp
         self.device = device
-        self.backend = "torch" if "torch" in xp.__name__ else "numpy"
         self.set_up()
         if recording is None:
             self.world = self.World(self)
         else:
             self.flights = recording.lengths_within(self.horizon, self.decision_interval)
             self.world = recording.world(self)
-        self.bank = {**self.banks, **self.trained_banks}[control](self)
         self.noise = self._noise_layout()
-        self._take_filter(self.bank)
-
-    def _take_filter(self, filter: Filter) -> None:
-        self.filter = filter
-        self._blocks = Blocks(filter.blocks, filter.quantities, self.xp)
-        self.fields = self._blocks.fields
-        self.action_space = filter.action_space
-
-    def __copy__(self) -> "Task":
-        """Another with the same attributes, to change one of them."""
-        other: Task = object.__new__(type(self))
-        other.__dict__.update(self.__dict__)
-        return other
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Task":
         """Share the task: nothing in it changes."""
@@ -226,8 +192,11 @@ class Task(ABC):
 
     def __reduce__(self) -> Any:
         """Pickle what it is made of; a module, its array namespace, cannot be."""
-        named = (self.parameters, self.control, self.xp.__name__, self.device, self.recording)
-        return _remake, (type(self), *named)
+        return _remake, (type(self), self.parameters, self.xp.__name__, self.device, self.recording)
+
+    def on(self, xp: ModuleType, device: Any = None) -> "Task":
+        """Return the same problem on other arrays."""
+        return type(self)(self.parameters, xp, device, self.recording)
 
     def set_up(self) -> None:  # noqa: B027  (most tasks have something to compute, none must)
         """Compute the constants that world and banks share."""
@@ -258,8 +227,10 @@ class Task(ABC):
         """What the parameters say of the time between measurements, s; None where it differs."""
         return getattr(self.parameters, "sampling_interval", None)
 
-    def picture(self) -> Any:
-        """Return the :class:`~.rendering.Picture` that draws an episode of this task; None for the general one."""
+    def picture(self, model: Any) -> Any:
+        """Return the :class:`~.rendering.Picture` that draws an episode of a model of this task; None for the general
+        one.
+        """
         return None
 
     @classmethod
@@ -303,143 +274,23 @@ class Task(ABC):
         """
         return None
 
+    def records(self, model: Any, episode: Any, kept: dict[str, Array]) -> dict[str, Array]:
+        """Report what else an evaluation keeps of each measurement, beside what filter and world report; here nothing.
+
+        Args:
+            model: :class:`~.model.Model` of this task.
+            episode: after the action.
+            kept: what filter and world report, see :meth:`.Filter.records`.
+        """
+        return {}
+
     def constant(self, values: Any) -> Array:
         """Turn numbers into a float64 array of the task's namespace and device."""
         return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
 
-    def columns(self, names: Sequence[str]) -> list[int]:
-        """Positions of named fields in the observation.
 
-        Raises:
-            ValueError: for a name that is no field.
-        """
-        return self._blocks.columns(names)
-
-    def reader(self, name: str) -> Reader:
-        """Return what reads a block or quantity of the observation by its name, uncompressed.
-
-        Raises:
-            ValueError: for a name that is neither.
-        """
-        return self._blocks.reader(name)
-
-    def under(self, control: str) -> "Task":
-        """Return the same problem with another control."""
-        return type(self)(self.parameters, control, self.xp, self.device, self.recording)
-
-    def on_numpy(self) -> "Task":
-        """Return the same problem on NumPy arrays, not compiled."""
-        return type(self)(self.parameters, self.control, numpy, None, self.recording)
-
-    def run(self, function: Callable[..., Any], *parts: Any) -> Any:
-        """Call ``function(task, *parts)`` on this task's backend.
-
-        Args:
-            function: of this module or another, not made anew for each call: it may be compiled, once.
-            *parts: nested tuples of arrays ``(..., N)``.
-
-        Returns:
-            Nested tuples or dictionaries of arrays ``(..., N)``.
-        """
-        return function(self, *parts)
-
-    def with_filter(self, make: Callable[["Task"], Filter]) -> "Task":
-        """Return the same problem with another filter in place of the bank.
-
-        Args:
-            make: makes the filter for a task; not made anew for each call, since what is compiled is kept by it.
-        """
-        other = copy.copy(self)
-        other._take_filter(make(self))
-        return other
-
-    def truth_for_filter(self, truth: Any) -> Any:
-        """Truth as the filter is given it: None unless it ``knows`` something."""
-        return truth if self.filter.knows else None
-
-    # --- what the engine calls
-
-    def begin(self, uniforms: Array, normals: Array) -> Episode:
-        """Episode at the start of the track.
-
-        Args:
-            uniforms: ``(noise.uniforms, N)``.
-            normals: ``(noise.initial_normals, N)``.
-        """
-        truth, initial = self.world.begin(Draws(uniforms, self.xp), normals)
-        return Episode(truth, initial, self.filter.begin(Input(initial, self.truth_for_filter(truth))))
-
-    def measure(self, episode: Episode, noise: Array) -> Episode:
-        """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
-        feedback = self.filter.feedback(episode.filter, episode.measurement)
-        truth, measurement = self.world.advance(episode.truth, noise, feedback)
-        return Episode(truth, measurement, self.filter.predict(episode.filter, measurement))
-
-    def observe(self, episode: Episode) -> Array:
-        """Step 3: what the agent is shown, ``(len(fields), N)``."""
-        if not self.fields:  # nothing steers the filter
-            N = next(named_arrays(episode.measurement))[1].shape[-1]
-            return self.xp.zeros((0, N), dtype=self.xp.float64, device=self.device)
-        return self._blocks.observe(episode.filter, episode.measurement)
-
-    def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4: the filter takes the measurement in, a bank with the action."""
-        given = Input(episode.measurement, self.truth_for_filter(episode.truth), action)
-        return episode._replace(filter=self.filter.update(episode.filter, given))
-
-    def mean(self, episode: Episode) -> Array:
-        """Estimate, ``(len(components), N)``, in the units of ``components``."""
-        return self.filter.mean(episode.filter)
-
-    def context(self, episode: Episode) -> dict[str, Array]:
-        """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
-        context = self.world.context(episode.truth)
-        return {name: self.xp.astype(values, self.xp.float64) for name, values in context.items()}
-
-    def cost(self, episode: Episode) -> Array:
-        """Step 5: what the estimate costs, uncapped, ``(N,)``."""
-        return self.world.cost(episode.truth, self.filter.mean(episode.filter))
-
-    def charge(self, episode: Episode) -> Array:
-        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.charge`."""
-        return self.world.charge(episode.truth, self.filter.mean(episode.filter))
-
-    def error(self, episode: Episode) -> Array:
-        """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
-        return self.filter.mean(episode.filter) - self.world.state(episode.truth)
-
-    def covariance(self, episode: Episode) -> Array:
-        """Covariance that the estimator reports for its error, ``(C, C, N)``."""
-        return self.filter.covariance(episode.filter)
-
-    def track(self, episode: Episode) -> dict[str, Array]:
-        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
-        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
-        """
-        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
-        return {**self._estimated(episode), **said}
-
-    def drawn(self, episode: Episode) -> dict[str, Array]:
-        """What a picture of a track shows: as :meth:`track`, but of the measurement what is ``seen`` of the components
-        ``(C, N)``, where anything is; NaN where it says nothing.
-        """
-        seen = self.world.seen(episode.measurement)
-        return {**self._estimated(episode), **({} if seen is None else {"seen": seen})}
-
-    def _estimated(self, episode: Episode) -> dict[str, Array]:
-        true = {"truth": self.world.state(episode.truth)} if self.has_truth else {}
-        return {**true, "estimate": self.mean(episode), "covariance": self.covariance(episode)}
-
-    def records(self, episode: Episode) -> dict[str, Array]:
-        """What else an evaluation keeps of each measurement."""
-        own = self.filter.records(episode.filter, episode.measurement)
-        return {**own, **self.world.records(episode.truth)}
-
-
-def _remake(
-    cls: type[Task], parameters: Any, control: str, namespace: str, device: Any, recording: Any
-) -> Task:
-    return cls(parameters, control, importlib.import_module(namespace), device, recording)
+def _remake(cls: type[Task], parameters: Any, namespace: str, device: Any, recording: Any) -> Task:
+    return cls(parameters, importlib.import_module(namespace), device, recording)
 
 
 def named_arrays(part: Any, prefix: str = "") -> Iterator[tuple[str, Array]]:

@@ -26,7 +26,7 @@ def episode_frames(
     Args:
         env: environment id.
         name: of the policy, for the title.
-        policy: what makes it for a task, or an object with a ``predict`` method.
+        policy: what makes it for a model, or an object with a ``predict`` method.
         scenario: name of a scenario, or a trajectory.
         seed: of the episode, as in ``reset``.
         every: actions from one frame to the next; the last action is always shown.
@@ -44,7 +44,7 @@ def episode_frames(
     world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
-    actor = SteppingPolicy(world.task, made(policy, world.task))
+    actor = SteppingPolicy(world.model, made(policy, world.model))
     observation, _ = world.reset(seed=seed)
     frames, memory, finished = [Image.fromarray(_frame(world))], actor.begin([seed]), False
     taken = 0

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol, get_args
 import numpy
 
 from ..envs.backend import host_array
+from ..envs.model import Model
 from ..envs.task import Array, Task
 
 Kind = Literal["policy", "estimator", "reference", "bound"]
@@ -32,20 +33,20 @@ def _has(found: Any, *methods: str) -> bool:
     return all(callable(getattr(found, method, None)) for method in methods)
 
 
-def made(maker: Any, task: Task) -> Any:
-    """Make a competitor for a task.
+def made(maker: Any, problem: Task | Model) -> Any:
+    """Make a competitor for a problem.
 
     Args:
-        maker: a class or function that takes the task, or nothing; or the competitor itself.
-        task: the problem.
+        maker: a class or function that takes the problem, or nothing; or the competitor itself.
+        problem: of a policy the model that it acts in, of anything else the task.
     """
     if not callable(maker):
         return maker
     try:
-        takes_task = bool(inspect.signature(maker).parameters)
+        takes_problem = bool(inspect.signature(maker).parameters)
     except ValueError:  # of a class that is compiled
-        takes_task = True
-    return maker(task) if takes_task else maker()
+        takes_problem = True
+    return maker(problem) if takes_problem else maker()
 
 
 def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
@@ -82,7 +83,7 @@ def expose_spaces(outer: Any, inner: Any, *further: str) -> None:
 
 
 class Policy:
-    """Base of the classical policies: made for a task, deterministic unless it says otherwise.
+    """Base of the classical policies: made for a model, deterministic unless it says otherwise.
 
     Subclasses set ``control`` and answer :meth:`predict`; those with memory keep it in the ``state`` that
     goes in and out, so that one object serves any number of episodes.
@@ -92,8 +93,9 @@ class Policy:
     control: ClassVar[str]
     """The control that the policy's actions are meant for."""
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.task: Any = model.task
 
     def begin(self, seeds: Sequence[int]) -> Any:
         """Memory at the start of the episodes with these seeds, for the first :meth:`predict` of an evaluation.
@@ -112,7 +114,7 @@ class Policy:
         """Choose actions.
 
         Args:
-            observation: ``(N, len(task.fields))``, or one observation without the batch axis.
+            observation: ``(N, len(model.fields))``, or one observation without the batch axis.
             state: what the last call returned; None at the first.
             episode_start: ``(N,)`` booleans, true where a new episode begins.
             deterministic: as in Stable-Baselines3; classical policies ignore it.
@@ -205,14 +207,14 @@ class RandomPolicy(Policy):
 
     seed = 0
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.control = task.control  # type: ignore[misc]  # it suits every control
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.control = model.control  # type: ignore[misc]  # it suits every control
 
     def begin(self, seeds: Sequence[int]) -> RandomActions:
         """Give every episode a generator of its own, of the policy's seed and the episode's."""
         generators = [numpy.random.default_rng([self.seed, seed]) for seed in seeds]
-        return RandomActions(generators, self.task.action_space)
+        return RandomActions(generators, self.model.action_space)
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Draw from the action space, each row from its generator."""

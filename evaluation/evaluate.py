@@ -12,12 +12,13 @@ import gymnasium
 import numpy
 import xarray
 
-from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, opened, task_class
+from ..envs.backend import make_model
+from ..envs.catalogue import find_scenario, importable_name, nearest, opened, task_class
 from ..envs.compiled import Report
+from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.reward import charge
-from ..envs.task import Episode, Scenario, Task
+from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .competitors import RANKED, Kind, kind_of
@@ -51,8 +52,8 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     own = getattr(maker, "control", None)
     space = getattr(maker, "action_space", None)
     if own is None and space is not None:
-        tasks = [make_task(cls.id, c) for c in cls.controls]
-        acting = [task for task in tasks if task.action_space == space]
+        models = [make_model(cls, c) for c in cls.controls]
+        acting = [model for model in models if model.action_space == space]
         if not acting:
             raise ValueError(f"policy {name!r} acts in {space}, which is no control of {cls.id}")
         # Controls may share an action space; what they show then tells them apart.
@@ -66,7 +67,7 @@ def control_of(maker: Any, kind: str, control: str | None, cls: type[Task], name
     return own
 
 
-def check_observation(task: Task, policy: Any, name: str) -> None:
+def check_observation(model: Model, policy: Any, name: str) -> None:
     """Raise ValueError if a model takes observations of another shape than the task shows, or privileged ones."""
     space = getattr(policy, "observation_space", None)
     if isinstance(space, gymnasium.spaces.Dict):
@@ -75,55 +76,57 @@ def check_observation(task: Task, policy: Any, name: str) -> None:
             "actor answer observations alone, in an object with a method predict"
         )
     shown = getattr(space, "shape", None)
-    if shown is not None and shown != (len(task.fields),):
+    if shown is not None and shown != (len(model.fields),):
         raise ValueError(
-            f"policy {name!r} expects observations of shape {shown}, but control {task.control!r} shows "
-            f"{len(task.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
+            f"policy {name!r} expects observations of shape {shown}, but control {model.control!r} shows "
+            f"{len(model.fields)} fields, and a model knows none by its name: train it again, or give the .safetensors "
             "of its run, which does"
         )
 
 
-def _measurement_report(task: Task, episode: Episode) -> dict[str, Any]:
+def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept of every measurement, arrays ``(..., N)``."""
-    error = task.error(episode)
+    error = model.error(episode)
     return {
         "error": error,
-        "cost": task.cost(episode),
-        "charge": charge(task, episode),
-        "nees": log_density(error, task.covariance(episode))[1],
-        **task.records(episode),
+        "cost": model.cost(episode),
+        "charge": charge(model, episode),
+        "nees": log_density(error, model.covariance(episode))[1],
+        **model.records(episode),
     }
 
 
-def _expectation_report(task: Task, episode: Episode) -> dict[str, Any]:
+def _expectation_report(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept where the truth is not known."""
-    return task.records(episode)
+    return model.records(episode)
 
 
-def _expectation_and_track(task: Task, episode: Episode) -> dict[str, Any]:
-    return {**_expectation_report(task, episode), **task.track(episode)}
+def _expectation_and_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_expectation_report(model, episode), **model.track(episode)}
 
 
-def _measurement_and_track(task: Task, episode: Episode) -> dict[str, Any]:
-    return {**_measurement_report(task, episode), **task.track(episode)}
+def _measurement_and_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_measurement_report(model, episode), **model.track(episode)}
 
 
-def _measurement_and_drawing(task: Task, episode: Episode) -> dict[str, Any]:
+def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept of every measurement, and what is kept of the first episodes only."""
-    kept = _measurement_report(task, episode) if task.has_truth else _expectation_report(task, episode)
-    return {**kept, **{f"{DRAWN}{name}": values for name, values in task.drawn(episode).items()}}
+    kept = (
+        _measurement_report(model, episode) if model.task.has_truth else _expectation_report(model, episode)
+    )
+    return {**kept, **{f"{DRAWN}{name}": values for name, values in model.drawn(episode).items()}}
 
 
-def _limits(task: Task, episode: Episode) -> dict[str, Any]:
+def _limits(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept of a bound."""
-    return task.filter.records(episode.filter, episode.measurement)
+    return model.filter.records(episode.filter, episode.measurement)
 
 
-def _report(task: Task, tracks: bool, drawn: bool) -> Report:
+def _report(model: Model, tracks: bool, drawn: bool) -> Report:
     """What is kept of every measurement of a task."""
     if drawn:
         return _measurement_and_drawing
-    if task.has_truth:
+    if model.task.has_truth:
         return _measurement_and_track if tracks else _measurement_report
     return _expectation_and_track if tracks else _expectation_report
 
@@ -152,7 +155,7 @@ def evaluate(
 
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        competitors: by the name that stands in the tables: each a class or function that makes it for a task,
+        competitors: by the name that stands in the tables: each a class or function that makes it,
             or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
         scenario: name of a scenario, a trajectory, a set of flights, or a recording; default: the environment's
             training distribution.
@@ -232,12 +235,11 @@ class Experiment:
     strict: bool = False
     keywords: Mapping[str, Any] = field(default_factory=dict)
 
-    def make_task(self, maker: Any, control: str) -> Task:
-        """Make the task of a competitor; the experiment's keywords win over those that were tuned with it."""
+    def make_model(self, maker: Any, control: str) -> Model:
+        """Make the model that a competitor acts in; the experiment's keywords win over those tuned with it."""
         keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
-        return task_on(
-            self.backend, self.environment, control, self.scenario, threads=self.threads, **keywords
-        )
+        cls = task_class(self.environment)
+        return make_model(cls, control, self.scenario, backend=self.backend, threads=self.threads, **keywords)
 
 
 @one_thread()
@@ -250,7 +252,7 @@ def run_experiment(
     """Run competitors over the episodes of an experiment; arguments, result and refusals as of :func:`evaluate`."""
     plan = plan_of(experiment, competitors)
     workers = check_workers(workers)
-    block = block_of(next(iter(plan.tasks.values())).horizon)
+    block = block_of(next(iter(plan.models.values())).task.horizon)
     pieces = [
         plan.piece(name, first, block, workers.alone)
         for name in competitors
@@ -280,7 +282,7 @@ class Piece(NamedTuple):
     first: int
     """Number of the first episode."""
     horizon: int
-    task: Task | None
+    model: Model | None
     """That was made already, in this process."""
 
     @property
@@ -292,14 +294,14 @@ class Piece(NamedTuple):
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``."""
     experiment = piece.experiment
-    task = piece.task or experiment.make_task(piece.maker, piece.control)
+    model = piece.model or experiment.make_model(piece.maker, piece.control)
     drawn = experiment.drawn_episodes - piece.first
     found: dict[str, numpy.ndarray] = run_competitor(
-        task,
+        model,
         piece.maker,
         piece.kind,
         piece.seeds,
-        _limits if piece.kind == "bound" else _report(task, experiment.tracks, drawn > 0),
+        _limits if piece.kind == "bound" else _report(model, experiment.tracks, drawn > 0),
         tick,
         piece.name,
         piece.first,
@@ -328,7 +330,7 @@ class Plan(NamedTuple):
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
     controls: dict[str, str]
-    tasks: dict[str, Task]
+    models: dict[str, Model]
     scenario: Scenario
     seeds: list[int]
     flown: numpy.ndarray | None
@@ -337,7 +339,7 @@ class Plan(NamedTuple):
 
     def piece(self, name: str, first: int, count: int, here: bool) -> Piece:
         """Return some episodes of a competitor as a piece of work, with its task if it is done here."""
-        task = self.tasks[name]
+        model = self.models[name]
         return Piece(
             self.experiment,
             name,
@@ -346,8 +348,8 @@ class Plan(NamedTuple):
             self.controls[name],
             self.seeds[first : first + count],
             first,
-            task.horizon,
-            task if here else None,
+            model.task.horizon,
+            model if here else None,
         )
 
     def dataset(
@@ -373,7 +375,7 @@ class Plan(NamedTuple):
             reference=experiment.reference,
             notes="\n".join(self.scenario.notes),
             recorded=int(self.scenario.recording is not None),
-            truth=int(next(iter(self.tasks.values())).has_truth),
+            truth=int(next(iter(self.models.values())).task.has_truth),
         )
 
 
@@ -399,25 +401,27 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     seeds = episode_seeds(split, seed, episodes)
     kinds = {name: kind_of(maker) for name, maker in competitors.items()}
     controls: dict[str, str] = {}
-    tasks: dict[str, Task] = {}
+    models: dict[str, Model] = {}
     # Every task is made before any episode runs, so that a wrong keyword costs nothing.
     for name, maker in competitors.items():
         controls[name] = control_of(maker, kinds[name], control, cls, name)
-        tasks[name] = experiment.make_task(maker, controls[name])
-    for name, task in tasks.items():
-        check_observation(task, competitors[name], name)
-    first = next(iter(tasks.values()))
-    group_of_each([c.name for c in first.components], first.groups)  # refused now, not when all is done
+        models[name] = experiment.make_model(maker, controls[name])
+    for name, model in models.items():
+        check_observation(model, competitors[name], name)
+    first = next(iter(models.values()))
+    group_of_each(
+        [c.name for c in first.task.components], first.task.groups
+    )  # refused now, not when all is done
     if chosen.recording is not None:
         _check_known_truth(kinds, chosen.name)
-        episodes = len(first.flights)  # nothing is random: each once
+        episodes = len(first.task.flights)  # nothing is random: each once
     flown, lengths = None, None
-    if first.flights:
+    if first.task.flights:
         seeds, flown, lengths = _flights_in_turn(first, split, seed, episodes)
     if chosen.recording is not None and flown is not None and lengths is not None:
         order = numpy.argsort(flown)
         seeds, flown, lengths = [seeds[i] for i in order], flown[order], lengths[order]
-    return Plan(experiment, competitors, kinds, controls, tasks, chosen, seeds, flown, lengths)
+    return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
 
 
 def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
@@ -452,13 +456,13 @@ def _check_known_truth(kinds: Mapping[str, Kind], name: str) -> None:
 
 
 def _flights_in_turn(
-    task: Task, split: str, seed: int, episodes: int
+    model: Model, split: str, seed: int, episodes: int
 ) -> tuple[list[int], numpy.ndarray, numpy.ndarray]:
     """Seeds, in their order, of which every flight gets as many as any other; the flight and length of each.
 
     An episode stays what its seed makes it. Who wants fewer episodes than there are flights gets one of each.
     """
-    count = len(task.flights)
+    count = len(model.task.flights)
     share = -(-episodes // count)
     found: list[int] = []
     flown: list[int] = []
@@ -467,13 +471,13 @@ def _flights_in_turn(
     first = 0
     while missing.any():
         for candidate in episode_seeds(split, seed, share * count, first):
-            uniforms = numpy.random.default_rng(candidate).random((task.noise.uniforms, 1))
-            flight = int(task.flight_of(uniforms)[0])
+            uniforms = numpy.random.default_rng(candidate).random((model.task.noise.uniforms, 1))
+            flight = int(model.task.flight_of(uniforms)[0])
             if missing[flight]:
                 missing[flight] -= 1
                 found.append(candidate)
                 flown.append(flight)
-                lengths.append(int(task.lengths(uniforms)[0]))
+                lengths.append(int(model.task.lengths(uniforms)[0]))
         first += share * count
     return found, numpy.array(flown), numpy.array(lengths)
 
@@ -492,29 +496,29 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     return ["mode" if "mode" in key else key]
 
 
-def action_names(task: Task, count: int) -> tuple[str, ...]:
+def action_names(model: Model, count: int) -> tuple[str, ...]:
     """Names of the components of a box of actions.
 
     As the observation names those of the last action, where it shows them; else the hypotheses, where there is a number
     for each; else the control, with numbers from 1 on where there are several.
     """
-    shown = [block.parts for block in task.bank.blocks if block.name in LAST_ACTIONS]
-    for names in (*shown, task.modes):
+    shown = [block.parts for block in model.filter.blocks if block.name in LAST_ACTIONS]
+    for names in (*shown, model.task.modes):
         # A number alone says less than the hypothesis's name.
         if len(names) == count and not any(str(name).isdigit() for name in names):
             return tuple(str(name).replace("-", "_") for name in names)
-    return tuple(f"{task.control}_{i + 1}" for i in range(count)) if count > 1 else (task.control,)
+    return tuple(f"{model.control}_{i + 1}" for i in range(count)) if count > 1 else (model.control,)
 
 
 def _actions_named(
     per_policy: Mapping[str, Mapping[str, numpy.ndarray]],
     controls: Mapping[str, str],
-    tasks: Mapping[str, Task],
+    models: Mapping[str, Model],
 ) -> dict[str, tuple[str, ...]]:
     """Names of the actions of every policy that has any; of their control too, where they steer by several."""
     acting = [name for name, series in per_policy.items() if "action" in series]
     several = len({controls[name] for name in acting}) > 1
-    found = {name: action_names(tasks[name], per_policy[name]["action"].shape[-1]) for name in acting}
+    found = {name: action_names(models[name], per_policy[name]["action"].shape[-1]) for name in acting}
     if several:
         return {name: tuple(f"{controls[name]}: {part}" for part in parts) for name, parts in found.items()}
     return found
@@ -536,13 +540,13 @@ def _actions_aligned(
 def _dataset(
     per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
 ) -> xarray.Dataset:
-    kinds, controls, tasks, scenario = plan.kinds, plan.controls, plan.tasks, plan.scenario
-    task = next(iter(tasks.values()))
+    kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
+    model = next(iter(models.values()))
     names = list(per_policy)
-    components = [c.name for c in task.components]
-    times = numpy.arange(1, task.horizon + 1)
+    components = [c.name for c in model.task.components]
+    times = numpy.arange(1, model.task.horizon + 1)
     variables: dict[str, Any] = {}
-    actions = _actions_named(per_policy, controls, tasks)
+    actions = _actions_named(per_policy, controls, models)
     for key in sorted({key for series in per_policy.values() for key in series}):
         if key == "action":
             variables[key] = (
@@ -568,29 +572,33 @@ def _dataset(
             "episode_seed": ("episode", [str(seed) for seed in seeds]),
             "time": times,
             "component": components,
-            "unit": ("component", [c.unit for c in task.components]),
-            "group": ("component", group_of_each(components, task.groups)),
+            "unit": ("component", [c.unit for c in model.task.components]),
+            "group": ("component", group_of_each(components, model.task.groups)),
         },
         attrs={
-            "environment": task.id,
+            "environment": model.task.id,
             "scenario": scenario.name,
             "keywords": keywords_as_text(plan.experiment.keywords),
             "split": plan.experiment.split,
             "seed": whole_number(plan.experiment.seed),
-            "cost": task.cost_description,
+            "cost": model.task.cost_description,
         },
     )
-    if task.interval is not None:
-        elapsed = ("time", task.interval * times, {"units": "s", "long_name": "since the start of the track"})
+    if model.task.interval is not None:
+        elapsed = (
+            "time",
+            model.task.interval * times,
+            {"units": "s", "long_name": "since the start of the track"},
+        )
         dataset = dataset.assign_coords(elapsed=elapsed)
     windows = {
-        name: (first, min(last, task.horizon))
-        for name, (first, last) in {**scenario.windows, "all": (1, task.horizon)}.items()
-        if first <= task.horizon
+        name: (first, min(last, model.task.horizon))
+        for name, (first, last) in {**scenario.windows, "all": (1, model.task.horizon)}.items()
+        if first <= model.task.horizon
     }
     dataset = with_windows(dataset, windows)
     if "mode_probability" in dataset:
-        dataset = dataset.assign_coords(mode=list(task.modes))
+        dataset = dataset.assign_coords(mode=list(model.task.modes))
     if actions:
         dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
     return dataset

@@ -5,7 +5,6 @@ world, and keeps its memory to itself: it may be anything.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from ..compiler.namespace import NotTraceable
 from ..envs.compiled import warn_of
 from ..envs.failures import explain_errors
 from ..envs.filter import Filter, Input
+from ..envs.model import Model
 from ..envs.observation import Array
 from ..envs.task import Task, named_arrays
 from ..filters.small_matrices import cholesky
@@ -178,7 +178,7 @@ class LimitState(NamedTuple):
     """State of a bound in the loop."""
 
     bank: Any
-    """Of the task's bank, which flies the loop."""
+    """Of the bank, which flies the loop."""
     mean_square: Array
     """Of the task's components, ``(C, N)``."""
     memory: Any
@@ -186,17 +186,18 @@ class LimitState(NamedTuple):
 
 
 class BoundFilter(Filter[Task, Any, LimitState]):
-    """A bound in the loop, see :class:`.competitors.Bound`, beside the task's bank under the action zero.
+    """A bound in the loop, see :class:`.competitors.Bound`, beside a bank under the action zero.
 
     Args:
         task: the estimation problem.
+        bank: what flies the loop.
         own: the bound, made for it; None where it runs in Python, beside traced steps.
         in_python: whether it does.
     """
 
-    def __init__(self, task: Task, own: Any, in_python: bool = False) -> None:
+    def __init__(self, task: Task, bank: Any, own: Any, in_python: bool = False) -> None:
         super().__init__(task)
-        self.own, self.bank, self.in_python = own, task.bank, in_python  # type: ignore[misc]
+        self.own, self.bank, self.in_python = own, bank, in_python  # type: ignore[misc]
         self.knows = getattr(own, "knows", "") or "the truth"  # type: ignore[misc]
 
     def begin(self, given: Input) -> LimitState:
@@ -237,11 +238,18 @@ class BoundFilter(Filter[Task, Any, LimitState]):
         return {"mean_square": state.mean_square}
 
 
-FILTERS: dict[Kind, Callable[..., Filter]] = {
-    "estimator": EstimatorFilter,
-    "reference": ReferenceFilter,
-    "bound": BoundFilter,
-}
+def make_filter(kind: Kind, model: Model, own: Any, in_python: bool) -> Filter:
+    """Make the filter of a competitor.
+
+    Args:
+        kind: estimator, reference or bound.
+        model: in whose loop it is put; a bound flies beside its filter.
+        own: the competitor, made for the task; None where it runs in Python, beside traced steps.
+        in_python: whether it does.
+    """
+    if kind == "bound":
+        return BoundFilter(model.task, model.filter, own, in_python)
+    return (EstimatorFilter if kind == "estimator" else ReferenceFilter)(model.task, own, in_python)
 
 
 class _InPython:
@@ -356,16 +364,16 @@ class _CheckedInPython(_InPython):
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes the filter of a competitor for a task; equal ones are traced once."""
+    """Makes the filter of a competitor for a model; equal ones are traced once."""
 
     kind: Kind
     maker: Any
     """Of a competitor that can be traced; None of one that runs in Python."""
 
-    def __call__(self, task: Task) -> Filter:
+    def __call__(self, model: Model) -> Filter:
         """Make it, on any arrays."""
-        own = None if self.maker is None else made(self.maker, task)
-        return FILTERS[self.kind](task, own, self.maker is None)
+        own = None if self.maker is None else made(self.maker, model.task)
+        return make_filter(self.kind, model, own, self.maker is None)
 
 
 def _can_be_traced(maker: Any, own: Any) -> bool:
@@ -378,12 +386,12 @@ def _can_be_traced(maker: Any, own: Any) -> bool:
     return True
 
 
-def put_in_loop(task: Task, competitor: Any, kind: Kind, name: str, count: int) -> Task:
-    """Return a task whose filter is a competitor.
+def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int) -> Model:
+    """Return a model whose filter is a competitor.
 
     Args:
-        task: the estimation problem.
-        competitor: estimator, reference or bound, or a class or function that makes it for a task.
+        model: task with a bank.
+        competitor: estimator, reference or bound, or a class or function that makes it.
         kind: what it is.
         name: of it, in errors.
         count: number of episodes.
@@ -392,16 +400,18 @@ def put_in_loop(task: Task, competitor: Any, kind: Kind, name: str, count: int) 
         ValueError: if it cannot be made, or has not the methods of its kind.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
-        own = made(competitor, task)
+        own = made(competitor, model.task)
     check_competitor(name, own, kind)
     if _can_be_traced(competitor, own):
         try:
-            return task.with_filter(_Maker(kind, competitor))
+            return model.with_filter(_Maker(kind, competitor))
         except NotTraceable as error:
-            warn_of(f"{name!r} of {task.id}", error)
-    looped = task.with_filter(_Maker(kind, None))
+            warn_of(f"{name!r} of {model.task.id}", error)
+    looped = model.with_filter(_Maker(kind, None))
     shown = f"{kind} {name!r}"
     estimates = kind == "estimator"
-    asked = _CheckedInPython(own, task, shown, count) if estimates else _InPython(own, task, shown)
-    looped.filter = FILTERS[kind](task, asked, True)
+    asked = (
+        _CheckedInPython(own, model.task, shown, count) if estimates else _InPython(own, model.task, shown)
+    )
+    looped.filter = make_filter(kind, model, asked, True)
     return looped

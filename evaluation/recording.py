@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy
 
-from ..envs.backend import task_on
-from ..envs.catalogue import find_scenario, import_task, opened
+from ..envs.backend import make_model
+from ..envs.catalogue import find_scenario, import_task, make_task, opened
 from ..envs.filter import Filter, Initial, Input
+from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
 from ..envs.recording_files import differing
-from ..envs.task import Episode, Task, named_arrays
+from ..envs.task import Task, named_arrays
 from .rollout import Progress, start_lanes
 from .seeds import episode_seeds
 
@@ -28,6 +29,10 @@ class NoFilter(Filter[Task, Any, Initial]):
     def update(self, state: Initial, given: Input) -> Initial:
         """Learn nothing."""
         return state
+
+
+def _no_filter(model: Model) -> NoFilter:
+    return NoFilter(model.task)
 
 
 def record(
@@ -62,7 +67,7 @@ def record(
     cls = import_task(env)
     seeds = episode_seeds(split, seed, episodes)
     chosen = find_scenario(cls, opened(cls, scenario), keywords)
-    plain = task_on("numpy", cls.id, scenario=chosen, **keywords)
+    plain = make_task(cls, chosen, **keywords)
     if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
     arrays = dict(named_arrays(measure_once(plain)[1]))
@@ -72,9 +77,9 @@ def record(
             f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
             "that a recording may hold: record fewer"
         )
-    task = task_on(backend, cls.id, scenario=chosen, **keywords).with_filter(NoFilter)
+    model = make_model(cls, scenario=chosen, backend=backend, **keywords).with_filter(_no_filter)
     chunks = [
-        _record(task, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
+        _record(model, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
     ]
     joined = [
         {name: numpy.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -113,7 +118,7 @@ def times_there(lengths: numpy.ndarray, rows: int) -> numpy.ndarray:
 
 
 def _record(
-    task: Task, seeds: Sequence[int], tick: Progress
+    model: Model, seeds: Sequence[int], tick: Progress
 ) -> tuple[dict[str, numpy.ndarray], dict[str, numpy.ndarray]]:
     """Measurements and truth, ``(E, T, ...)``, and what was told of the start, ``(E, ...)``."""
     initial: dict[str, numpy.ndarray] = {}
@@ -129,16 +134,18 @@ def _record(
     def keep(episode: Episode) -> None:
         for name, values in named_arrays(episode.measurement):
             series.setdefault(name, []).append(first(values))
-        series.setdefault("truth", []).append(first(task.world.state(episode.truth)))
+        series.setdefault("truth", []).append(first(model.task.world.state(episode.truth)))
 
-    lanes, nothing = start_lanes(task, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
+    lanes, nothing = start_lanes(model, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(nothing):
             keep(episode)
-        tick(count * task.decision_interval)
+        tick(count * model.task.decision_interval)
     keep(lanes.state)
-    uniforms = numpy.stack([numpy.random.default_rng(s).random(task.noise.uniforms) for s in seeds], axis=1)
-    initial["length"] = task.lengths(uniforms)
-    if task.flights:
-        initial["flight"] = task.flight_of(uniforms)
+    uniforms = numpy.stack(
+        [numpy.random.default_rng(s).random(model.task.noise.uniforms) for s in seeds], axis=1
+    )
+    initial["length"] = model.task.lengths(uniforms)
+    if model.task.flights:
+        initial["flight"] = model.task.flight_of(uniforms)
     return {name: numpy.stack(values, axis=1) for name, values in series.items()}, initial

@@ -8,8 +8,8 @@ import numpy
 
 from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
+from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from ..envs.task import Episode, Task
 from .competitors import Kind, check_competitor, kind_of, made
 from .dataset import FAULTS
 from .filters import put_in_loop
@@ -19,15 +19,15 @@ Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
 
 
-def start_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+def start_lanes(model: Model, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
     Args:
-        task: the estimation problem.
+        model: task with a bank.
         seeds: of the episodes.
         begun: called with the episodes at the start of the track.
     """
-    lanes = Lanes(task, len(seeds), begun=begun)
+    lanes = Lanes(model, len(seeds), begun=begun)
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
@@ -35,7 +35,7 @@ def start_lanes(task: Task, seeds: Sequence[int], begun: Callable[[Episode], Non
 
 
 def rollout(
-    task: Task,
+    model: Model,
     competitor: Any,
     seeds: Sequence[int],
     report: Report = whole_episode,
@@ -46,10 +46,10 @@ def rollout(
     """Run whatever competes over one episode for each seed, measurement by measurement.
 
     Args:
-        task: the estimation problem, of a policy under its control.
-        competitor: policy, estimator, reference or bound, or a class or function that makes it for the task.
+        model: task with a bank; of a policy, that of its control.
+        competitor: policy, estimator, reference or bound, or a class or function that makes it.
         seeds: of the episodes, all run side by side.
-        report: function of the task and the state after the measurement was taken in; default: the state itself.
+        report: function of the model and the state after the measurement was taken in; default: the state itself.
         kind: what the competitor is; default: what it says.
         name: of it, in errors.
 
@@ -59,14 +59,14 @@ def rollout(
     """
     kind = kind or kind_of(competitor)
     if kind != "policy":
-        task = put_in_loop(task, competitor, kind, name, len(seeds))
-        lanes, action = start_lanes(task, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+        model = put_in_loop(model, competitor, kind, name, len(seeds))
+        lanes, action = start_lanes(model, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
         for _ in range(lanes.decisions_per_episode):
             for found, _ in lanes.decide(action, report):
                 yield found, action
         return
-    lanes = start_lanes(task, seeds)
-    policy = SteppingPolicy(task, check_competitor(name, made(competitor, task), kind))
+    lanes = start_lanes(model, seeds)
+    policy = SteppingPolicy(model, check_competitor(name, made(competitor, model), kind))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         action, memory = policy.predict(lanes.observe(), memory)
@@ -75,7 +75,7 @@ def rollout(
 
 
 def run_competitor(
-    task: Task,
+    model: Model,
     competitor: Any,
     kind: Kind,
     seeds: Sequence[int],
@@ -90,7 +90,7 @@ def run_competitor(
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
     Args:
-        task: as in :func:`rollout`, likewise what follows.
+        model: as in :func:`rollout`, likewise what follows.
         competitor: likewise.
         kind: likewise.
         seeds: likewise.
@@ -107,7 +107,7 @@ def run_competitor(
         Arrays ``(episodes, time, ...)`` by name.
     """
     series: dict[str, list[numpy.ndarray]] = {}
-    fewer, space = dict(only or {}), task.action_space
+    fewer, space = dict(only or {}), model.action_space
     counts: dict[str, int] = {}
 
     def keep(name: str, values: numpy.ndarray) -> None:
@@ -120,11 +120,13 @@ def run_competitor(
 
     boxed = actions and kind == "policy" and isinstance(space, gymnasium.spaces.Box)
     reserved = {"action", "lost"} if kind == "policy" and actions else set()
-    for step, (found, action) in enumerate(rollout(task, competitor, seeds, report, kind=kind, name=name), 1):
+    for step, (found, action) in enumerate(
+        rollout(model, competitor, seeds, report, kind=kind, name=name), 1
+    ):
         for taken in reserved & found.keys():
             raise ValueError(
-                f"{task.id} records something under the name {taken!r}, under which an evaluation keeps which actions "
-                "were applied or episodes lost: call it something else"
+                f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
+                "which actions were applied or episodes lost: call it something else"
             )
         if strict and "lost" in found:
             _refuse_losses(found["lost"][: len(seeds)], name, first_episode, step)

@@ -7,7 +7,7 @@ import numpy
 
 from ..compiler.functions import padded_width
 from ..envs.environment import check_action
-from ..envs.task import Task
+from ..envs.model import Model
 from .competitors import Policy
 
 MODEL_ROWS = 128
@@ -31,18 +31,18 @@ class SteppingPolicy(Policy):
     one is repeated to fill up.
 
     Args:
-        task: the estimation problem, under the policy's control.
+        model: task with the bank that the policy steers.
         policy: anything with Stable-Baselines3's ``predict``.
         scenario: of the environment; None is its default.
         task_keywords: parameters of the task that the environment must be made with.
     """
 
     def __init__(
-        self, task: Task, policy: Any, scenario: Any = None, task_keywords: Mapping[str, Any] | None = None
+        self, model: Model, policy: Any, scenario: Any = None, task_keywords: Mapping[str, Any] | None = None
     ) -> None:
-        super().__init__(task)
+        super().__init__(model)
         self.policy = policy
-        self.control = task.control  # type: ignore[misc]  # made for it
+        self.control = model.control  # type: ignore[misc]  # made for it
         self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
 
     @property
@@ -75,7 +75,7 @@ class SteppingPolicy(Policy):
         """Choose actions.
 
         Args:
-            observation: ``(N, len(task.fields))``, or one observation without the batch axis.
+            observation: ``(N, len(model.fields))``, or one observation without the batch axis.
             state: what the last call returned; at the first None, or what :meth:`begin` has returned.
             episode_start: ``(N,)`` booleans, or one; true where a new episode begins, as it does everywhere at the
                 first call.
@@ -101,7 +101,7 @@ class SteppingPolicy(Policy):
         answers, kept = [], []
         for call, memory in zip(calls, memories, strict=True):
             answer, after = self.policy.predict(batch[call], memory, start[call], deterministic=deterministic)
-            answers.append(check_action(self.task.action_space, answer, len(call)))
+            answers.append(check_action(self.model.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
         return (action[0] if single else action), Memory(kept, False)

@@ -131,7 +131,7 @@ def reduce_episodes(
     if plan.flown is not None:
         raise ValueError("flights and recordings have no summary: evaluate them")
     bootstrap = _resampling(asked.episodes)
-    block = block_of(plan.tasks[asked.name].horizon)
+    block = block_of(plan.models[asked.name].task.horizon)
 
     def parts() -> Iterator[Part]:
         for i in range(asked.first, asked.end, block):

@@ -10,6 +10,7 @@ import xarray
 from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines.problem import Problem, import_problem, problem_of
+from .envs.backend import make_model
 from .envs.catalogue import imported, make_task, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
@@ -26,7 +27,7 @@ GATED = "gated:"
 
 
 def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
-    """Return what makes a policy, estimator, reference or bound for a task.
+    """Return what makes a policy, estimator, reference or bound.
 
     Args:
         env: environment id.
@@ -172,7 +173,7 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
-    task = make_task(problem.id, experiment.control, experiment.scenario, **experiment.keywords)
+    task = make_task(problem.task, experiment.scenario, **experiment.keywords)
     own = problem.baselines.metrics
     return [EvaluationRequest(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
 
@@ -204,13 +205,13 @@ def make_policy(
         ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
     """
     if isinstance(env, str):
-        problem, task = import_problem(env), None
+        problem, model = import_problem(env), None
     else:
-        task = _task_of(env)
-        problem = problem_of(task.id)
+        model = _model_of(env)
+        problem = Problem.of(type(model.task))
         if control is not None or scenario is not None or keywords:
             raise ValueError("control, scenario and parameters are the environment's own: leave them out")
-        control = task.control
+        control = model.control
     name = str(policy) if isinstance(policy, str | Path) else type(policy).__name__
     named = isinstance(policy, str | Path)
     maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
@@ -219,22 +220,22 @@ def make_policy(
         raise ValueError(f"{name!r} does not act: of kind {kind}, it can be evaluated only")
     control = control_of(maker, kind, control, problem.task, name)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
-    if task is None:
-        task = make_task(problem.id, control, scenario, **keywords)
+    if model is None:
+        model = make_model(problem.task, control, scenario, **keywords)
     else:
         for parameter, value in keywords.items():
-            own = getattr(task.parameters, parameter)
+            own = getattr(model.task.parameters, parameter)
             if own != value:
                 raise ValueError(
                     f"policy {name!r} acts in an environment with {parameter}={value!r}, and this one has {own!r}: "
                     "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
                 )
-    check_observation(task, maker, name)
-    return SteppingPolicy(task, check_competitor(name, made(maker, task), kind), scenario, keywords)
+    check_observation(model, maker, name)
+    return SteppingPolicy(model, check_competitor(name, made(maker, model), kind), scenario, keywords)
 
 
-def _task_of(env: Any) -> Any:
-    """Return the task of an environment.
+def _model_of(env: Any) -> Any:
+    """Return the model of an environment.
 
     Raises:
         ValueError: if it is none of filtergym, or computes in torch.
@@ -256,7 +257,7 @@ def _task_of(env: Any) -> Any:
         )
     if inner.backend == "torch":
         raise ValueError("policies answer in NumPy arrays: make the environment with another backend")
-    return inner.task
+    return inner.model
 
 
 def tidy_records(dataset: xarray.Dataset) -> list[Record]:

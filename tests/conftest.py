@@ -15,7 +15,8 @@ import hypothesis
 import numpy as np
 import pytest
 from filtergym.envs import compiled
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
+from models import make_model
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
@@ -96,7 +97,7 @@ def paired_controls(cases):
 @pytest.fixture
 def short(env_id):
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
-    interval = min(make_task(env_id).decision_interval, 2)
+    interval = min(make_model(env_id).task.decision_interval, 2)
     return {"horizon": DECISIONS * interval, "decision_interval": interval}
 
 

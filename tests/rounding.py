@@ -23,7 +23,7 @@ REPETITIONS = (0, 1)
 """Numbers of the repetitions that a test makes of several lanes."""
 LOOSEST = 1e-4
 """A result, or one, times this is the largest tolerance: what rounding takes further, a test says nothing about."""
-PARTS = {"world": ("begin", "advance"), "bank": ("start", "predict", "act", "feedback")}
+PARTS = {"world": ("begin", "advance"), "filter": ("start", "predict", "act", "feedback")}
 """Methods of the parts of a task that are called within a step."""
 
 
@@ -68,8 +68,9 @@ def move_roundings(env, repetition=0):
     """
     lanes = env.unwrapped.fleet.only
     pattern = 1000 * repetition + np.arange(lanes.width)
-    for task in filter(None, (lanes.task, lanes.paper)):
-        for owner, names in ((task, ("observe", "charge")), *((getattr(task, p), PARTS[p]) for p in PARTS)):
+    for model in filter(None, (lanes.model, lanes.paper)):
+        parts = ((model.task.world, "world"), (model.filter, "filter"))
+        for owner, names in ((model, ("observe", "charge")), *((part, PARTS[p]) for part, p in parts)):
             for name in names:
                 setattr(owner, name, _that_moves(getattr(owner, name), pattern))
     return env

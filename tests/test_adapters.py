@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.estimators import KalmanModel
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.filter import Initial
 from filtergym.evaluation.rollout import rollout
 from filtergym.filters import kalman
+from models import make_model
 
 import filtergym
 from filtergym import adapters
@@ -36,8 +36,10 @@ def example(name):
 
 def estimates(maker, scenario="random", episodes=8, **keywords):
     """Mean, (time, 4, episodes), and covariance over its largest entry, (time, 4, 4, episodes)."""
-    task = make_task(ID, scenario=scenario, **keywords)
-    answers = [(e.filter.mean, e.filter.covariance) for e, _ in rollout(task, maker(task), range(episodes))]
+    model = make_model(ID, scenario=scenario, **keywords)
+    answers = [
+        (e.filter.mean, e.filter.covariance) for e, _ in rollout(model, maker(model.task), range(episodes))
+    ]
     means, covariances = map(np.stack, zip(*answers, strict=True))
     return means, covariances / abs(covariances).max(axis=(1, 2), keepdims=True)
 
@@ -206,7 +208,7 @@ def test_states_are_mapped_both_ways():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(4, 4))
     initial = Initial(rng.normal(size=(4, 3)), np.repeat((root @ root.T)[:, :, None], 3, axis=-1))
-    estimator = Permuted(make_task(ID))
+    estimator = Permuted(make_model(ID).task)
     memory = estimator.start(initial, 3)
     np.testing.assert_array_equal(estimator.began.mean, [0.0, *initial.mean[[3, 0, 1, 2], 2]])
     np.testing.assert_array_equal(estimator.began.covariance[0], 0.0)

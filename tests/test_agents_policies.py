@@ -11,11 +11,13 @@ from filtergym.agents import learned_policy
 from filtergym.agents.learned_policy import PRETRAINED, LearnedPolicy
 from filtergym.agents.residual import ResidualActions, ResidualPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.catalogue import catalogue, task_class
+from filtergym.envs.model import Model
 from filtergym.envs.observation import Block
 from filtergym.envs.task import named_arrays
 from filtergym.evaluation.competitors import ConstantPolicy, kind_of
 from filtergym.evaluation.rollout import run_competitor
+from models import make_model
 
 from filtergym import evaluate
 from filtergym.names import competitor
@@ -126,10 +128,10 @@ def test_fields_are_found_by_their_names(file):
     parameters = cls.Parameters(horizon=4 * interval, decision_interval=interval)
     costs = []
     for own in (cls, wider(cls)):
-        task = own(parameters, control)
-        found = run_competitor(task, maker(task), kind_of(maker), range(8), lambda t, e: {"cost": t.cost(e)})
+        model = Model(own(parameters), control)
+        found = run_competitor(model, maker, kind_of(maker), range(8), lambda m, e: {"cost": m.cost(e)})
         costs.append(found["cost"])
-    assert task.fields[0].name == "further"
+    assert model.fields[0].name == "further"
     np.testing.assert_array_equal(*costs)
 
 
@@ -148,8 +150,8 @@ def stored(tmp_path):
     """Store an agent that always answers zero, its header changed by keywords."""
     from safetensors.numpy import save_file
 
-    task = make_task(ID, "gain")
-    fields = [field.name for field in task.fields]
+    model = make_model(ID, "gain")
+    fields = [field.name for field in model.fields]
     arrays = {
         "observation_mean": np.zeros(len(fields), np.float32),
         "observation_scale": np.ones(len(fields), np.float32),
@@ -159,7 +161,7 @@ def stored(tmp_path):
     header = {
         "environment": ID,
         "control": "gain",
-        "interface": str(task.interface),
+        "interface": str(model.task.interface),
         "fields": json.dumps(fields),
         "output": "clip",
         "activation": "tanh",
@@ -181,14 +183,14 @@ def test_policy_of_another_environment_is_refused(stored):
     path = stored(environment="filtergym/Other-v0")
     with pytest.raises(ValueError, match="was trained on filtergym/Other-v0, not on " + ID):
         load_policy(problem_of(ID).task, path)
-    fields = [field.name for field in make_task(ID, "gain").fields]
+    fields = [field.name for field in make_model(ID, "gain").fields]
     path = stored(fields=json.dumps(["range", *fields[1:]]))
     with pytest.raises(ValueError, match=r"was trained on other fields .* has no field 'range': choose from"):
         evaluate(ID, [str(path)], episodes=1)
 
 
 def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command):
-    now = make_task(ID).interface
+    now = make_model(ID).task.interface
     path = stored(interface=str(now - 1))
     with pytest.raises(ValueError, match=rf"its interface {now - 1}, now {now}\): train it again"):
         evaluate(ID, [str(path)], episodes=1)
@@ -199,8 +201,8 @@ def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command
 
 
 def test_layers_by_hand():
-    task = make_task(ID, "gain")
-    count = len(task.fields)
+    model = make_model(ID, "gain")
+    count = len(model.fields)
     arrays = {
         "observation_mean": np.full(count, 1.0, np.float32),
         "observation_scale": np.full(count, 2.0, np.float32),
@@ -211,7 +213,7 @@ def test_layers_by_hand():
     }
     shown = np.zeros((3, count))
     shown[:, 0], shown[:, 1] = [1.0, 2.0, 1e6], [1.0, 5.0, 1.0]
-    action = LearnedPolicy(task, arrays, "clip", "relu").predict(shown)[0]
+    action = LearnedPolicy(model, arrays, "clip", "relu").predict(shown)[0]
     # Normalised: (0, 0), (0.5, 2), (10 by the limit, 0); after the first layer (0, 0), (0.5, 1), (10, 0).
     np.testing.assert_allclose(action[:, 0], [0.1, 0.6, 1.0], rtol=1e-6)
 
@@ -227,7 +229,7 @@ def paid(env, actions):
 
 
 def test_zero_correction_is_exactly_the_policy():
-    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
     env = ResidualActions(gymnasium.make(ID, control="gain"), policy)
     memory = None
 
@@ -257,7 +259,7 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
     pytest.importorskip("stable_baselines3")
     from filtergym.agents import to_sb3
 
-    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
 
     def native():
         return gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", control="gain", horizon=30)
@@ -277,7 +279,7 @@ def test_zero_correction_is_exactly_the_policy_through_the_adapter():
 
 
 def test_residuals_that_cannot_be():
-    policy = competitor(ID, "adaptive")(make_task(ID, "gain"))
+    policy = competitor(ID, "adaptive")(make_model(ID, "gain"))
     with pytest.raises(ValueError, match="made for control 'gain', but the environment has 'weights'"):
         ResidualActions(gymnasium.make(ID, control="weights"), policy)
     with pytest.raises(ValueError, match="a residual action is added: control 'mode' has Discrete"):

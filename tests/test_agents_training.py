@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import Problem, problem_of
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 
 from filtergym import evaluate
@@ -32,6 +31,7 @@ from filtergym.agents.network_arrays import network_arrays
 from filtergym.agents.sb3_policy import Sb3Policy, load_sb3_policy
 from filtergym.agents.sb3_training import train_sb3
 from filtergym.agents.training_run import RunOptions, Session, Trainee, load_run, new_run, resume_run
+from models import make_model
 from sb3_contrib import RecurrentPPO
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -198,7 +198,7 @@ def test_exported_agent_acts_like_the_model(algorithm, control, tmp_path):
     train(small_run(algorithm, 240, control=control), tmp_path)
     file = tmp_path / "agent.safetensors"
     export_run(tmp_path, file)
-    policy = competitor(ID, str(file))(make_task(ID, control))
+    policy = competitor(ID, str(file))(make_model(ID, control))
     model = load_sb3_policy(tmp_path / "best" / "model.zip", trust=True)
     shown = np.random.default_rng(0).normal(0.0, 3.0, (50, *model.observation_space.shape))
     action, expected = policy.predict(shown)[0], model.predict(shown)[0]
@@ -223,17 +223,17 @@ def test_an_exported_estimator_is_what_was_validated(tmp_path):
 
 
 def test_exported_recurrent_policy_acts_like_the_network(tmp_path):
-    task = make_task(ID, "weights")
+    model = make_model(ID, "weights")
     torch.manual_seed(0)
-    network = RecurrentPolicy(len(task.fields), task.action_space, 5)
+    network = RecurrentPolicy(len(model.fields), model.action_space, 5)
     network.head.weight.data.mul_(20.0)
     network.mean.fill_(0.3)
     network.scale.fill_(2.0)
-    policy = LearnedPolicy(task, network.arrays(), "tanh")
+    policy = LearnedPolicy(model, network.arrays(), "tanh")
     rng = np.random.default_rng(1)
     hidden, state = torch.zeros(6, 5), None
     for step in range(12):
-        shown = rng.normal(0.0, 4.0, (6, len(task.fields)))
+        shown = rng.normal(0.0, 4.0, (6, len(model.fields)))
         start = rng.random(6) < 0.3 if step else np.ones(6, dtype=bool)
         action, state = policy.predict(shown, state, start)
         hidden[torch.as_tensor(start)] = 0.0
@@ -247,7 +247,7 @@ def gradient_of_bias(truncation, horizon=6):
     env = TaskVectorEnv(ID, 3, "gain", horizon=horizon, backend="torch", autoreset_mode="Disabled")
     env.reset(seed=1)
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(env.task.fields), env.task.action_space, 4).double()
+    policy = RecurrentPolicy(len(env.model.fields), env.model.action_space, 4).double()
     # Observations are cut to float32 by the policy; here in double, for differences.
     policy.forward = lambda shown, hidden: double_forward(policy, shown, hidden)
 
@@ -369,7 +369,7 @@ def recurrent_agent(control, layers=1):
 def test_exported_recurrent_agent_remembers_like_the_model(control):
     agent, env = recurrent_agent(control)
     arrays, output, activation = network_arrays(agent, "recurrent-ppo")
-    policy = LearnedPolicy(make_task(ID, control), arrays, output, activation)
+    policy = LearnedPolicy(make_model(ID, control), arrays, output, activation)
     shown, start = env.reset(), np.ones(5, dtype=bool)
     memory = state = None
     met = []

@@ -6,8 +6,8 @@ import pytest
 from filtergym.agents.named_policies import shipped_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
+from models import make_model
 
 from filtergym import evaluate
 from filtergym.names import competitor
@@ -37,9 +37,9 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
     assert_same(evaluate(env_id, names, episodes=13, **short), everyone)
 
 
-def residual(task):
+def residual(model):
     """Random corrections of random actions."""
-    return ResidualPolicy(task, RandomPolicy(task), competitor(ID, "adaptive")(task))
+    return ResidualPolicy(model, RandomPolicy(model), competitor(ID, "adaptive")(model))
 
 
 residual.control = "gain"
@@ -50,8 +50,8 @@ def test_random_actions_are_every_episodes_own(monkeypatch):
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 8)
     everyone = evaluate(ID, makers, episodes=17, horizon=10)
     assert_same(evaluate(ID, makers, episodes=3, horizon=10), everyone)
-    policy = RandomPolicy(make_task(ID, "gain"))
-    observation = np.zeros((17, len(policy.task.fields)))
+    policy = RandomPolicy(make_model(ID, "gain"))
+    observation = np.zeros((17, len(policy.model.fields)))
     actions, _ = policy.predict(
         observation, policy.begin([int(seed) for seed in everyone["episode_seed"].values])
     )
@@ -60,11 +60,11 @@ def test_random_actions_are_every_episodes_own(monkeypatch):
 
 @pytest.mark.parametrize("control", ["weights", "mode"])
 def test_random_actions_are_one_draw_after_another(control):
-    policy = RandomPolicy(make_task(ID, control))
-    space, memory = policy.task.action_space, policy.begin([3, 5])
+    policy = RandomPolicy(make_model(ID, control))
+    space, memory = policy.model.action_space, policy.begin([3, 5])
     generators = [np.random.default_rng([policy.seed, seed]) for seed in (3, 5)]
     for _ in range(2 * DRAWN_AT_ONCE + 1):
-        found, memory = policy.predict(np.zeros((2, len(policy.task.fields))), memory)
+        found, memory = policy.predict(np.zeros((2, len(policy.model.fields))), memory)
         if control == "mode":
             expected = [generator.integers(space.n) for generator in generators]
         else:

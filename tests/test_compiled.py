@@ -1,6 +1,7 @@
 """Compiled steps: as near to NumPy's as rounding allows, the same bits for every N, everywhere that NumPy goes."""
 
 import multiprocessing
+import pickle
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -11,13 +12,13 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Search, tune
 from filtergym.envs import compiled as compiled_tasks
-from filtergym.envs.backend import task_on
-from filtergym.envs.catalogue import catalogue, make_task
-from filtergym.envs.compiled import compiled
+from filtergym.envs.catalogue import catalogue
+from filtergym.envs.compiled import CompiledModel
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.envs.maneuvering_target import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
 from filtergym.evaluation.recording import NoFilter
+from models import make_model
 from rounding import REPETITIONS, assert_same, move_roundings
 
 import filtergym
@@ -155,8 +156,8 @@ def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
     for step in range(5):
         action = random_actions(plain.action_space, 1, step)[0]
         state = looked_at.fleet.only.state
-        task = looked_at.task
-        expected = task.cost(task.act(state, np.stack([action, *[0 * action] * 7], axis=-1)))
+        model = looked_at.model
+        expected = model.cost(model.act(state, np.stack([action, *[0 * action] * 7], axis=-1)))
         looked_at.fleet.only.state = state  # through the arrays, not the stepper's memory
         one, other = plain.step(action), looked_at.step(action)
         np.testing.assert_array_equal(one[0], other[0])
@@ -271,10 +272,10 @@ def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
 
 
 def test_a_report_that_cannot_be_traced_is_made_with_numpy():
-    task = task_on("compiled", MANEUVERING.id, "gain", horizon=5)
+    model = make_model(MANEUVERING.id, "gain", horizon=5, backend="compiled")
 
-    def odd(task, episode):
-        return {"cost": task.cost(episode), "largest": np.full(8, float(task.cost(episode).max()))}
+    def odd(model, episode):
+        return {"cost": model.cost(episode), "largest": np.full(8, float(model.cost(episode).max()))}
 
     env = TaskVectorEnv(MANEUVERING.id, 3, "gain", backend="compiled", horizon=5)
     env.reset(seed=0)
@@ -282,19 +283,20 @@ def test_a_report_that_cannot_be_traced_is_made_with_numpy():
         ((found, _),) = env.fleet.only.decide(np.zeros((3, 1)), odd)
     assert found["largest"][0] == found["cost"].max()
     with pytest.warns(UserWarning, match="is not compiled"):
-        task.run(lambda task, episode: float(episode.max()), np.ones((2, 8)))
+        model.run(lambda model, episode: float(episode.max()), np.ones((2, 8)))
 
 
 def test_the_task_is_still_what_it_was():
-    task = make_task(MANEUVERING.id, "evidence")
-    fast = compiled(task)
-    assert isinstance(fast, MANEUVERING)
+    model = make_model(MANEUVERING.id, "evidence")
+    fast = CompiledModel(model.task, "evidence")
+    assert fast.task is model.task
     assert fast.backend == "compiled"
     assert fast.under("gain").backend == "compiled"
     assert fast.under("gain").control == "gain"
-    assert fast.fields == task.fields
-    assert fast.original is task
-    assert fast.with_filter(NoFilter).fields == ()
+    assert fast.fields == model.fields
+    assert fast.on_numpy().backend == "numpy"
+    assert fast.with_filter(lambda other: NoFilter(other.task)).fields == ()
+    assert pickle.loads(pickle.dumps(fast)).backend == "compiled"
 
 
 def test_two_scenarios_share_their_code(tmp_path, monkeypatch):

@@ -7,11 +7,12 @@ import re
 import numpy as np
 import pytest
 import xarray
-from filtergym.envs.catalogue import make_task
+from filtergym.envs.catalogue import task_class
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.curves import curves_of
 from filtergym.evaluation.dataset import windows_of
 from filtergym.evaluation.evaluate import action_names
+from models import make_model
 from scipy.stats import chi2
 
 from filtergym import evaluate, record
@@ -121,10 +122,10 @@ def test_actions_and_gains(dataset, curves):
     np.testing.assert_allclose(weights, dataset["mode_probability"].sel(policy="imm"), atol=1e-6)
     np.testing.assert_allclose(curves["action"].sel(policy="imm").values[:2], weights.mean(axis=0).T)
     assert np.isnan(curves["action"].sel(policy="imm").values[2]).all()
-    task = make_task(TARGET, "gain", "paper", horizon=60)
+    model = make_model(TARGET, "gain", "paper", horizon=60)
     action = dataset["action"].sel(policy="adaptive", action_name="gain: gain").values
     # Another way to the same number: the gain that the bank has recorded.
-    np.testing.assert_allclose(dataset["alpha"].sel(policy="adaptive"), task.bank.alpha(action[None]))
+    np.testing.assert_allclose(dataset["alpha"].sel(policy="adaptive"), model.filter.alpha(action[None]))
     found = curves.sel(policy="adaptive", action_name="gain: gain")
     for name, expected in (
         ("action", action.mean(axis=0)),
@@ -166,9 +167,9 @@ def test_an_action_is_told_as_the_box_bounds_it():
     ],
 )
 def test_names_of_actions(env, control, expected):
-    task = make_task(env, control)
-    found = action_names(task, task.action_space.shape[0])
-    assert len(found) == len(set(found)) == task.action_space.shape[0]
+    model = make_model(env, control)
+    found = action_names(model, model.action_space.shape[0])
+    assert len(found) == len(set(found)) == model.action_space.shape[0]
     assert found == expected
 
 
@@ -220,11 +221,8 @@ def test_what_it_says_of_itself(dataset, curves, tmp_path):
 
 
 def test_names_that_an_evaluation_keeps_are_refused(monkeypatch):
-    cls = type(make_task(TARGET))
-    records = cls.records
-    monkeypatch.setattr(
-        cls, "records", lambda self, episode: {**records(self, episode), "action": episode.truth[0]}
-    )
+    cls = task_class(TARGET)
+    monkeypatch.setattr(cls, "records", lambda self, model, episode, kept: {"action": episode.truth[0]})
     with pytest.raises(ValueError, match="records something under the name 'action'"):
         evaluate(TARGET, "imm", "paper", 2, horizon=3, backend="numpy")
     monkeypatch.setattr(cls, "groups", {"here": ("position_x",), "there": ("position_x",)})

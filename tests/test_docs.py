@@ -12,7 +12,8 @@ import pytest
 from environment_page import environment_tables, put_tables
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, make_task, parameter_names
+from filtergym.envs.catalogue import catalogue, parameter_names
+from models import make_model
 from pages import insert_between_markers
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -65,7 +66,7 @@ def test_page_names_everything(id):
 def test_page_names_every_field(id):
     words = set(re.findall(r"`([a-zA-Z0-9_-]+)`", page(id)))
     for control in catalogue()[id].controls:
-        for field in make_task(id, control).fields:
+        for field in make_model(id, control).fields:
             # A page may leave out the numbers or letters that tell filters, satellites and axes apart.
             stem = field.name
             while stem and stem not in words:

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
 from filtergym.filters import geodesy
 from filtergym.filters import loosely_coupled as ins_gnss
+from models import make_model
 from scipy.spatial.transform import Rotation
 
 from filtergym import evaluate, read_recording
@@ -241,9 +241,9 @@ LEVELS = {"drift": 0.3, "coloured": 0.5, "correlation_time": 4.0, "white_intensi
 
 
 def test_modelled_error_is_the_filters_own():
-    p = make_task(
+    p = make_model(
         "filtergym/LooselyCoupledNavigation-v0", scenario="paper", **{**drive.PARAMETERS, **LEVELS}
-    ).parameters
+    ).task.parameters
     covariance, expected = p.modelled_prior(np.zeros(())), []
     for _ in range(81):
         covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.modelled_growth)
@@ -284,9 +284,9 @@ def test_shipped_file_is_a_recording(shipped):
     licence = (ROOT / "docs" / "data" / "drive_licence.txt").read_text(encoding="utf-8")
     assert "BSD 3-Clause License" in licence
     assert shipped.attrs["source"].split("commit ")[1].split(",")[0] in licence
-    task = make_task(shipped.attrs["environment"], **json.loads(shipped.attrs["parameters"]))
+    model = make_model(shipped.attrs["environment"], **json.loads(shipped.attrs["parameters"]))
     assert json.loads(shipped.attrs["parameters"]) == drive.PARAMETERS
-    assert [c.name for c in task.components] == shipped["component"].values.tolist()
+    assert [c.name for c in model.task.components] == shipped["component"].values.tolist()
     for name in (*Measurement._fields, "seconds", "truth", "initial_mean", "initial_covariance", "length"):
         assert np.isfinite(shipped[name]).all(), name
     assert shipped["ins"].shape == (24, 81, 2)

@@ -9,11 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue, make_task, register
+from filtergym.envs.catalogue import catalogue, register
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
-from filtergym.envs.task import Episode
+from filtergym.envs.model import Episode
 from filtergym.evaluation.recording import NoFilter
 from gymnasium.utils.env_checker import check_env
+from models import make_model
 
 from filtergym import evaluate
 
@@ -49,47 +50,47 @@ def run(env, actions, seed=21):
 
 def test_bank_needs_nothing_but_the_measurements(env_id, control, short, random_actions):
     """No truth: fed with what the world said, and with nothing else, the bank shows and estimates the same."""
-    task = make_task(env_id, control, **short)
+    model = make_model(env_id, control, **short)
     rng, episode = np.random.default_rng(3), None
-    noise = task.noise
-    episode = task.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
-    alone = task.bank.start(episode.measurement)
-    for step in range(task.horizon):
+    noise = model.task.noise
+    episode = model.begin(rng.random((noise.uniforms, 8)), rng.normal(size=(noise.initial_normals, 8)))
+    alone = model.filter.start(episode.measurement)
+    for step in range(model.task.horizon):
         row = np.concatenate([rng.normal(size=(noise.normals, 8)), rng.random((noise.row_uniforms, 8))])
-        episode = task.measure(episode, row)
-        alone = task.bank.predict(alone, episode.measurement)
+        episode = model.measure(episode, row)
+        alone = model.filter.predict(alone, episode.measurement)
         np.testing.assert_array_equal(
-            task.observe(Episode(None, episode.measurement, alone)), task.observe(episode)
+            model.observe(Episode(None, episode.measurement, alone)), model.observe(episode)
         )
-        action = random_actions(task.action_space, 8, step).T
-        episode = task.act(episode, action)
-        alone = task.bank.act(alone, episode.measurement, action)
-        np.testing.assert_array_equal(task.bank.mean(alone), task.mean(episode))
-        np.testing.assert_array_equal(task.bank.covariance(alone), task.covariance(episode))
+        action = random_actions(model.action_space, 8, step).T
+        episode = model.act(episode, action)
+        alone = model.filter.act(alone, episode.measurement, action)
+        np.testing.assert_array_equal(model.filter.mean(alone), model.mean(episode))
+        np.testing.assert_array_equal(model.filter.covariance(alone), model.covariance(episode))
 
 
 def test_functions_of_a_bank_have_no_door_for_the_truth(env_id, control):
     doors = {"self", "initial", "state", "measurement", "action"}
     for name in ("start", "predict", "act", "mean", "covariance", "feedback", "records"):
-        function = getattr(type(make_task(env_id, control).bank), name)
+        function = getattr(type(make_model(env_id, control).filter), name)
         assert set(inspect.signature(function).parameters) <= doors, name
 
 
 def test_estimate_made_outside_starts_where_everyone_starts(env_id, short):
     """The task without its bank: who says nothing reports the start for ever, in a loop of its own."""
-    task = make_task(env_id, **short).with_filter(NoFilter)
-    noise = task.noise
-    episode = task.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
+    model = make_model(env_id, **short).with_filter(lambda other: NoFilter(other.task))
+    noise = model.task.noise
+    episode = model.begin(np.full((noise.uniforms, 8), 0.5), np.zeros((noise.initial_normals, 8)))
     mean, covariance = episode.measurement.mean, episode.measurement.covariance
-    count = len(task.components)
+    count = len(model.task.components)
     assert mean.shape == (count, 8)
     assert covariance.shape == (count, count, 8)
     np.testing.assert_array_equal(covariance, covariance.swapaxes(0, 1))
     for _ in range(3):
-        episode = task.measure(episode, np.zeros((noise.normals + noise.row_uniforms, 8)))
-        np.testing.assert_array_equal(task.mean(episode), mean)
-        assert np.isfinite(task.error(episode)).all()
-        assert np.isfinite(task.cost(episode)).all()
+        episode = model.measure(episode, np.zeros((noise.normals + noise.row_uniforms, 8)))
+        np.testing.assert_array_equal(model.mean(episode), mean)
+        assert np.isfinite(model.error(episode)).all()
+        assert np.isfinite(model.cost(episode)).all()
 
 
 def test_episode_ends_by_truncation_at_the_horizon(env_id, control, short, random_actions):
@@ -111,10 +112,12 @@ def test_spec_survives_json(env_id, control, short, random_actions):
 
 def test_parameters_survive_json(env_id):
     # Lists from a file mean the same as tuples from Python.
-    task = make_task(env_id)
-    values = {name: getattr(task.parameters, name) for name in task.Parameters.__dataclass_fields__}
-    again = make_task(env_id, **json.loads(json.dumps(values)))
-    assert again.parameters == task.parameters
+    model = make_model(env_id)
+    values = {
+        name: getattr(model.task.parameters, name) for name in model.task.Parameters.__dataclass_fields__
+    }
+    again = make_model(env_id, **json.loads(json.dumps(values)))
+    assert again.task.parameters == model.task.parameters
 
 
 def test_registration_twice_changes_nothing(env_id):
@@ -188,10 +191,10 @@ def test_float64_actions_lose_nothing(env_id, control, short):
 
 
 def test_relative_reward_of_the_papers_algorithm_is_zero(env_id, short):
-    task = make_task(env_id)
-    env = TaskVectorEnv(env_id, 4, control=task.paper_policy.control, reward="relative", **short)
+    model = make_model(env_id)
+    env = TaskVectorEnv(env_id, 4, control=model.task.paper_policy.control, reward="relative", **short)
     env.reset(seed=0)
-    action = np.tile(np.asarray(task.paper_policy.action), (4, 1))
+    action = np.tile(np.asarray(model.task.paper_policy.action), (4, 1))
     if isinstance(env.single_action_space, gym.spaces.Discrete):
         action = action[:, 0].astype(int)
     for _ in range(8):
@@ -199,14 +202,14 @@ def test_relative_reward_of_the_papers_algorithm_is_zero(env_id, short):
 
 
 def test_relative_reward_is_the_difference_of_costs(env_id, control, short, random_actions):
-    task = make_task(env_id)
+    model = make_model(env_id)
     ours, relative = (
         TaskVectorEnv(env_id, 3, control=control, reward=r, **short) for r in ("cost", "relative")
     )
-    paper = TaskVectorEnv(env_id, 3, control=task.paper_policy.control, reward="cost", **short)
+    paper = TaskVectorEnv(env_id, 3, control=model.task.paper_policy.control, reward="cost", **short)
     for env in (ours, relative, paper):
         env.reset(seed=1)
-    paper_action = np.tile(np.asarray(task.paper_policy.action), (3, 1))
+    paper_action = np.tile(np.asarray(model.task.paper_policy.action), (3, 1))
     for step in range(5):
         actions = random_actions(ours.single_action_space, 3, step)
         mine, difference, papers = (
@@ -220,13 +223,13 @@ def test_relative_reward_is_the_difference_of_costs(env_id, control, short, rand
 def test_papers_policy_equals_the_papers_constant_action(env_id):
     """The policy that sees observations, and the same algorithm inside the task."""
     known = baselines_of(env_id)
-    paper = make_task(env_id).paper_policy
+    paper = make_model(env_id).task.paper_policy
 
     class Constant:
         control = paper.control
 
-        def __init__(self, task):
-            self.discrete = isinstance(task.action_space, gym.spaces.Discrete)
+        def __init__(self, model):
+            self.discrete = isinstance(model.action_space, gym.spaces.Discrete)
 
         def predict(self, observation, state=None, episode_start=None, deterministic=True):
             action = np.tile(np.asarray(paper.action), (len(observation), 1))
@@ -234,7 +237,7 @@ def test_papers_policy_equals_the_papers_constant_action(env_id):
 
     scenario = next(name for name in catalogue()[env_id].scenarios if name.startswith("paper"))
     # Only one paper's experiment is longer.
-    horizon = min(make_task(env_id, scenario=scenario).horizon, 600)
+    horizon = min(make_model(env_id, scenario=scenario).task.horizon, 600)
     makers = {"policy": known.policies[known.score_paper], "inside": Constant}
     result = evaluate(env_id, makers, scenario, episodes=4, horizon=horizon)
     policy, inside = (result.error.sel(policy=name).values for name in ("policy", "inside"))
@@ -246,10 +249,10 @@ def test_policies_answer_one_and_many(env_id, short):
     interval = short["decision_interval"]
     known = baselines_of(env_id)
     for name, maker in known.policies.items():
-        task = make_task(env_id, getattr(maker, "control", None))
-        policy = maker(task)
-        assert policy.control == task.control
-        env = TaskVectorEnv(env_id, 3, control=task.control, decision_interval=interval)
+        model = make_model(env_id, getattr(maker, "control", None))
+        policy = maker(model)
+        assert policy.control == model.control
+        env = TaskVectorEnv(env_id, 3, control=model.control, decision_interval=interval)
         observation, _ = env.reset(seed=0)
         state, single_state = None, None
         start = np.ones(3, dtype=bool)
@@ -270,10 +273,10 @@ def test_policies_forget_at_the_start_of_an_episode(env_id):
     for name, maker in known.policies.items():
         if name == "random":
             continue
-        task = make_task(env_id, getattr(maker, "control", None))
-        policy = maker(task)
+        model = make_model(env_id, getattr(maker, "control", None))
+        policy = maker(model)
         rng = np.random.default_rng(0)
-        rows = rng.normal(size=(15, 2, len(task.fields)))
+        rows = rng.normal(size=(15, 2, len(model.fields)))
         state = None
         for k in range(10):
             _, state = policy.predict(rows[k], state, np.full(2, k == 0))
@@ -292,7 +295,7 @@ def test_stable_baselines3_evaluates_a_baseline(env_id, short):
     known = baselines_of(env_id)
     policy_class = known.policies[known.score_paper]
     env = gym.make(env_id, control=policy_class.control, **short)
-    mean, deviation = evaluate_policy(policy_class(env.unwrapped.task), env, n_eval_episodes=3, warn=False)
+    mean, deviation = evaluate_policy(policy_class(env.unwrapped.model), env, n_eval_episodes=3, warn=False)
     assert np.isfinite([mean, deviation]).all()
 
 
@@ -317,7 +320,7 @@ def test_evaluation_replays_what_gymnasium_shows(env_id, short):
     maker = known.policies[known.score_paper]
     result = evaluate(env_id, [known.score_paper], episodes=3, seed=5, **short)
     env = gym.make(env_id, control=maker.control, detailed_info=True, disable_env_checker=True, **short)
-    policy = maker(env.unwrapped.task)
+    policy = maker(env.unwrapped.model)
     interval = env.unwrapped.task.decision_interval
     for episode, seed in enumerate(result.episode_seed.values):
         observation, _ = env.reset(seed=int(seed))

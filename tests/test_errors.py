@@ -3,9 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
 from filtergym.evaluation.seeds import episode_seeds
+from models import make_model
 
 import filtergym
 from filtergym import evaluate
@@ -14,7 +15,7 @@ from filtergym.names import competitor
 ID = "filtergym/ManeuveringTarget-v0"
 
 
-@pytest.mark.parametrize("make", [TaskEnv, TaskVectorEnv, make_task])
+@pytest.mark.parametrize("make", [TaskEnv, TaskVectorEnv, make_model])
 class TestNames:
     def test_environment(self, make):
         with pytest.raises(ValueError, match=r"unknown environment .*Manoeuvring.*did you mean '" + ID):

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.dataset import notes_of
+from models import make_model
 
 import filtergym
 from filtergym.__main__ import main
@@ -81,10 +81,10 @@ def test_a_plain_estimator_works_everywhere(env_id, short):
 
 def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
     env, episodes = "filtergym/UavAutopilot-v0", 8
-    task = make_task(env)
-    competitors = {"start": Recording(task), "raw": Raw(task)}
+    model = make_model(env)
+    competitors = {"start": Recording(model.task), "raw": Raw(model.task)}
     result = filtergym.evaluate(env, competitors, episodes=episodes, horizon=100)
-    measured, noise, truths = list(task.measured), [], []
+    measured, noise, truths = list(model.task.measured), [], []
     for name, recording in competitors.items():
         measurements, means = zip(*recording.said, strict=True)
         errors = result.error.sel(policy=name).transpose("time", "component", "episode").values
@@ -94,7 +94,7 @@ def test_in_a_closed_loop_an_estimate_flies_its_own_truth_on_the_same_noise():
         noise.append(np.where(there > 0, readings - truth[:, measured], 0.0))
         truths.append(truth)
         # What it estimates is flown: the control that follows is in force until the next measurement.
-        commanded = [task.autopilot(mean, m.command) for m, mean in recording.said]
+        commanded = [model.task.autopilot(mean, m.command) for m, mean in recording.said]
         np.testing.assert_array_equal([m.control for m, _ in recording.said[1:]], commanded[:-1])
     assert abs(truths[0] - truths[1]).max() > 1.0
     # Rounding of truths of some hundred degrees.

@@ -12,8 +12,8 @@ from environment_page import environment_tables
 from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import problem_of
 from filtergym.envs import registration
-from filtergym.envs.catalogue import make_task
 from gymnasium.utils.env_checker import check_env
+from models import make_model
 
 import filtergym
 
@@ -86,7 +86,7 @@ def test_tables_of_its_page(example):
     assert "| `nis` | 1 | log(1 + x) of normalised innovation squared |" in tables["fields"]
     assert "Limits of its true factor" in tables["parameters"]
     assert "Knows the factor on the gusts at every moment." in tables["policies"]
-    assert make_task(ID).noise.uniforms == 3
+    assert make_model(ID).task.noise.uniforms == 3
 
 
 def test_command_line_finds_it_in_the_working_directory():

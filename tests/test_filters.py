@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.backend import task_on
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.evaluation.competitors import Likelihood
 from filtergym.evaluation.dataset import FAULTS
 from filtergym.evaluation.filters import find_fault, is_lacking, put_in_loop
 from filtergym.evaluation.rollout import rollout, start_lanes
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import packed_covariance
+from models import make_model
 from scipy.stats import multivariate_normal
 
 import filtergym
@@ -75,9 +75,9 @@ def test_every_shipped_estimator_reference_and_bound_is_traced(id, kind, name):
     group = {"estimator": "estimators", "reference": "references", "bound": "bounds"}[kind]
     maker = getattr(baselines_of(id), group)[name]
     keywords = {**getattr(maker, "task_keywords", {}), **SHORT.get(id, {"horizon": 40})}
-    looped = put_in_loop(make_task(id, **keywords), maker, kind, name, 8)
+    looped = put_in_loop(make_model(id, **keywords), maker, kind, name, 8)
     assert not looped.filter.in_python
-    fast = put_in_loop(task_on("compiled", id, **keywords), maker, kind, name, 8)
+    fast = put_in_loop(make_model(id, **keywords, backend="compiled"), maker, kind, name, 8)
     assert not fast.filter.in_python
     assert fast.backend == "compiled"
 
@@ -91,11 +91,11 @@ def test_a_traceable_class_is_compiled_and_says_what_it_says_in_python():
         size = 1e5 if name == "error" else np.nanmax(abs(other)) + 1.0
         np.testing.assert_allclose(one, other, rtol=0.0, atol=1e4 * np.finfo(float).eps * size)
     assert np.isnan(found["log_likelihood"].values).any()
-    task = task_on("compiled", TARGET)
-    assert not put_in_loop(task, Kalman, "estimator", "mine", 8).filter.in_python
-    assert put_in_loop(task, InPython, "estimator", "mine", 8).filter.in_python
+    model = make_model(TARGET, backend="compiled")
+    assert not put_in_loop(model, Kalman, "estimator", "mine", 8).filter.in_python
+    assert put_in_loop(model, InPython, "estimator", "mine", 8).filter.in_python
     # An object was made for arrays of NumPy, whatever its class says.
-    assert put_in_loop(task, Kalman(task), "estimator", "mine", 8).filter.in_python
+    assert put_in_loop(model, Kalman(model.task), "estimator", "mine", 8).filter.in_python
 
 
 def test_what_cannot_be_traced_though_it_says_so_runs_in_python_with_a_warning():
@@ -114,9 +114,9 @@ def test_what_cannot_be_traced_though_it_says_so_runs_in_python_with_a_warning()
 
 def test_log_likelihood_is_the_density_of_every_measurement_as_it_was_predicted():
     """Of a Kalman filter by SciPy's density of the prediction, measurement by measurement."""
-    task = make_task(TARGET, scenario="missed-detections", horizon=30)
+    model = make_model(TARGET, scenario="missed-detections", horizon=30)
     maker = baselines_of(TARGET).estimators["unscented-turn"]
-    run = [(e.measurement, e.filter) for e, _ in rollout(task, maker, episode_seeds("test", 5, 8))]
+    run = [(e.measurement, e.filter) for e, _ in rollout(model, maker, episode_seeds("test", 5, 8))]
     seen = missed = 0
     for measurement, state in run:
         for lane in range(8):
@@ -142,13 +142,13 @@ def test_log_likelihood_is_the_density_of_every_measurement_as_it_was_predicted(
 
 def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_arrived():
     id = "filtergym/UavAutopilot-v0"
-    task = make_task(id, "gain", "random", horizon=400, dropout_period=60, dropout_length=(10, 30))
-    lanes = start_lanes(task, episode_seeds("test", 2, 8))
-    bank, R, counts = task.bank, np.diag(task.sensor_variances), set()
+    model = make_model(id, "gain", "random", horizon=400, dropout_period=60, dropout_length=(10, 30))
+    lanes = start_lanes(model, episode_seeds("test", 2, 8))
+    bank, R, counts = model.filter, np.diag(model.task.sensor_variances), set()
     for _ in range(lanes.decisions_per_episode):
         state, measurement = lanes.state.filter, lanes.state.measurement
         P = packed_covariance.unpack(
-            state.covariance + state.scale * bank.process_noise, len(task.components)
+            state.covariance + state.scale * bank.process_noise, len(model.task.components)
         )
         told = bank.records(state, measurement)["log_likelihood"]
         for lane in range(8):
@@ -157,7 +157,7 @@ def test_log_likelihood_of_the_autopilots_filter_is_that_of_the_readings_that_ar
             if not len(there):
                 assert math.isnan(told[lane])
                 continue
-            rows = [task.measured[k] for k in there]
+            rows = [model.task.measured[k] for k in there]
             S = P[np.ix_(rows, rows)][..., lane] + R[np.ix_(there, there)]
             innovation = measurement.reading[there, lane] - state.mean[rows, lane]
             # Sums and roots of a few numbers: 1e-12 of their size.
@@ -256,13 +256,13 @@ def test_faults_are_those_of_eigenvalues():
 
 
 def test_something_is_lacking_where_a_number_of_a_measurement_is_nan():
-    task = make_task(TARGET, scenario="missed-detections", horizon=30)
-    for episode, _ in rollout(task, Kalman, range(8)):
-        received = task.world.received(episode.measurement)
+    model = make_model(TARGET, scenario="missed-detections", horizon=30)
+    for episode, _ in rollout(model, Kalman, range(8)):
+        received = model.task.world.received(episode.measurement)
         np.testing.assert_array_equal(is_lacking(received, np), episode.measurement.available == 0.0)
 
 
 def test_a_compiled_filter_is_kept_for_the_next_chunk_of_episodes():
-    task = task_on("compiled", TARGET)
-    first, second = (put_in_loop(task, Kalman, "estimator", "mine", 8) for _ in range(2))
+    model = make_model(TARGET, backend="compiled")
+    first, second = (put_in_loop(model, Kalman, "estimator", "mine", 8) for _ in range(2))
     assert first.programs is second.programs

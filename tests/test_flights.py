@@ -14,13 +14,13 @@ import pymap3d
 import pytest
 import xarray
 from filtergym.envs import flight_tables
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.flight_cleaning import smoothed
 from filtergym.envs.flights import read_flights
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import flight_records
 from filtergym.filters.geodesy import east_north
 from gymnasium.vector import AutoresetMode
+from models import make_model
 
 from filtergym import Flights, Trajectory, evaluate, make_policy, tidy_records
 from filtergym.__main__ import main
@@ -177,7 +177,7 @@ def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
     with pytest.raises(
         ValueError, match="is not installed; its samples need nothing else: pip install --no-deps"
     ):
-        make_task(ID, scenario="traffic:quickstart")
+        make_model(ID, scenario="traffic:quickstart")
     folder = tmp_path / "traffic" / "data" / "samples" / "collections"
     folder.mkdir(parents=True)
     (tmp_path / "traffic" / "__init__.py").write_text("raise ImportError('of a long chain of libraries')")
@@ -198,7 +198,7 @@ def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
     expected = east_north(np.radians(latitude), np.radians(longitude), height, origin).T
     np.testing.assert_allclose(found.trajectories[0].position, expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.diff(found.trajectories[0].time), 5.0, rtol=1e-9)
-    assert make_task(ID, scenario="traffic:quickstart").parameters.flight == "track"
+    assert make_model(ID, scenario="traffic:quickstart").task.parameters.flight == "track"
     with pytest.raises(
         ValueError, match="the package traffic has no sample 'quikstart': did you mean quickstart"
     ):
@@ -337,7 +337,7 @@ WRONG = {
 def test_a_wrong_file_is_refused_in_one_sentence(columns, message, tmp_path):
     file = table(tmp_path / "wrong.csv", **columns)
     with pytest.raises(ValueError, match=message) as told:
-        make_task(ID, scenario=file)
+        make_model(ID, scenario=file)
     assert "wrong.csv" in str(told.value)
     assert "\n" not in str(told.value)
 
@@ -419,13 +419,13 @@ def test_wrong_limits_are_refused(keywords, message, tmp_path):
 )
 def test_what_is_no_set_is_refused(source, message):
     with pytest.raises(ValueError, match=message):
-        make_task(ID, scenario=source)
+        make_model(ID, scenario=source)
 
 
 def test_environments_without_flights_say_so(tmp_path):
     flight_file(tmp_path / "a.csv")
     with pytest.raises(ValueError, match="RadarEsmTracking-v0 does not take flights as scenario"):
-        make_task("RadarEsmTracking", scenario=tmp_path)
+        make_model("RadarEsmTracking", scenario=tmp_path)
 
 
 def test_broken_files_are_left_out_and_named_and_a_set_of_them_is_refused(tmp_path):
@@ -448,24 +448,25 @@ def test_broken_files_are_left_out_and_named_and_a_set_of_them_is_refused(tmp_pa
 
 
 def test_the_table_of_flights_is_every_flight_on_its_own():
-    task = make_task(ID, scenario=three())
-    alone = [make_task(ID, scenario=flight) for flight in three()]
-    assert task.flights == tuple(one.horizon for one in alone) == (32, 16, 24)
-    assert task.horizon == 32
+    model = make_model(ID, scenario=three())
+    alone = [make_model(ID, scenario=flight) for flight in three()]
+    assert model.task.flights == tuple(one.task.horizon for one in alone) == (32, 16, 24)
+    assert model.task.horizon == 32
     drawn = np.array([[0.0, 0.34, 0.67, 0.999, 0.33, 0.66, 0.5, 0.1]])
-    np.testing.assert_array_equal(task.lengths(drawn), [32, 16, 24, 24, 32, 16, 16, 32])
+    np.testing.assert_array_equal(model.task.lengths(drawn), [32, 16, 24, 24, 32, 16, 16, 32])
     nothing = np.zeros((4, 8))
-    episode = task.begin(drawn, nothing)
+    episode = model.begin(drawn, nothing)
     singles = [one.begin(np.empty((0, 8)), nothing) for one in alone]
     for _ in range(16):
-        for lane, flight in enumerate(task.flight_of(drawn)):
+        for lane, flight in enumerate(model.task.flight_of(drawn)):
             np.testing.assert_array_equal(
-                task.world.state(episode.truth)[:, lane], task.world.state(singles[flight].truth)[:, 0]
+                model.task.world.state(episode.truth)[:, lane],
+                model.task.world.state(singles[flight].truth)[:, 0],
             )
         noise = np.zeros((2, 8))
-        episode = task.measure(episode, noise)
+        episode = model.measure(episode, noise)
         singles = [one.measure(single, noise) for one, single in zip(alone, singles, strict=True)]
-    np.testing.assert_array_equal(task.context(episode)["flight"], [0, 1, 2, 2, 0, 1, 1, 0])
+    np.testing.assert_array_equal(model.context(episode)["flight"], [0, 1, 2, 2, 0, 1, 1, 0])
 
 
 @pytest.mark.parametrize("backend", ["compiled", "numpy"])
@@ -565,21 +566,21 @@ def test_flights_of_the_same_name_are_not_pieces_of_one():
 
 def test_one_flight_of_a_file_is_the_trajectory_itself(tmp_path):
     flight_file(tmp_path / "one.csv")
-    task = make_task(ID, scenario=tmp_path / "one.csv")
-    assert task.parameters == make_task(ID, scenario=Trajectory(FIVE, weave(FIVE))).parameters
+    model = make_model(ID, scenario=tmp_path / "one.csv")
+    assert model.task.parameters == make_model(ID, scenario=Trajectory(FIVE, weave(FIVE))).task.parameters
 
 
 def test_a_horizon_ends_every_flight_and_decisions_that_hold_fit():
-    assert make_task(ID, scenario=three(), horizon=20).flights == (20, 16, 20)
-    assert make_task(ID, scenario=three(), horizon=50).flights == (32, 16, 24)
-    assert make_task(ID, scenario=three(), decision_interval=5, horizon=30).flights == (30, 15, 20)
-    assert make_task(ID, scenario=three(), sampling_interval=4.0).flights == (48, 25, 36)
+    assert make_model(ID, scenario=three(), horizon=20).task.flights == (20, 16, 20)
+    assert make_model(ID, scenario=three(), horizon=50).task.flights == (32, 16, 24)
+    assert make_model(ID, scenario=three(), decision_interval=5, horizon=30).task.flights == (30, 15, 20)
+    assert make_model(ID, scenario=three(), sampling_interval=4.0).task.flights == (48, 25, 36)
 
 
 def test_too_many_scans_are_refused(monkeypatch):
     monkeypatch.setattr("filtergym.envs.maneuvering_target.task.MOST_SCANS", 71)
     with pytest.raises(ValueError, match="have 72 scans of 6 s together, more than 71: fly fewer"):
-        make_task(ID, scenario=three())
+        make_model(ID, scenario=three())
 
 
 def test_a_set_survives_json_and_a_reset_names_one(tmp_path):

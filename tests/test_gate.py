@@ -17,8 +17,8 @@ from filtergym.baselines.alarm import LARGER, Alarm, InnovationAlarm, scale_rati
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.envs import registration
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.competitors import ConstantPolicy, Policy
+from models import make_model
 from scipy.stats import norm
 
 from filtergym import evaluate, make_policy
@@ -52,9 +52,9 @@ class Constant(ConstantPolicy):
 
 
 def test_gate_is_open_for_a_window_and_the_policy_remembers_what_it_was_not_asked_for():
-    task = make_task(ID, "gain")
-    policy = Gated(task, Counting, alarm=Scripted, fallback=Constant)
-    shown = np.zeros((12, 2, len(task.fields)))
+    model = make_model(ID, "gain")
+    policy = Gated(model, Counting, alarm=Scripted, fallback=Constant)
+    shown = np.zeros((12, 2, len(model.fields)))
     shown[[2, 4], 0, 0] = shown[6, 1, 0] = 2.0
     start = np.zeros((12, 2), dtype=bool)
     start[0] = start[8, 1] = True
@@ -165,13 +165,13 @@ def test_smaller_noise_is_wrong_too():
     env = gymnasium.make_vec(
         "filtergym/LooselyCoupledNavigation-v0", num_envs=8, scenario="paper", horizon=150
     )
-    task = env.unwrapped.task
+    model = env.unwrapped.model
     first, _ = env.reset(seed=0)
     zero = np.zeros((8, 3))
     shown = np.stack([first, *(env.step(zero)[0] for _ in range(149))])
-    alarm = baselines_of(task.id).alarm(task)
+    alarm = baselines_of(model.task.id).alarm(model)
     assert not heard(alarm, shown).any()
-    (column,) = task.columns(["innovation_over_sigma"])
+    (column,) = model.columns(["innovation_over_sigma"])
     innovation = shown[..., column]
     shown[..., column] = np.sign(innovation) * np.log1p(np.expm1(np.abs(innovation)) / 3.0)
     assert heard(alarm, shown)[100:].any(axis=0).all()
@@ -179,8 +179,8 @@ def test_smaller_noise_is_wrong_too():
 
 def test_every_alarm_serves_every_control(env_id, control, short):
     """Of every environment; it speaks or not, but answers what it should."""
-    task = make_task(env_id, control, **short)
-    alarm = (baselines_of(env_id).alarm or InnovationAlarm)(task)
+    model = make_model(env_id, control, **short)
+    alarm = (baselines_of(env_id).alarm or InnovationAlarm)(model)
     env = gymnasium.make_vec(env_id, num_envs=3, control=control, backend="numpy", **short)
     shown, _ = env.reset(seed=0)
     memory, start = None, np.ones(3, dtype=bool)
@@ -218,13 +218,13 @@ def test_gates_that_cannot_be():
     ):
         evaluate(ID, ["gated:hard-imm"], episodes=1)
     with pytest.raises(ValueError, match="fallback is made for control 'gain', but the task has 'gains'"):
-        Gate(make_task(ID, "gains"), fallback=Constant)
+        Gate(make_model(ID, "gains"), fallback=Constant)
     with pytest.raises(ValueError, match="policy is made for control 'gain', but the task has 'gains'"):
-        Gated(make_task(ID, "gains"), Constant)
+        Gated(make_model(ID, "gains"), Constant)
     with pytest.raises(ValueError, match="window must be at least one decision, got 0"):
-        Gate(make_task(ID, "gain"), window=0)
+        Gate(make_model(ID, "gain"), window=0)
     with pytest.raises(ValueError, match="shows no 'innovation' under control 'gains'"):
-        InnovationAlarm(make_task(ID, "gains"))
+        InnovationAlarm(make_model(ID, "gains"))
 
 
 @pytest.fixture
@@ -241,12 +241,12 @@ def pendulum():
 
 
 def test_an_environment_of_ones_own_has_the_general_alarm_or_brings_one(pendulum):
-    task = make_task(pendulum)
-    assert type(Gate(task).alarm) is InnovationAlarm
+    model = make_model(pendulum)
+    assert type(Gate(model).alarm) is InnovationAlarm
     baselines.ADDED[pendulum] = dataclasses.replace(baselines_of(pendulum), alarm=Scripted)
-    assert type(Gate(task).alarm) is Scripted
-    assert Gate(task).window == 3
-    assert Gate(task, alarm=InnovationAlarm).window == InnovationAlarm.window
+    assert type(Gate(model).alarm) is Scripted
+    assert Gate(model).window == 3
+    assert Gate(model, alarm=InnovationAlarm).window == InnovationAlarm.window
 
 
 # --- in training
@@ -255,21 +255,21 @@ def test_an_environment_of_ones_own_has_the_general_alarm_or_brings_one(pendulum
 def native(**keywords):
     from filtergym.agents import to_sb3
 
-    task = make_task(ID, "gain")
+    model = make_model(ID, "gain")
     env = gymnasium.make_vec(ID, num_envs=5, autoreset_mode="SameStep", control="gain", horizon=30)
     made = to_sb3(env, staggered=True, **keywords)
     made.seed(0)
-    return made, task
+    return made, model
 
 
 def test_the_adapter_asks_the_gate_as_the_policy_does():
     pytest.importorskip("stable_baselines3")
-    inside, task = native(gate=Gate(make_task(ID, "gain"), Constant))
+    inside, model = native(gate=Gate(make_model(ID, "gain"), Constant))
     outside, _ = native()
-    policy = Gated(task, Counting, fallback=Constant)
+    policy = Gated(model, Counting, fallback=Constant)
     shown = inside.reset()
     np.testing.assert_array_equal(outside.reset(), shown)
-    agent, memory, state, start = Counting(task), None, None, np.ones(5, dtype=bool)
+    agent, memory, state, start = Counting(model), None, None, np.ones(5, dtype=bool)
     for step in range(70):
         raw, memory = agent.predict(shown, memory, start)
         action, state = policy.predict(shown, state, start)
@@ -278,7 +278,7 @@ def test_the_adapter_asks_the_gate_as_the_policy_does():
             np.testing.assert_array_equal(mine, theirs)
         if step == 40:
             kept = pickle.dumps(inside.snapshot())
-            inside, _ = native(gate=Gate(task, Constant))
+            inside, _ = native(gate=Gate(model, Constant))
             inside.restore(pickle.loads(kept))
         shown, start = one[0], one[2]
 
@@ -386,7 +386,7 @@ def test_gradient_through_the_gate_is_that_of_torch():
     keywords = {"control": "gain", "horizon": 12, "reward": "cost", "autoreset_mode": "Disabled"}
     envs = [TaskVectorEnv(ID, 6, backend=backend, **keywords) for backend in ("torch", "compiled")]
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(envs[0].task.fields), envs[0].task.action_space, 4).double()
+    policy = RecurrentPolicy(len(envs[0].model.fields), envs[0].model.action_space, 4).double()
     policy.low, policy.high = policy.low.double(), policy.high.double()
     found = []
 
@@ -394,7 +394,7 @@ def test_gradient_through_the_gate_is_that_of_torch():
         found.append(torch.cat([part.grad.ravel() for part in policy.parameters()]))
         policy.zero_grad()
 
-    gates = [Gate(env.task, Constant, window=2) for env in envs]
+    gates = [Gate(env.model, Constant, window=2) for env in envs]
     for env in envs:
         env.reset(seed=0)
     costs = [

@@ -17,7 +17,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
+from models import make_model
 from rounding import REPETITIONS, assert_near, move_roundings, moved_parameters, tolerance
 
 FOLDER = Path(__file__).parent / "golden"
@@ -64,7 +65,7 @@ def trajectory(env_id, control, actions, backend="numpy"):
 def tolerances(env_id, control):
     """What rounding may do to the trajectory, that of the constants which follow from the parameters included."""
     actions = stored(env_id, control)["actions"]
-    parameters = make_task(env_id, control).parameters
+    parameters = make_model(env_id, control).task.parameters
     found = {"observations": [], "rewards": []}
     for repetition in REPETITIONS:
         keywords = moved_parameters(parameters, repetition)

@@ -104,7 +104,7 @@ def test_nothing_flows_back_to_a_place_in_a_table():
 
 def random_policy(env, dtype):
     torch.manual_seed(0)
-    policy = RecurrentPolicy(len(env.task.fields), env.task.action_space, 6).to(dtype)
+    policy = RecurrentPolicy(len(env.model.fields), env.model.action_space, 6).to(dtype)
     with torch.no_grad():
         policy.head.weight.mul_(10.0)
         policy.head.bias.normal_(0.0, 0.3)

@@ -7,12 +7,13 @@ import pytest
 from filtergym.agents.learned_estimator import EstimatorMaker
 from filtergym.agents.learned_policy import LearnedPolicy, load_policy, write_arrays
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.draws import Draws
 from filtergym.envs.maneuvering_target import kalman_net as radar
-from filtergym.envs.task import Episode
+from filtergym.envs.model import Episode
 from filtergym.evaluation.competitors import kind_of
 from filtergym.filters import coordinated_turn, kalman, loosely_coupled
+from models import make_model
 
 import filtergym
 
@@ -21,9 +22,9 @@ NAME = "kalman-net"
 HAVING = [id for id, cls in catalogue().items() if NAME in cls.trained_banks]
 
 
-def network(task, answer=0.0):
+def network(model, answer=0.0):
     """A network that always answers the same, or with arrays of random weights."""
-    fields, count = len(task.fields), task.action_space.shape[0]
+    fields, count = len(model.fields), model.action_space.shape[0]
     rng = np.random.default_rng(5)
     random = answer == "random"
     arrays = {
@@ -36,21 +37,24 @@ def network(task, answer=0.0):
         "weight_0": (rng.normal(0.0, 0.5, (count, 4)) * random).astype(np.float32),
         "bias_0": np.full(count, 0.0 if random else np.arctanh(answer), np.float32),
     }
-    return LearnedPolicy(task, arrays, "tanh")
+    return LearnedPolicy(model, arrays, "tanh")
 
 
 def episodes(id, count, steps, **keywords):
     """Initial, and the measurements of episodes of the training distribution."""
-    task = make_task(id, NAME, **keywords)
+    model = make_model(id, NAME, **keywords)
     rng = np.random.default_rng(2)
-    draws = Draws(rng.random((task.noise.uniforms, count)), np)
-    truth, initial = task.world.begin(draws, rng.normal(size=(task.noise.initial_normals, count)))
+    draws = Draws(rng.random((model.task.noise.uniforms, count)), np)
+    truth, initial = model.task.world.begin(draws, rng.normal(size=(model.task.noise.initial_normals, count)))
     found = []
     for _ in range(steps):
-        noise = rng.normal(size=(task.noise.normals, count)), rng.random((task.noise.row_uniforms, count))
-        truth, measurement = task.world.advance(truth, np.concatenate(noise), None)
+        noise = (
+            rng.normal(size=(model.task.noise.normals, count)),
+            rng.random((model.task.noise.row_uniforms, count)),
+        )
+        truth, measurement = model.task.world.advance(truth, np.concatenate(noise), None)
         found.append(measurement)
-    return task, initial, found
+    return model, initial, found
 
 
 def test_who_has_one():
@@ -58,9 +62,9 @@ def test_who_has_one():
 
 
 def test_of_a_radar_zero_answers_are_a_kalman_filter():
-    task, initial, measurements = episodes(RADAR, 8, 60, undisturbed=0.0)
+    model, initial, measurements = episodes(RADAR, 8, 60, undisturbed=0.0)
     assert 0.0 < np.mean([m.available for m in measurements]) < 1.0
-    estimator = EstimatorMaker(NAME, network)(task)
+    estimator = EstimatorMaker(NAME, network)(model.task)
     memory = estimator.start(initial, 8)
     H = np.eye(2, 4)
     mean, P = [initial.mean[:, i] for i in range(8)], [initial.covariance[:, :, i] for i in range(8)]
@@ -89,8 +93,8 @@ def test_of_an_ins_zero_answers_are_the_augmented_filter():
 
 def test_of_a_radar_any_answer_is_what_the_description_says():
     """The equations at the head of the module, one lane after the other, with matrices of NumPy."""
-    task, initial, measurements = episodes(RADAR, 16, 3)
-    rng, bank = np.random.default_rng(0), task.bank
+    model, initial, measurements = episodes(RADAR, 16, 3)
+    rng, bank = np.random.default_rng(0), model.filter
     state = bank.start(initial)
     for measurement in measurements:
         before, state = state, bank.predict(state, measurement)
@@ -142,7 +146,7 @@ def test_covariance_of_the_augmented_filter_under_any_gain_is_josephs():
 @pytest.mark.parametrize("answer", [-0.999, 0.999, "random"])
 def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, answer):
     """An evaluation refuses what is not finite, symmetric and positive definite."""
-    maker = EstimatorMaker(NAME, lambda task: network(task, answer))
+    maker = EstimatorMaker(NAME, lambda model: network(model, answer))
     cost = filtergym.evaluate(id, {"net": maker}, episodes=16)["cost"]
     assert float(cost.max()) < 1e6
 
@@ -150,28 +154,28 @@ def test_whatever_the_network_answers_the_filter_reports_a_covariance(id, answer
 @pytest.mark.parametrize("id", HAVING)
 def test_the_estimator_is_the_policy_in_its_bank(id):
     """What is trained in the environment is what is evaluated outside of it."""
-    task, initial, measurements = episodes(id, 8, 40)
+    model, initial, measurements = episodes(id, 8, 40)
     estimator, policy = (
-        EstimatorMaker(NAME, lambda task: network(task, "random"))(task),
-        network(task, "random"),
+        EstimatorMaker(NAME, lambda model: network(model, "random"))(model.task),
+        network(model, "random"),
     )
-    memory, state, hidden = estimator.start(initial, 8), task.bank.start(initial), None
+    memory, state, hidden = estimator.start(initial, 8), model.filter.start(initial), None
     for measurement in measurements:
         mean, covariance, memory = estimator.update(measurement, memory)
-        episode = Episode(None, measurement, task.bank.predict(state, measurement))
-        action, hidden = policy.predict(task.observe(episode).T, hidden)
-        state = task.act(episode, action.T.astype(float)).filter
-        np.testing.assert_array_equal(mean, task.bank.mean(state))
-        np.testing.assert_array_equal(covariance, task.bank.covariance(state))
+        episode = Episode(None, measurement, model.filter.predict(state, measurement))
+        action, hidden = policy.predict(model.observe(episode).T, hidden)
+        state = model.act(episode, action.T.astype(float)).filter
+        np.testing.assert_array_equal(mean, model.filter.mean(state))
+        np.testing.assert_array_equal(covariance, model.filter.covariance(state))
 
 
 @pytest.fixture
 def stored(tmp_path):
     from filtergym.agents.training_run import RunOptions, new_run
 
-    task = make_task(RADAR, NAME)
+    model = make_model(RADAR, NAME)
     path = tmp_path / "net.safetensors"
-    write_arrays(path, network(task, 0.3).arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
+    write_arrays(path, network(model, 0.3).arrays, new_run(problem_of(RADAR), RunOptions(NAME)), "tanh")
     return path
 
 

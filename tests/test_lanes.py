@@ -1,9 +1,9 @@
 """The engine's noise, beside its code: every measurement takes the next row of its episode, also across blocks."""
 
 import numpy as np
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.noise_ring import BLOCK, LONGEST_BLOCK
+from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 
@@ -20,19 +20,19 @@ def naive_rows(seed, noise, rows):
 def test_long_episodes_take_one_row_after_another(monkeypatch):
     horizon = LONGEST_BLOCK + 10
     scans = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
-    task = make_task(ID, "gain", horizon=horizon, **scans)
-    assert task.noise.row_uniforms == 0
+    model = make_model(ID, "gain", horizon=horizon, **scans)
+    assert model.task.noise.row_uniforms == 0
     taken = []
-    measure = task.measure
+    measure = model.measure
     monkeypatch.setattr(
-        task, "measure", lambda state, row: (taken.append(row.copy()), measure(state, row))[1]
+        model, "measure", lambda state, row: (taken.append(row.copy()), measure(state, row))[1]
     )
-    lanes = Lanes(task, 2)
+    lanes = Lanes(model, 2)
     for lane in range(2):
         lanes.seed(lane, np.random.default_rng(10 + lane))
     lanes.restart()
     for _ in range(3 * BLOCK):
         lanes.decide(np.zeros((2, 1)))
     for lane in range(2):
-        expected = naive_rows(10 + lane, task.noise, 3 * BLOCK + 1)
+        expected = naive_rows(10 + lane, model.task.noise, 3 * BLOCK + 1)
         np.testing.assert_array_equal(np.array(taken)[:, :, lane], expected)

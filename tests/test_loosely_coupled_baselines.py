@@ -10,13 +10,13 @@ from filtergym.baselines.loosely_coupled_navigation.estimators import AugmentedE
 from filtergym.baselines.loosely_coupled_navigation.policies import recovery_times
 from filtergym.baselines.loosely_coupled_navigation.references import Matched
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.schedules import within
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import kalman_bucy, loosely_coupled
 from filtergym.filters.linear_systems import van_loan
 from filtergym.papers.kalman_bucy_ins_gnss import experiment
+from models import make_model
 
 import filtergym  # noqa: F401  # registers the environments
 from filtergym import evaluate, tidy_records
@@ -47,8 +47,8 @@ def on_paper():
 def steered(name, scenario, seeds, **keywords):
     """States after every action of a policy or reference, one list."""
     maker = competitor(ID, name)
-    task = make_task(ID, getattr(maker, "control", None), scenario, **keywords)
-    return task, [state for state, _ in rollout(task, maker, seeds)]
+    model = make_model(ID, getattr(maker, "control", None), scenario, **keywords)
+    return model, [state for state, _ in rollout(model, maker, seeds)]
 
 
 # --- errors
@@ -110,8 +110,8 @@ def test_the_covariance_is_that_of_the_gain_in_use_where_the_noises_are_as_model
 
 @pytest.mark.parametrize("scenario", ["random", "quiet", "jamming", "outage", "spoof-ramp"])
 def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
-    task = make_task(ID, "gain", scenario)
-    matched, s, found = Matched(task), task.parameters.sampling, []
+    model = make_model(ID, "gain", scenario)
+    matched, s, found = Matched(model.task), model.task.parameters.sampling, []
 
     class Watched:
         start = matched.start
@@ -127,7 +127,7 @@ def test_innovations_of_matched_are_white_and_of_the_size_it_says(scenario):
             return matched.update(measurement, truth, memory)
 
     runs = 400
-    for _ in rollout(task, Watched(), episode_seeds("test", 2, runs), kind="reference"):
+    for _ in rollout(model, Watched(), episode_seeds("test", 2, runs), kind="reference"):
         pass
     normalised = np.stack(found, axis=1)
     nis = np.nanmean(normalised**2, axis=1)
@@ -147,8 +147,8 @@ def test_matched_equals_a_naive_filter_told_the_truth():
         "change_start": (0.1, 1.8), "horizon": 200,
     }  # fmt: skip
     seeds = [5, 6, 7]
-    task, states = steered("matched", "random", seeds, **keywords)
-    s = task.parameters.sampling
+    model, states = steered("matched", "random", seeds, **keywords)
+    s = model.task.parameters.sampling
     for lane in range(len(seeds)):
         first = states[0].truth
         sigma = first.coloured_step[lane] / s.coloured
@@ -231,7 +231,7 @@ def test_policies_forget_at_the_start_of_an_episode():
     for name in ("time-varying", "innovation-adaptive", "augmented-gain"):
         maker = competitor(ID, name)
         env = gym.make(ID, control="gain")
-        policy = maker(env.unwrapped.task)
+        policy = maker(env.unwrapped.model)
         shown = [env.reset(seed=4)[0], *(env.step(np.array([0.4]))[0] for _ in range(20))]
         memory, fresh_memory, both = None, None, [np.stack([o, o]) for o in shown]
         for observation in both:
@@ -378,9 +378,9 @@ def test_estimated_noise_survives_jamming():
 
 def test_a_new_report_is_believed():
     """A receiver that says of itself that it has become better is used so at once."""
-    task = make_task(ID, "gain", "paper")
+    model = make_model(ID, "gain", "paper")
     for rule in RULES:
-        found = competitor(ID, f"augmented-{rule}")(task).filter
+        found = competitor(ID, f"augmented-{rule}")(model.task).filter
         none = np.zeros((1, 8))
         memory = found.start(none)
         for variance in (2.0, 0.2):

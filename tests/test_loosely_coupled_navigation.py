@@ -5,40 +5,41 @@ from collections import deque
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.draws import Draws
 from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
 from filtergym.envs.loosely_coupled_navigation.task import TASK
+from filtergym.envs.model import Model
 from filtergym.filters import kalman_bucy, linear_systems, loosely_coupled
+from models import make_model
 
 PAPER = LooselyCoupledNavigationParameters()
 MODEL = (*loosely_coupled.error_model(0.6, 0.4, 1.0, 0.04)[:2], [[1.0, 0, 0]], [[0.02]])
 START = np.diag([0.0, 0.36, 0.16])
 
 
-def make(scenario, control="gain", xp=np, **keywords):
+def make(scenario, control="gain", xp=np, **keywords) -> Model:
     values = {**TASK.scenarios[scenario].parameters, **keywords}
-    return TASK(TASK.Parameters(**values), control, xp)
+    return Model(TASK(TASK.Parameters(**values), xp), control)
 
 
-def numbers(task, lanes, steps, seed):
+def numbers(model, lanes, steps, seed):
     """What an episode draws: uniforms, initial normals, and a list of rows."""
     rng = np.random.default_rng(seed)
-    rows = task.noise.normals + task.noise.row_uniforms
+    rows = model.task.noise.normals + model.task.noise.row_uniforms
     return (
-        rng.random((task.noise.uniforms, lanes)),
-        rng.standard_normal((task.noise.initial_normals, lanes)),
+        rng.random((model.task.noise.uniforms, lanes)),
+        rng.standard_normal((model.task.noise.initial_normals, lanes)),
         [rng.standard_normal((rows, lanes)) for _ in range(steps)],
     )
 
 
-def states(task, drawn, policy):
+def states(model, drawn, policy):
     """Drive the task; yield the state after each measurement and the state after each action."""
     uniforms, normals, rows = drawn
-    state = task.begin(uniforms, normals)
+    state = model.begin(uniforms, normals)
     for k, row in enumerate(rows):
-        seen = task.measure(state, row)
-        state = task.act(seen, policy(k, seen))
+        seen = model.measure(state, row)
+        state = model.act(seen, policy(k, seen))
         yield seen, state
 
 
@@ -54,18 +55,18 @@ def chosen(condition, one, other):
     return np.where(condition, one, other)
 
 
-def constant(task, action, lanes):
-    if task.control == "mode":
+def constant(model, action, lanes):
+    if model.control == "mode":
         return lambda k, seen: np.full(lanes, action)
-    return lambda k, seen: np.full((task.action_space.shape[0], lanes), action)
+    return lambda k, seen: np.full((model.action_space.shape[0], lanes), action)
 
 
-def random_actions(task, lanes, steps, seed):
+def random_actions(model, lanes, steps, seed):
     rng = np.random.default_rng([seed, 1])
-    if task.control == "mode":
+    if model.control == "mode":
         return rng.integers(0, 3, (steps, lanes))
-    low = 0.0 if task.control == "weights" else -1.2
-    return rng.uniform(low, 1.2, (steps, task.action_space.shape[0], lanes))
+    low = 0.0 if model.control == "weights" else -1.2
+    return rng.uniform(low, 1.2, (steps, model.action_space.shape[0], lanes))
 
 
 # --- The reference table ---------------------------------------------------------------------------------
@@ -104,14 +105,16 @@ def fixed_gain_root_mean_square(gain=None):
 )
 def test_reference_table(control, action, printed, theory):
     runs = 4000
-    task = make("paper", control)
+    model = make("paper", control)
     if control == "gain":
-        action = float(task.bank.action_for_gain(action))
+        action = float(model.filter.action_for_gain(action))
     squares, nees, nis = np.zeros(runs), np.zeros(runs), np.zeros(runs)
-    for k, (_, state) in enumerate(states(task, numbers(task, runs, 500, 3), constant(task, action, runs))):
+    for k, (_, state) in enumerate(
+        states(model, numbers(model, runs, 500, 3), constant(model, action, runs))
+    ):
         if k >= 249:
-            squares += task.error(state)[0] ** 2
-            nis += task.records(state)["nis"]
+            squares += model.error(state)[0] ** 2
+            nis += model.records(state)["nis"]
             if (control, action) == ("mode", 2):
                 nees += augmented_nees(state)
     # Half a unit of the last digit that the table prints, and a little.
@@ -168,10 +171,10 @@ def test_attenuation_follows_from_the_moments(K):
 def test_the_plain_scheme_attenuates_a_constant_and_the_augmented_one_removes_it():
     runs, means = 3000, []
     for control, action in (("gain", *TASK.paper_policy.action), ("mode", 2)):
-        task = make("paper", control, fixed_drift=1.0, horizon=2000)
-        run = states(task, numbers(task, runs, 2000, 5), constant(task, action, runs))
+        model = make("paper", control, fixed_drift=1.0, horizon=2000)
+        run = states(model, numbers(model, runs, 2000, 5), constant(model, action, runs))
         _, state = deque(run, maxlen=1).pop()
-        means.append(task.error(state)[0])
+        means.append(model.error(state)[0])
     K = loosely_coupled.settled_gain(0.0036, 2.0)
     standard_error = [m.std() / math.sqrt(runs) for m in means]
     # The sampled scheme settles at beta step (1 - gain) / gain, close to beta / K = 0.236.
@@ -188,9 +191,9 @@ def test_the_plain_scheme_attenuates_a_constant_and_the_augmented_one_removes_it
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bank_equals_naive_filters(seed):
     lanes, steps = 4, 300
-    task = make("random", "weights", axes=2, noise_changes=(2, 2), outage_probability=1.0)
-    drawn, actions = numbers(task, lanes, steps, seed), random_actions(task, lanes, steps, seed)
-    run = list(states(task, drawn, lambda k, seen: actions[k]))
+    model = make("random", "weights", axes=2, noise_changes=(2, 2), outage_probability=1.0)
+    drawn, actions = numbers(model, lanes, steps, seed), random_actions(model, lanes, steps, seed)
+    run = list(states(model, drawn, lambda k, seen: actions[k]))
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     for lane in range(lanes):
         for axis in range(2):
@@ -219,9 +222,9 @@ def test_the_bank_equals_naive_filters(seed):
                 found = [*bank.plain_variance[:, 0, lane], bank.covariance.position[lane]]
                 np.testing.assert_allclose(found, variances, rtol=1e-10)
                 mean = weights @ expected
-                np.testing.assert_allclose(task.mean(state)[axis, lane], mean, atol=1e-11)
+                np.testing.assert_allclose(model.mean(state)[axis, lane], mean, atol=1e-11)
                 np.testing.assert_allclose(
-                    task.covariance(state)[axis, axis, lane],
+                    model.covariance(state)[axis, axis, lane],
                     weights @ (variances + (expected - mean) ** 2),
                     rtol=1e-8,
                 )
@@ -229,13 +232,13 @@ def test_the_bank_equals_naive_filters(seed):
 
 def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
     lanes, steps = 5, 200
-    task = make("random", outage_probability=1.0)
-    actions = random_actions(task, lanes, steps, 1)
+    model = make("random", outage_probability=1.0)
+    actions = random_actions(model, lanes, steps, 1)
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     settled = loosely_coupled.settled_gain(0.0036, 2.0)
     x, v, P = 0.0, 0.0, np.tile(START, (lanes, 1, 1))
     for k, (seen, state) in enumerate(
-        states(task, numbers(task, lanes, steps, 1), lambda k, seen: actions[k])
+        states(model, numbers(model, lanes, steps, 1), lambda k, seen: actions[k])
     ):
         a = np.clip(actions[k, 0], -1, 1)
         said = seen.measurement
@@ -245,29 +248,29 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         before = x + said.increment[0]
         x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
         v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
-        np.testing.assert_allclose(task.mean(state)[0], x, atol=1e-12)
+        np.testing.assert_allclose(model.mean(state)[0], x, atol=1e-12)
         rest = np.tile(np.eye(3), (lanes, 1, 1))
         rest[:, 0, 0] = 1 - gain
         P = rest @ (Phi @ P @ Phi.T + Qd) @ rest
         P[:, 0, 0] += gain**2 * said.reported_deviation**2
         # What the innovations are scaled by, and what is reported: rounding over 200 steps.
         np.testing.assert_allclose(state.filter.variance.assumed[0], v, rtol=1e-12)
-        np.testing.assert_allclose(task.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
-    drawn = numbers(task, lanes, steps, 2)
-    for _, state in states(task, drawn, constant(task, -1.0, lanes)):
-        np.testing.assert_array_equal(task.mean(state), state.measurement.ins)
-    for _, state in states(make("paper"), drawn, constant(task, 1.0, lanes)):
+        np.testing.assert_allclose(model.covariance(state)[0, 0], P[:, 0, 0], rtol=1e-10)
+    drawn = numbers(model, lanes, steps, 2)
+    for _, state in states(model, drawn, constant(model, -1.0, lanes)):
+        np.testing.assert_array_equal(model.mean(state), state.measurement.ins)
+    for _, state in states(make("paper"), drawn, constant(model, 1.0, lanes)):
         np.testing.assert_array_equal(state.filter.gain, 1.0)
-        np.testing.assert_allclose(task.mean(state), state.measurement.fix, atol=1e-15)
+        np.testing.assert_allclose(model.mean(state), state.measurement.fix, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_scaled_noises_are_those_of_a_textbook_filter(seed):
     """Van Loan's matrices of the scaled intensities in a plain filter of (delta, beta, eta)."""
     lanes, steps = 4, 200
-    task = make("random", "noise", axes=2, noise_changes=(2, 2), outage_probability=1.0)
-    drawn, actions = numbers(task, lanes, steps, seed), random_actions(task, lanes, steps, seed)
-    run = list(states(task, drawn, lambda k, seen: actions[k]))
+    model = make("random", "noise", axes=2, noise_changes=(2, 2), outage_probability=1.0)
+    drawn, actions = numbers(model, lanes, steps, seed), random_actions(model, lanes, steps, seed)
+    run = list(states(model, drawn, lambda k, seen: actions[k]))
     clipped = np.clip(actions, -1, 1)
     receiver = np.where(clipped[:, 0] > 0, 100.0 ** clipped[:, 0], 10.0 ** (0.5 * clipped[:, 0]))
     coloured, white = 10.0 ** clipped[:, 1], 10.0 ** clipped[:, 2]
@@ -297,24 +300,24 @@ def test_scaled_noises_are_those_of_a_textbook_filter(seed):
                 P = rest @ P @ rest.T + R * np.outer(K, K)
             bank = state.filter
             # Rounding over 200 steps of different but equal formulas.
-            np.testing.assert_allclose(task.mean(state)[:, lane], said.ins[:, lane] - error[0], atol=1e-11)
+            np.testing.assert_allclose(model.mean(state)[:, lane], said.ins[:, lane] - error[0], atol=1e-11)
             np.testing.assert_allclose([bank.drift[:, lane], bank.coloured[:, lane]], error[1:], atol=1e-11)
-            np.testing.assert_allclose(task.covariance(state)[..., lane], P[0, 0] * np.eye(2), rtol=1e-9)
+            np.testing.assert_allclose(model.covariance(state)[..., lane], P[0, 0] * np.eye(2), rtol=1e-9)
 
 
 def test_no_change_of_the_noises_is_the_paper_s_augmented_filter():
     lanes, steps = 6, 300
-    task, schemes = make("random", "noise"), make("random", "mode")
-    drawn = numbers(task, lanes, steps, 4)
+    model, schemes = make("random", "noise"), make("random", "mode")
+    drawn = numbers(model, lanes, steps, 4)
     for (seen, state), (also_seen, scheme) in zip(
-        states(task, drawn, constant(task, 0.0, lanes)),
+        states(model, drawn, constant(model, 0.0, lanes)),
         states(schemes, drawn, constant(schemes, 2, lanes)),
         strict=True,
     ):
         # The displacement's variance is taken apart and put together again: one rounding.
         for found, expected in (
-            (task.mean(state), schemes.mean(scheme)),
-            (task.covariance(state), schemes.covariance(scheme)),
+            (model.mean(state), schemes.mean(scheme)),
+            (model.covariance(state), schemes.covariance(scheme)),
             (seen.filter.seen.normalised, also_seen.filter.seen.normalised[2]),
             (state.filter.drift, scheme.filter.drift),
             (state.filter.coloured, scheme.filter.coloured),
@@ -323,8 +326,8 @@ def test_no_change_of_the_noises_is_the_paper_s_augmented_filter():
 
 
 def test_actions_and_gains_are_inverse():
-    task = make("paper")
-    bank = task.bank
+    model = make("paper")
+    bank = model.filter
     for gain in (0.0, 2e-5, 0.0032, 0.0415, 0.5, 1.0):
         assert float(bank.gain(bank.action_for_gain(gain))) == pytest.approx(gain, rel=1e-12)
     assert bank.gain(np.array(1.0)) == 1.0
@@ -336,7 +339,7 @@ def test_actions_and_gains_are_inverse():
     assert bank.gain(np.array(TASK.paper_policy.action[0])) == pytest.approx(settled, rel=1e-12)
     # Where the paper's gain lies at the edge of the range, zero keeps room on both sides.
     for keywords in ({"smallest_gain": 0.5}, {"receiver_intensity": 1e-9}):
-        edge = make("paper", **keywords).bank
+        edge = make("paper", **keywords).filter
         gains = edge.gain(np.linspace(-0.999, 1.0, 50))
         assert (np.diff(gains) > 0).all()
         np.testing.assert_allclose(edge.gain(edge.action_for_gain(gains)), gains, rtol=1e-10)
@@ -349,10 +352,10 @@ def signed_log(x):
 
 
 def test_averages_are_those_of_the_definition():
-    task = make("outage")
+    model = make("outage")
     weight = 1 - math.exp(-0.01 / 0.25)
     mean, square, product, last = 0.0, 1.0, 0.0, 0.0
-    for seen, _ in states(task, numbers(task, 1, 400, 4), constant(task, 0.4, 1)):
+    for seen, _ in states(model, numbers(model, 1, 400, 4), constant(model, 0.4, 1)):
         said, bank = seen.measurement, seen.filter
         if said.available[0]:
             n = bank.seen.innovation[0, 0] / math.sqrt(
@@ -362,7 +365,7 @@ def test_averages_are_those_of_the_definition():
             square += weight * (n * n - square)
             product += weight * (n * last - product)
             last = n
-        shown = task.observe(seen)[:, 0]
+        shown = model.observe(seen)[:, 0]
         expected = [signed_log(mean), math.log1p(square), signed_log(product)]
         np.testing.assert_allclose(shown[2:5], expected, rtol=1e-10, atol=1e-13)
         assert shown[0] == pytest.approx(signed_log(last) if said.available[0] else 0.0, rel=1e-12)
@@ -379,11 +382,13 @@ def test_disturbances_stand_where_they_are_drawn():
         "spoof-ramp": ("spoofing_start", "spoofing_duration"),
     }
     for name, (start, duration) in limits.items():
-        task = make(name)
-        uniforms, normals, rows = numbers(task, lanes, 500, 6)
+        model = make(name)
+        uniforms, normals, rows = numbers(model, lanes, 500, 6)
         rows = [0.0 * row for row in rows]
         drawn = {"outage": "outage", "jamming": "jamming", "spoof-ramp": "spoofing"}[name]
-        for k, (seen, _) in enumerate(states(task, (uniforms, normals, rows), constant(task, 0.0, lanes)), 1):
+        for k, (seen, _) in enumerate(
+            states(model, (uniforms, normals, rows), constant(model, 0.0, lanes)), 1
+        ):
             first, end = getattr(seen.truth, drawn)
             inside = (k >= first) & (k < end)
             said = seen.measurement
@@ -395,7 +400,7 @@ def test_disturbances_stand_where_they_are_drawn():
             fix = np.where(inside & (name == "outage"), 0.0, 2 * math.sin(0.008 * k) + pull)
             np.testing.assert_allclose(said.fix[0], fix, atol=1e-12)
         # One row of a hundredth of a second is the rounding of start and end.
-        p, windows = task.parameters, TASK.scenarios[name].windows
+        p, windows = model.task.parameters, TASK.scenarios[name].windows
         for seconds, (low, high) in ((first, getattr(p, start)), (end - first, getattr(p, duration))):
             assert low - 0.011 <= 0.01 * seconds.min()
             assert 0.01 * seconds.max() <= high + 0.011
@@ -407,8 +412,8 @@ def test_disturbances_stand_where_they_are_drawn():
 
 
 def test_random_draws_what_it_says_and_reports_half_of_the_changes():
-    task, lanes = make("random", undisturbed=0.0), 20000
-    state = task.begin(*numbers(task, lanes, 0, 8)[:2]).truth
+    model, lanes = make("random", undisturbed=0.0), 20000
+    state = model.begin(*numbers(model, lanes, 0, 8)[:2]).truth
     low, high = 10**-0.5, 10**0.5
     intensities = state.receiver_levels**2 / 2.0
     for lowest, drawn in ((0.05, state.drift_deviation / 0.6), *((low, values) for values in intensities)):
@@ -432,8 +437,8 @@ def test_random_draws_what_it_says_and_reports_half_of_the_changes():
 
 
 def test_nothing_befalls_one_of_six():
-    task, lanes = make("random"), 20000
-    state = task.begin(*numbers(task, lanes, 0, 8)[:2]).truth
+    model, lanes = make("random"), 20000
+    state = model.begin(*numbers(model, lanes, 0, 8)[:2]).truth
     calm = state.drift_deviation == 0.6
     assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / lanes)
     modelled = make("paper").begin(*numbers(make("paper"), 8, 0, 8)[:2]).truth
@@ -445,13 +450,13 @@ def test_nothing_befalls_one_of_six():
 
 
 def test_outliers_are_as_many_and_as_large_as_stated():
-    task, lanes = make("outliers", horizon=50), 4000
-    uniforms, normals, rows = numbers(task, lanes, 50, 8)
-    state = task.begin(uniforms, normals)
+    model, lanes = make("outliers", horizon=50), 4000
+    uniforms, normals, rows = numbers(model, lanes, 50, 8)
+    state = model.begin(uniforms, normals)
     seen, rng = [], np.random.default_rng(0)
     for row in rows:
         row[3] = rng.random(lanes)
-        state = task.measure(state, row)
+        state = model.measure(state, row)
         seen.append(state.truth.deviation)
         error = state.measurement.fix - state.truth.reference
         # The error is what is left of a position of 2 m.
@@ -464,9 +469,9 @@ def test_outliers_are_as_many_and_as_large_as_stated():
 
 def test_ins_noise_has_the_drawn_intensities():
     low = 10**-0.5
-    task = make("random", coloured_factor=(low, 1 / low), white_factor=(low, 1 / low), undisturbed=0.0)
-    state = task.begin(*numbers(task, 6, 0, 9)[:2]).truth
-    s = task.parameters.sampling
+    model = make("random", coloured_factor=(low, 1 / low), white_factor=(low, 1 / low), undisturbed=0.0)
+    state = model.begin(*numbers(model, 6, 0, 9)[:2]).truth
+    s = model.task.parameters.sampling
     for i in range(6):
         variance = (state.coloured_step[i] / s.coloured) ** 2
         q33 = state.coloured_step[i] ** 2
@@ -485,12 +490,12 @@ def test_ins_noise_has_the_drawn_intensities():
 
 
 def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
-    task = make("paper")
+    model = make("paper")
     # One lane for each source: beta, eta, the two noises; the step is linear in them.
     normals = np.array([[1.0, 0, 0, 0, 0], [0, 1, 0, 0, 0]])
     noise = np.array([[0.0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
-    truth, _ = task.world.begin(Draws(np.full((20, 5), 0.5), np), normals)
-    after, _ = task.world.advance(truth, noise, None)
+    truth, _ = model.task.world.begin(Draws(np.full((20, 5), 0.5), np), normals)
+    after, _ = model.task.world.advance(truth, noise, None)
     error = np.stack([(after.ins - after.reference)[0], after.drift[0], after.coloured[0]])
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
     # The last lane has no source and stays free of error.
@@ -507,35 +512,35 @@ def test_one_step_of_the_ins_error_has_the_covariance_of_van_loan():
 @pytest.mark.parametrize("scenario", TASK.scenarios)
 def test_shapes_and_sizes(control, axes, scenario):
     lanes, steps = 8, 60
-    task = make(scenario, control, axes=axes)
-    actions = random_actions(task, lanes, steps, 0)
-    uniforms, normals, rows = numbers(task, lanes, steps, 0)
-    shapes = [x.shape for x in arrays(task.begin(uniforms, normals).filter)]
-    for seen, state in states(task, (uniforms, normals, rows), lambda k, seen: actions[k]):
-        observation = task.observe(seen)
-        assert observation.shape == (len(task.fields), lanes)
+    model = make(scenario, control, axes=axes)
+    actions = random_actions(model, lanes, steps, 0)
+    uniforms, normals, rows = numbers(model, lanes, steps, 0)
+    shapes = [x.shape for x in arrays(model.begin(uniforms, normals).filter)]
+    for seen, state in states(model, (uniforms, normals, rows), lambda k, seen: actions[k]):
+        observation = model.observe(seen)
+        assert observation.shape == (len(model.fields), lanes)
         assert np.isfinite(observation).all()
         assert np.abs(observation).max() < 50
         assert [x.shape for x in arrays(state.filter)] == shapes
         assert all(x.dtype == np.float64 and x.shape[-1] == lanes for x in arrays(state))
-        assert task.error(state).shape == (axes, lanes) == (len(task.components), lanes)
-        assert task.covariance(state).shape == (axes, axes, lanes)
-        np.testing.assert_allclose(task.cost(state), (task.error(state) ** 2).sum(0) / 2.0, rtol=1e-12)
-        for name, record in task.records(state).items():
+        assert model.error(state).shape == (axes, lanes) == (len(model.task.components), lanes)
+        assert model.covariance(state).shape == (axes, axes, lanes)
+        np.testing.assert_allclose(model.cost(state), (model.error(state) ** 2).sum(0) / 2.0, rtol=1e-12)
+        for name, record in model.records(state).items():
             assert record.shape == ((3, lanes) if name == "mode_probability" else (lanes,))
-    assert len({f.name for f in task.fields}) == len(task.fields)
+    assert len({f.name for f in model.fields}) == len(model.fields)
 
 
 @pytest.mark.parametrize("control", TASK.controls)
 def test_the_truth_follows_the_noise_and_not_the_control(control):
     lanes, steps = 4, 80
     reference = make("random", "gain", axes=2)
-    task = make("random", control, axes=2)
-    drawn = numbers(task, lanes, steps, 2)
-    actions = random_actions(task, lanes, steps, 5)
+    model = make("random", control, axes=2)
+    drawn = numbers(model, lanes, steps, 2)
+    actions = random_actions(model, lanes, steps, 5)
     for (seen, _), (other, _) in zip(
         states(reference, drawn, constant(reference, 0.3, lanes)),
-        states(task, drawn, lambda k, s: actions[k]),
+        states(model, drawn, lambda k, s: actions[k]),
         strict=True,
     ):
         for found, expected in zip(arrays(other[:2]), arrays(seen[:2]), strict=True):
@@ -546,56 +551,56 @@ def test_the_truth_follows_the_noise_and_not_the_control(control):
 def test_no_truth_at_any_distance(control):
     """The same measurements of another truth give the same observations and estimates."""
     lanes, steps = 4, 150
-    task = make("random", control, axes=2, outage_probability=1.0, spoofing_probability=0.5)
-    drawn, actions = numbers(task, lanes, steps, 3), random_actions(task, lanes, steps, 3)
+    model = make("random", control, axes=2, outage_probability=1.0, spoofing_probability=0.5)
+    drawn, actions = numbers(model, lanes, steps, 3), random_actions(model, lanes, steps, 3)
     rng = np.random.default_rng(4)
-    bank = task.bank.start(task.begin(*drawn[:2]).measurement)
-    for k, (seen, state) in enumerate(states(task, drawn, lambda k, s: actions[k])):
-        bank = task.bank.predict(bank, seen.measurement)
+    bank = model.filter.start(model.begin(*drawn[:2]).measurement)
+    for k, (seen, state) in enumerate(states(model, drawn, lambda k, s: actions[k])):
+        bank = model.filter.predict(bank, seen.measurement)
         false = type(seen.truth)(*(rng.normal(size=x.shape) for x in seen.truth))
         np.testing.assert_array_equal(
-            task.observe(seen._replace(truth=false, filter=bank)), task.observe(seen)
+            model.observe(seen._replace(truth=false, filter=bank)), model.observe(seen)
         )
-        bank = task.bank.act(bank, seen.measurement, actions[k])
+        bank = model.filter.act(bank, seen.measurement, actions[k])
         other = state._replace(truth=false, filter=bank)
-        np.testing.assert_array_equal(task.mean(other), task.mean(state))
-        np.testing.assert_array_equal(task.covariance(other), task.covariance(state))
-        assert (task.error(other) != task.error(state)).any()
+        np.testing.assert_array_equal(model.mean(other), model.mean(state))
+        np.testing.assert_array_equal(model.covariance(other), model.covariance(state))
+        assert (model.error(other) != model.error(state)).any()
 
 
 @pytest.mark.parametrize("control", TASK.controls)
 def test_what_is_shown_and_paid_does_not_depend_on_the_motion(control):
     """Otherwise an agent learns the motion by heart and reads the errors of the INS off its increments."""
     drawn, actions = numbers(make("random"), 4, 100, 5), random_actions(make("random", control), 4, 100, 5)
-    task = make("random", control)
+    model = make("random", control)
     at_rest, moving = (
         states(make("random", control, reference_amplitude=a), drawn, lambda k, s: actions[k])
         for a in (0.0, 1000.0)
     )
     for (seen, acted), (same, same_acted) in zip(at_rest, moving, strict=True):
         # 1000 m in double precision, 100 steps, over a noise of centimetres.
-        np.testing.assert_allclose(task.observe(same), task.observe(seen), rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(task.cost(same_acted), task.cost(acted), rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(model.observe(same), model.observe(seen), rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(model.cost(same_acted), model.cost(acted), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("control", TASK.controls)
 def test_lanes_at_different_times_do_not_disturb_each_other(control):
     lanes, late = 8, 37
-    task = make("random", control)
-    drawn, actions = numbers(task, lanes, 120, 7), random_actions(task, lanes, 120, 7)
-    alone = [state for _, state in states(task, drawn, lambda k, s: actions[k])]
+    model = make("random", control)
+    drawn, actions = numbers(model, lanes, 120, 7), random_actions(model, lanes, 120, 7)
+    alone = [state for _, state in states(model, drawn, lambda k, s: actions[k])]
     restarted = np.arange(lanes) % 2 == 1
-    state = task.begin(*drawn[:2])
+    state = model.begin(*drawn[:2])
     for k in range(120):
         if k == late:
-            fresh = task.begin(*drawn[:2])
+            fresh = model.begin(*drawn[:2])
             state = state._replace(
                 truth=chosen(restarted, fresh.truth, state.truth),
                 filter=chosen(restarted, fresh.filter, state.filter),
             )
         row = np.where(restarted & (k >= late), drawn[2][k - late], drawn[2][k])
-        state = task.act(
-            task.measure(state, row), np.where(restarted & (k >= late), actions[k - late], actions[k])
+        state = model.act(
+            model.measure(state, row), np.where(restarted & (k >= late), actions[k - late], actions[k])
         )
     for found, old, new in zip(*map(arrays, (state, alone[119], alone[119 - late])), strict=True):
         np.testing.assert_array_equal(found, np.where(restarted, new, old))
@@ -606,31 +611,33 @@ def test_torch_equals_numpy(torch, control):
     lanes, steps = 8, 60
     keywords = {"axes": 2, "outage_probability": 1.0, "outage_start": (0.1, 0.3), "jamming_probability": 1.0}
     keywords |= {"spoofing_probability": 1.0, "change_start": (0.1, 0.4)}
-    task, twin = make("random", control, **keywords), make("random", control, torch, **keywords)
-    drawn, actions = numbers(task, lanes, steps, 1), random_actions(task, lanes, steps, 1)
+    model, twin = make("random", control, **keywords), make("random", control, torch, **keywords)
+    drawn, actions = numbers(model, lanes, steps, 1), random_actions(model, lanes, steps, 1)
     copies = (*(torch.from_numpy(x) for x in drawn[:2]), [torch.from_numpy(x) for x in drawn[2]])
-    run = states(task, drawn, lambda k, s: actions[k])
+    run = states(model, drawn, lambda k, s: actions[k])
     other = states(twin, copies, lambda k, s: torch.from_numpy(actions[k]))
     for (seen, state), (seen_too, state_too) in zip(run, other, strict=True):
         assert all(x.dtype == torch.float64 for x in arrays(state_too))
         # The two libraries round exp, log and sin differently in the last place.
-        np.testing.assert_allclose(twin.observe(seen_too).numpy(), task.observe(seen), rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(
+            twin.observe(seen_too).numpy(), model.observe(seen), rtol=1e-10, atol=1e-12
+        )
         for a, b in zip(arrays(state), arrays(state_too), strict=True):
             np.testing.assert_allclose(b.numpy(), a, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(twin.cost(state_too).numpy(), task.cost(state), rtol=1e-9, atol=1e-12)
-        for name, record in task.records(state).items():
+        np.testing.assert_allclose(twin.cost(state_too).numpy(), model.cost(state), rtol=1e-9, atol=1e-12)
+        for name, record in model.records(state).items():
             np.testing.assert_allclose(twin.records(state_too)[name].numpy(), record, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("control", ["noise", "gain", "weights"])
 def test_the_cost_is_differentiable_in_the_actions(torch, control):
     lanes, steps = 2, 12
-    task, twin = make("random", control), make("random", control, torch)
-    drawn = numbers(task, lanes, steps, 1)
-    actions = np.random.default_rng(0).uniform(0.1, 0.9, (steps, task.action_space.shape[0], lanes))
+    model, twin = make("random", control), make("random", control, torch)
+    drawn = numbers(model, lanes, steps, 1)
+    actions = np.random.default_rng(0).uniform(0.1, 0.9, (steps, model.action_space.shape[0], lanes))
 
     def total(values):
-        return sum(task.cost(s).sum() for _, s in states(task, drawn, lambda k, seen: values[k]))
+        return sum(model.cost(s).sum() for _, s in states(model, drawn, lambda k, seen: values[k]))
 
     copies = (*(torch.from_numpy(x) for x in drawn[:2]), [torch.from_numpy(x) for x in drawn[2]])
     leaf = torch.from_numpy(actions.copy()).requires_grad_()
@@ -672,7 +679,7 @@ def test_parameters_from_json_and_duration():
     assert LooselyCoupledNavigationParameters(drift_factor=[0.5, 2.0]).drift_factor == (0.5, 2.0)
     assert LooselyCoupledNavigationParameters(duration=2.0, sampling_interval=0.02).horizon == 100
     with pytest.raises(ValueError, match="control 'evidence'"):
-        make_task(TASK.id, "evidence")
+        make_model(TASK.id, "evidence")
 
 
 # --- The batched filter functions --------------------------------------------------------------------------

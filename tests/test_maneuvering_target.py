@@ -6,11 +6,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from filtergym.baselines.maneuvering_target.policies import InteractingMultipleModel
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.trajectory import Trajectory
 from filtergym.evaluation.dataset import windows_of
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
+from models import make_model
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -115,7 +115,7 @@ def test_imm_policy_equals_the_imm_as_plain_filter(bank, seed):
     )
     truth, start, measurements = paper_data(seed)
     expected, probabilities = naive_imm(start, measurements, gains, transition, initial)
-    policy = InteractingMultipleModel(env.unwrapped.task)
+    policy = InteractingMultipleModel(env.unwrapped.model)
     observation, _ = env.reset(seed=seed)
     for k in range(1, 101):
         lanes = env.unwrapped.fleet.only
@@ -160,29 +160,29 @@ def test_gains_are_those_of_a_naive_imm(bank, steered):
 
 
 def test_no_change_of_the_gains_is_zero_evidence():
-    steps, banks = [], [make_task(ID, control, "random", **REGULAR) for control in ("gains", "evidence")]
-    for task in banks:
+    steps, banks = [], [make_model(ID, control, "random", **REGULAR) for control in ("gains", "evidence")]
+    for model in banks:
         rng = np.random.default_rng(4)
-        state = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+        state = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
         steps.append([])
         for _ in range(60):
-            state = task.act(task.measure(state, rng.normal(size=(2, 8))), np.zeros((2, 8)))
-            steps[-1].append(task.mean(state))
+            state = model.act(model.measure(state, rng.normal(size=(2, 8))), np.zeros((2, 8)))
+            steps[-1].append(model.mean(state))
     # The gain goes into a logit and back, and an IMM amplifies the rounding; metres.
     np.testing.assert_allclose(*steps, rtol=0, atol=1e-6)
 
 
 def test_zero_evidence_is_the_plain_filter_bit_for_bit():
     """The recursion through the functions of ``filters``, batch of 8, against the task's own bank."""
-    task = make_task(ID, "evidence", "random", **REGULAR)
+    model = make_model(ID, "evidence", "random", **REGULAR)
     rng = np.random.default_rng(0)
-    state = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+    state = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
     mean, covariance, mu = state.filter.mean, state.filter.covariance, state.filter.probabilities
     alpha = np.array([[0.3], [0.7]])
     beta = alpha_beta.benedict_bordner_beta(alpha)
     transition = np.array([[0.9, 0.1], [0.1, 0.9]])
-    for _ in range(task.horizon):
-        state = task.measure(state, rng.normal(size=(2, 8)))
+    for _ in range(model.task.horizon):
+        state = model.measure(state, rng.normal(size=(2, 8)))
         prediction = imm.predict_mode_probabilities(transition, mu)
         mean, covariance = imm.mix(mean, covariance, prediction.mixing)
         position, velocity = alpha_beta.predict(mean[:2], mean[2:], T), mean[2:]
@@ -195,12 +195,12 @@ def test_zero_evidence_is_the_plain_filter_bit_for_bit():
         covariance = alpha_beta.update_joint_covariance(
             covariance, state.measurement.variance[:, None], alpha, beta, T
         )
-        state = task.act(state, np.zeros((2, 8)))
+        state = model.act(state, np.zeros((2, 8)))
         np.testing.assert_array_equal(state.filter.probabilities, mu)
         np.testing.assert_array_equal(state.filter.mean, mean)
         np.testing.assert_array_equal(state.filter.covariance, covariance)
         np.testing.assert_allclose(
-            task.error(state),
+            model.error(state),
             imm.combine(mean, covariance, mu)[0]
             - np.concatenate([state.truth.position, state.truth.velocity]),
             rtol=0,
@@ -363,10 +363,10 @@ def test_known_turn_reports_an_honest_covariance(paper):
 
 
 def test_random_flights_keep_their_limits():
-    task = make_task(ID, "gain", "random", **REGULAR)
-    p, runs = task.parameters, 4000
+    model = make_model(ID, "gain", "random", **REGULAR)
+    p, runs = model.task.parameters, 4000
     rng = np.random.default_rng(0)
-    state = task.begin(rng.random((task.noise.uniforms, runs)), np.zeros((4, runs))).truth
+    state = model.begin(rng.random((model.task.noise.uniforms, runs)), np.zeros((4, runs))).truth
     start_range, speed = np.hypot(*state.position), np.hypot(*state.velocity)
     for values, (low, high) in ((start_range, (5e3, 60e3)), (speed, (60.0, 300.0))):
         assert low <= values.min() < low + 0.01 * (high - low)
@@ -387,7 +387,7 @@ def test_random_flights_keep_their_limits():
     # Fly without noise and look at what each scan does.
     turns = thrusts = 0
     for k in range(1, p.horizon + 1):
-        before, after = state, task.world.advance(state, np.zeros((2, runs)), None)[0]
+        before, after = state, model.task.world.advance(state, np.zeros((2, runs)), None)[0]
         active = ((m.first <= k) & (k <= m.last)).any(axis=0)
         straight = before.position + T * before.velocity
         quiet = ~active
@@ -416,18 +416,18 @@ def test_random_flights_keep_their_limits():
     assert 0.45 < turns / (turns + thrusts) < 0.55
 
 
-def begun(task, episodes, seed=0):
+def begun(model, episodes, seed=0):
     """Episodes at the start of the track."""
-    rng, noise = np.random.default_rng(seed), task.noise
-    return task.begin(
+    rng, noise = np.random.default_rng(seed), model.task.noise
+    return model.begin(
         rng.random((noise.uniforms, episodes)), rng.normal(size=(noise.initial_normals, episodes))
     )
 
 
 @pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])
 def test_legs_are_drawn_around_the_stated_ones(scenario):
-    task = make_task(ID, "gain", scenario)
-    p, legs = task.parameters, begun(task, 4000).truth.flight
+    model = make_model(ID, "gain", scenario)
+    p, legs = model.task.parameters, begun(model, 4000).truth.flight
     stated = np.array(p.legs)
     share = np.diff(legs.time, axis=0) / stated[:, :1]
     assert (np.abs(share - 1.0) <= p.leg_spread).all()
@@ -449,11 +449,15 @@ def test_legs_are_drawn_around_the_stated_ones(scenario):
 
 @pytest.mark.parametrize("scenario", ["atc", "cruise", "descent"])
 def test_legs_are_flown_exactly(scenario):
-    task = make_task(ID, "gain", scenario, leg_spread=0.0, start_spread=0.0, course_spread=0.0, mirrored=0.0)
-    p = task.parameters
+    model = make_model(
+        ID, "gain", scenario, leg_spread=0.0, start_spread=0.0, course_spread=0.0, mirrored=0.0
+    )
+    p = model.task.parameters
     interval, count = p.sampling_interval, p.horizon + 2
-    legs = begun(task, 1).truth.flight
-    track = np.concatenate(task.world.course.advance(legs, np.arange(count) + 0.0 * legs.time[:1, 0], None))
+    legs = begun(model, 1).truth.flight
+    track = np.concatenate(
+        model.task.world.course.advance(legs, np.arange(count) + 0.0 * legs.time[:1, 0], None)
+    )
     times = interval * np.arange(count)
     ends = np.cumsum([duration for duration, _ in p.legs])
     rates = np.radians([rate for _, rate in p.legs])
@@ -489,18 +493,18 @@ def test_legs_are_flown_exactly(scenario):
             centre = place + np.stack([-v[1], v[0]]) / rate
             np.testing.assert_allclose(centre, centre[:, :1] * np.ones_like(centre), rtol=0, atol=1e-7)
     # That is where the task flies.
-    state = begun(task, 8).truth
+    state = begun(model, 8).truth
     for k in range(1, p.horizon + 1):
-        state, _ = task.world.advance(state, np.zeros((2, 8)), None)
+        state, _ = model.task.world.advance(state, np.zeros((2, 8)), None)
         np.testing.assert_array_equal(state.position[:, 0], track[:2, k])
         np.testing.assert_array_equal(state.velocity[:, 0], track[2:, k])
 
 
 def test_paper_flight_is_the_paper_flight():
-    task = make_task(ID, "gain", "paper")
-    state = task.begin(np.zeros((0, 8)), np.zeros((4, 8))).truth
+    model = make_model(ID, "gain", "paper")
+    state = model.begin(np.zeros((0, 8)), np.zeros((4, 8))).truth
     for expected in paper_flight()[1:]:
-        state, _ = task.world.advance(state, np.zeros((2, 8)), None)
+        state, _ = model.task.world.advance(state, np.zeros((2, 8)), None)
         here = np.concatenate([state.position, state.velocity])[:, 0]
         np.testing.assert_allclose(here, expected, rtol=1e-13, atol=1e-9)
         if state.scan[0] == 55:
@@ -508,10 +512,10 @@ def test_paper_flight_is_the_paper_flight():
 
 
 def test_polar_measurements_have_their_stated_errors():
-    task = make_task(ID, "gain", "paper", polar_measurements=True)
+    model = make_model(ID, "gain", "paper", polar_measurements=True)
     rng = np.random.default_rng(0)
     runs = 20000
-    state = task.measure(task.begin(np.zeros((0, runs)), np.zeros((4, runs))), rng.normal(size=(2, runs)))
+    state = model.measure(model.begin(np.zeros((0, runs)), np.zeros((4, runs))), rng.normal(size=(2, runs)))
     radius = np.hypot(*state.measurement.position) - np.hypot(*state.truth.position)
     azimuth = np.arctan2(*state.measurement.position[::-1]) - np.arctan2(*state.truth.position[::-1])
     tolerance = 4 / math.sqrt(2 * runs)
@@ -532,9 +536,9 @@ class TestNoTruth:
 
     def test_same_measurements_from_another_truth_show_the_same(self, control, scenario):
         """The other target flies apart, and its noise is what gives the same measurements."""
-        task = make_task(ID, control, scenario)
+        model = make_model(ID, control, scenario)
         rng = np.random.default_rng(1)
-        state = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+        state = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
         offset = np.array([[2500.0], [-1800.0]])
         truth = state.truth._replace(position=state.truth.position + offset)
         if truth.scans is not None:
@@ -542,13 +546,13 @@ class TestNoTruth:
         other, missed = state._replace(truth=truth), 0
         for _ in range(40):
             # Whether a scan sees the target, and how early it comes, is the same for both.
-            row, scan = rng.normal(size=(2, 8)), rng.random((task.noise.row_uniforms, 8))
-            state = task.measure(state, np.concatenate([row, scan]))
-            probe, _ = task.world.advance(other.truth, np.concatenate([0.0 * row, scan]), None)
+            row, scan = rng.normal(size=(2, 8)), rng.random((model.task.noise.row_uniforms, 8))
+            state = model.measure(state, np.concatenate([row, scan]))
+            probe, _ = model.task.world.advance(other.truth, np.concatenate([0.0 * row, scan]), None)
             place = probe.position
             sigma = np.sqrt(np.stack([variances(x, y) for x, y in place.T], axis=1))
             row = (state.measurement.position - place) / sigma
-            other = task.measure(other, np.concatenate([row, scan]))
+            other = model.measure(other, np.concatenate([row, scan]))
             missed += (state.measurement.available == 0.0).sum()
             assert (abs(other.truth.position - state.truth.position) > 1000.0).any(
                 axis=0
@@ -558,9 +562,9 @@ class TestNoTruth:
             np.testing.assert_allclose(
                 other.measurement.position, state.measurement.position, rtol=0, atol=1e-9
             )
-            np.testing.assert_allclose(task.observe(other), task.observe(state), rtol=1e-7, atol=1e-7)
-            actions = self.actions(task, rng)
-            state, other = task.act(state, actions), task.act(other, actions)
+            np.testing.assert_allclose(model.observe(other), model.observe(state), rtol=1e-7, atol=1e-7)
+            actions = self.actions(model, rng)
+            state, other = model.act(state, actions), model.act(other, actions)
         assert (missed > 0) == (scenario == "random")
 
 
@@ -586,7 +590,7 @@ def test_weights_are_normalised_and_zero_is_uniform():
 def test_mode_collapses_the_bank_to_one_switching_filter():
     env = gym.make(ID, control="mode", scenario="paper", detailed_info=True)
     fixed = gym.make(ID, control="gain", scenario="paper", detailed_info=True)
-    action = fixed.unwrapped.task.bank.action_for_alpha(0.7)
+    action = fixed.unwrapped.model.filter.action_for_alpha(0.7)
     env.reset(seed=0), fixed.reset(seed=0)
     for _ in range(30):
         one, other = env.step(1)[4], fixed.step(np.array([action]))[4]
@@ -623,10 +627,10 @@ def test_log_likelihood_reward_is_that_of_the_truth():
     env.reset(seed=0)
     for _ in range(10):
         state = env.unwrapped.fleet.only.state
-        task = env.unwrapped.task
-        after = task.act(state, np.full((2, 8), 0.5))
+        model = env.unwrapped.model
+        after = model.act(state, np.full((2, 8), 0.5))
         _, reward, _, _, info = env.step(np.array([0.5, 0.5]))
-        expected = multivariate_normal.logpdf(info["error"], cov=task.covariance(after)[..., 0])
+        expected = multivariate_normal.logpdf(info["error"], cov=model.covariance(after)[..., 0])
         assert reward == pytest.approx(expected, rel=1e-9)
 
 
@@ -716,4 +720,4 @@ def test_bad_trajectories(time, position, velocity, message):
 def test_a_flight_of_too_many_scans_is_refused_at_once(last, keywords, message):
     flight = Trajectory(np.array([0.0, 5.0, last]), np.array([[1000.0, 0.0], [1100.0, 0.0], [2000.0, 500.0]]))
     with pytest.raises(ValueError, match=message):
-        make_task("ManeuveringTarget", scenario=flight, **keywords)
+        make_model("ManeuveringTarget", scenario=flight, **keywords)

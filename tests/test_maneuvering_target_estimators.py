@@ -17,10 +17,10 @@ from filtergym.baselines.maneuvering_target.estimators import (
 )
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import coordinated_turn
+from models import make_model
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -41,13 +41,13 @@ def unit_noise(dt):
 
 
 @pytest.fixture(scope="module", params=["regular", "irregular"])
-def task(request):
+def model(request):
     """Scans that all see the target, every six seconds; and such that miss it and come early."""
     irregular = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
-    return make_task(ID, None, "random", **(irregular if request.param == "irregular" else {}))
+    return make_model(ID, None, "random", **(irregular if request.param == "irregular" else {}))
 
 
-def estimates(task, estimator, horizon=100):
+def estimates(model, estimator, horizon=100):
     """What an estimator is given and answers: start, measurements, means and covariances of eight episodes."""
     given, answers = [], []
 
@@ -62,14 +62,14 @@ def estimates(task, estimator, horizon=100):
             answers.append((mean, covariance))
             return mean, covariance, memory
 
-    for _ in rollout(task, Watched(), episode_seeds("train", 3, LANES)):
+    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
         pass
     return given[0], given[1:], *map(np.array, zip(*answers, strict=True))
 
 
-def compare(task, estimator, naive, rtol=1e-9):
+def compare(model, estimator, naive, rtol=1e-9):
     """Every mean and covariance of three episodes with those of a naive recursion."""
-    initial, measurements, means, covariances = estimates(task, estimator)
+    initial, measurements, means, covariances = estimates(model, estimator)
     for b in range(3):
         track = naive(initial.mean[:, b], initial.covariance[..., b])
         next(track)
@@ -136,15 +136,17 @@ def naive_imm_turn(accelerations, start_rate, change, stay):
     return track
 
 
-def test_imm_with_a_turn_equals_naive_loops(task):
+def test_imm_with_a_turn_equals_naive_loops(model):
     values = ((0.1, 4.0, 0.5), 1.5, 0.4, (0.97, 0.8, 0.9))
-    compare(task, KalmanTurnInteractingMultipleModel(task, *values), naive_imm_turn(*values), rtol=1e-8)
+    compare(
+        model, KalmanTurnInteractingMultipleModel(model.task, *values), naive_imm_turn(*values), rtol=1e-8
+    )
 
 
 @pytest.mark.parametrize("stay", [(0.9, 0.9), (0.98, 0.6, 0.8)])
-def test_modes_start_as_the_chain_leaves_them(task, stay):
+def test_modes_start_as_the_chain_leaves_them(model, stay):
     accelerations = (0.1,) * len(stay)
-    estimator = KalmanInteractingMultipleModel(task, accelerations, stay)
+    estimator = KalmanInteractingMultipleModel(model.task, accelerations, stay)
     np.testing.assert_allclose(estimator.transition.sum(axis=1), 1.0, rtol=1e-15)
     np.testing.assert_allclose(estimator.probabilities.sum(), 1.0, rtol=1e-15)
     np.testing.assert_allclose(
@@ -152,7 +154,7 @@ def test_modes_start_as_the_chain_leaves_them(task, stay):
     )
 
 
-def test_imm_equals_filterpys(task):
+def test_imm_equals_filterpys(model):
     filterpy = pytest.importorskip("filterpy.kalman")
     sigmas, stay = (0.2, 4.0), (0.98, 0.9)
 
@@ -178,10 +180,10 @@ def test_imm_equals_filterpys(task):
                 peer._compute_state_estimate()
             z, R, dt = yield peer.x, peer.P
 
-    compare(task, KalmanInteractingMultipleModel(task, sigmas, stay), track, rtol=1e-8)
+    compare(model, KalmanInteractingMultipleModel(model.task, sigmas, stay), track, rtol=1e-8)
 
 
-def test_unscented_filter_equals_filterpys(task):
+def test_unscented_filter_equals_filterpys(model):
     filterpy = pytest.importorskip("filterpy.kalman")
     acceleration, change, start_rate = 0.5, 0.4, 1.5
 
@@ -201,10 +203,10 @@ def test_unscented_filter_equals_filterpys(task):
                 peer.update(z, R=R)
             z, R, dt = yield peer.x[:4], peer.P[:4, :4]
 
-    compare(task, UnscentedTurn(task, acceleration, change, start_rate), track)
+    compare(model, UnscentedTurn(model.task, acceleration, change, start_rate), track)
 
 
-def test_sage_husa_equals_the_papers_recursion(task):
+def test_sage_husa_equals_the_papers_recursion(model):
     acceleration, forgetting, least = 0.8, 0.9, 0.2
 
     def track(x, P):
@@ -224,10 +226,10 @@ def test_sage_husa_equals_the_papers_recursion(task):
             level = max((1 - d) * level + d * sample.mean(), least**2)
             z, R, dt = yield x, P
 
-    compare(task, SageHusa(task, acceleration, forgetting, least), track)
+    compare(model, SageHusa(model.task, acceleration, forgetting, least), track)
 
 
-def test_variational_bayes_equals_the_papers_recursion(task):
+def test_variational_bayes_equals_the_papers_recursion(model):
     acceleration, rho, shape = 2.0, 0.9, 4.0
 
     def track(x, P):
@@ -248,10 +250,10 @@ def test_variational_bayes_equals_the_papers_recursion(task):
             P = after
             z, R, dt = yield x, P
 
-    compare(task, VariationalBayes(task, acceleration, rho, shape), track)
+    compare(model, VariationalBayes(model.task, acceleration, rho, shape), track)
 
 
-def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(task):
+def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(model):
     acceleration, tau = 0.6, 2.0
 
     def track(x, P):
@@ -266,7 +268,7 @@ def test_variational_bayes_of_the_prediction_equals_the_papers_recursion(task):
                     estimated = (tau * nominal + P + np.outer(x - before, x - before)) / (tau + 1)
             z, R, dt = yield x, P
 
-    compare(task, VariationalBayesPrediction(task, acceleration, tau), track)
+    compare(model, VariationalBayesPrediction(model.task, acceleration, tau), track)
 
 
 def test_untuned_values_are_those_in_force():
@@ -281,7 +283,7 @@ def test_untuned_values_are_those_in_force():
         assert mean_cost(Candidate(problem_of(ID), "random", tunable, tunable.start, seeds)) == pytest.approx(
             expected, rel=1e-9
         ), name
-        assert isinstance(untuned(make_task(ID, None, "random")), maker)
+        assert isinstance(untuned(make_model(ID, None, "random").task), maker)
 
 
 def test_tuned_imm_with_a_turn_beats_the_others_on_fresh_flights():

@@ -9,9 +9,9 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.maneuvering_target.policies import AdaptiveGain, InteractingMultipleModel
 from filtergym.baselines.maneuvering_target.references import KnownInputBound
 from filtergym.envs.backend import host_array
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
+from models import make_model
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -125,14 +125,14 @@ def flown(control, act, seed, **keywords):
         **IRREGULAR,
         **keywords,
     )
-    task, said, truncated = env.unwrapped.task, [], False
+    model, said, truncated = env.unwrapped.model, [], False
     observation, _ = env.reset(seed=seed)
     while not truncated:
         measurement = env.unwrapped.fleet.only.state.measurement
         shown = observation
-        observation, _, _, truncated, info = env.step(act(task, observation))
+        observation, _, _, truncated, info = env.step(act(model, observation))
         said.append((shown, measurement, info))
-    return task, said
+    return model, said
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -140,8 +140,8 @@ def test_policy_of_the_paper_equals_the_imm_as_plain_filter(seed):
     start, scans = paper_data(seed)
     expected = naive_bank(start, scans, CHAIN, PRIOR, [(0.3, 0.7)] * len(scans))
 
-    def act(task, observation):
-        return InteractingMultipleModel(task).predict(observation)[0]
+    def act(model, observation):
+        return InteractingMultipleModel(model).predict(observation)[0]
 
     _, said = flown("weights", act, seed)
     assert 5 < sum(z is None for *_, z in scans) < 70
@@ -167,7 +167,7 @@ def test_steered_gains_equal_the_imm_as_plain_filter():
     """Where the scan missed the target neither the action nor the likelihood counts."""
     rng, used = np.random.default_rng(5), []
 
-    def act(task, observation):
+    def act(model, observation):
         action = rng.uniform(-1.0, 1.0, 2)
         used.append(1.0 / (1.0 + np.exp(-(np.log([0.3 / 0.7, 0.7 / 0.3]) + 2.0 * action))))
         return action
@@ -184,7 +184,7 @@ def test_steered_gains_equal_the_imm_as_plain_filter():
 def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
     rng, used = np.random.default_rng(6), []
 
-    def act(task, observation):
+    def act(model, observation):
         action = rng.uniform(-1.0, 1.0, 1)
         used.append(0.5 + 0.45 * action[0])
         return action
@@ -205,10 +205,10 @@ def test_one_filter_equals_the_recursion_with_the_gain_over_the_elapsed_time():
 def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="random", seed=0, **keywords):
     """Episodes after each scan, before and after random actions; ``detections`` says which see the target."""
     scans = {"detection_probability": (0.5, 0.5), "scan_jitter": (jitter, jitter), "undisturbed": 0.0}
-    task = make_task(ID, control, scenario, **scans, **keywords)
+    model = make_model(ID, control, scenario, **scans, **keywords)
     rng = np.random.default_rng(seed)
-    noise = task.noise
-    episode = task.begin(
+    noise = model.task.noise
+    episode = model.begin(
         rng.random((noise.uniforms, count)), normals * rng.standard_normal((noise.initial_normals, count))
     )
     said = [(None, episode)]
@@ -220,14 +220,14 @@ def rolled(control, detections, jitter=0.0, count=8, normals=0.0, scenario="rand
                 rng.random((1, count)),
             ]
         )
-        before = task.measure(said[-1][1], row)
-        space = task.action_space
+        before = model.measure(said[-1][1], row)
+        space = model.action_space
         shape = (*space.shape, count)
         action = (
             rng.integers(space.n, size=shape) if control == "mode" else rng.uniform(*_limits(space), shape)
         )
-        said.append((before, task.act(before, action)))
-    return task, said
+        said.append((before, model.act(before, action)))
+    return model, said
 
 
 def _limits(space):
@@ -237,16 +237,16 @@ def _limits(space):
 @pytest.mark.parametrize("jitter", [0.0, 0.9])
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_target_that_is_never_seen_is_predicted(control, jitter):
-    task, said = rolled(control, [False] * 30, jitter, normals=1.0)
+    model, said = rolled(control, [False] * 30, jitter, normals=1.0)
     start = said[0][1].measurement
     time, chance = np.zeros(8), np.array([0.5, 0.5])
     x0, P0 = start.mean, start.covariance
     for before, after in said[1:]:
         time = time + before.measurement.interval
-        chance = chance @ np.array(task.parameters.transition)
+        chance = chance @ np.array(model.task.parameters.transition)
         np.testing.assert_allclose(before.measurement.elapsed, time, rtol=1e-12)
         expected = np.concatenate([x0[:2] + time * x0[2:], x0[2:]])
-        np.testing.assert_allclose(task.mean(after), expected, rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(model.mean(after), expected, rtol=1e-12, atol=1e-9)
         grown = np.stack([transition(t) @ P0[..., i] @ transition(t).T for i, t in enumerate(time)], axis=-1)
         state = after.filter
         if isinstance(state, AlphaBeta):
@@ -258,23 +258,23 @@ def test_a_target_that_is_never_seen_is_predicted(control, jitter):
                 )
             np.testing.assert_array_equal(state.average_excess, 0.0)
         else:
-            np.testing.assert_allclose(task.covariance(after), grown, rtol=1e-12, atol=1e-6)
+            np.testing.assert_allclose(model.covariance(after), grown, rtol=1e-12, atol=1e-6)
             np.testing.assert_allclose(state.probabilities, chance[:, None] + np.zeros(8), rtol=1e-12)
         np.testing.assert_array_equal(state.average_innovation, 0.0)
         np.testing.assert_array_equal(state.average_log_squared, 0.0)
         np.testing.assert_array_equal(state.innovation, 0.0)
-        assert np.isfinite(task.observe(before)).all()
+        assert np.isfinite(model.observe(before)).all()
 
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_averages_and_gains_hold_where_the_target_is_missed(control):
-    task, said = rolled(control, [True] * 5 + [False] * 4 + [True], normals=1.0)
+    model, said = rolled(control, [True] * 5 + [False] * 4 + [True], normals=1.0)
     seen, missed = said[5][1].filter, said[9][1].filter
     for name in ("average_innovation", "average_log_squared", "alpha"):
         np.testing.assert_array_equal(getattr(missed, name), getattr(seen, name))
     assert (said[10][1].filter.average_innovation != seen.average_innovation).all()
-    read = {name: task.reader(name) for name in ("available", "elapsed")}
-    shown = [task.observe(before).T for before, _ in said[1:]]
+    read = {name: model.reader(name) for name in ("available", "elapsed")}
+    shown = [model.observe(before).T for before, _ in said[1:]]
     assert [read["available"](o)[0, 0] for o in shown] == [1.0] * 5 + [0.0] * 4 + [1.0]
     elapsed = [read["elapsed"](o)[0, 0] for o in shown]
     np.testing.assert_allclose(elapsed, [1.0] * 5 + [1.0, 2.0, 3.0, 4.0, 5.0], rtol=1e-14)
@@ -283,17 +283,17 @@ def test_averages_and_gains_hold_where_the_target_is_missed(control):
 @pytest.mark.parametrize("control", CONTROLS)
 def test_what_is_said_of_a_missed_target_does_not_count(control):
     """Not even NaN, which a recording might hold."""
-    task, said = rolled(control, [True] * 3, normals=1.0)
+    model, said = rolled(control, [True] * 3, normals=1.0)
     episode, before = said[-1][1], said[-1][0]
     missed = before.measurement._replace(available=np.zeros(8))
     answers = []
     for position in (0.0, 1e9, math.nan):
         measurement = missed._replace(position=position + np.zeros((2, 8)))
-        bank = task.bank.predict(episode.filter, measurement)
-        space = task.action_space
+        bank = model.filter.predict(episode.filter, measurement)
+        space = model.action_space
         action = np.ones(8, dtype=int) if control == "mode" else np.full((*space.shape, 8), 0.3)
-        after = task.bank.act(bank, measurement, action)
-        answers.append((task.bank.mean(after), task.bank.covariance(after)))
+        after = model.filter.act(bank, measurement, action)
+        answers.append((model.filter.mean(after), model.filter.covariance(after)))
     for mean, covariance in answers:
         np.testing.assert_array_equal(mean, answers[0][0])
         np.testing.assert_array_equal(covariance, answers[0][1])
@@ -303,42 +303,42 @@ def test_what_is_said_of_a_missed_target_does_not_count(control):
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_bank_that_could_miss_the_target_is_the_same_where_it_does_not(control):
     """Bit for bit: so a recording of regular scans is replayed by either."""
-    regular, other = (make_task(ID, control, **scans) for scans in (REGULAR, IRREGULAR))
+    regular, other = (make_model(ID, control, **scans) for scans in (REGULAR, IRREGULAR))
     rng = np.random.default_rng(2)
-    noise = regular.noise
+    noise = regular.task.noise
     assert noise.row_uniforms == 0
-    assert (other.noise.uniforms, other.noise.row_uniforms) == (noise.uniforms + 2, 2)
+    assert (other.task.noise.uniforms, other.task.noise.row_uniforms) == (noise.uniforms + 2, 2)
     episode = regular.begin(rng.random((noise.uniforms, 8)), rng.standard_normal((noise.initial_normals, 8)))
-    bank = other.bank.start(episode.measurement)
+    bank = other.filter.start(episode.measurement)
     for _ in range(20):
         episode = regular.measure(episode, rng.standard_normal((2, 8)))
-        bank = other.bank.predict(bank, episode.measurement)
+        bank = other.filter.predict(bank, episode.measurement)
         np.testing.assert_array_equal(
             other._blocks.observe(bank, episode.measurement), regular.observe(episode)
         )
         space = regular.action_space
         action = rng.integers(2, size=8) if control == "mode" else rng.random((*space.shape, 8))
         episode = regular.act(episode, action)
-        bank = other.bank.act(bank, episode.measurement, action)
-        np.testing.assert_array_equal(other.bank.mean(bank), regular.mean(episode))
-        np.testing.assert_array_equal(other.bank.covariance(bank), regular.covariance(episode))
+        bank = other.filter.act(bank, episode.measurement, action)
+        np.testing.assert_array_equal(other.filter.mean(bank), regular.mean(episode))
+        np.testing.assert_array_equal(other.filter.covariance(bank), regular.covariance(episode))
 
 
 @pytest.mark.parametrize("control", CONTROLS)
 def test_a_straight_flight_without_noise_is_followed_without_error(control):
-    task, said = rolled(control, [True, False, True, True, False, False] * 10, 0.95, maneuver_count=(0, 0))
+    model, said = rolled(control, [True, False, True, True, False, False] * 10, 0.95, maneuver_count=(0, 0))
     for before, after in said[1:]:
         assert (before.measurement.interval > 0.0).all()
-        np.testing.assert_allclose(task.error(after), 0.0, atol=1e-8)
+        np.testing.assert_allclose(model.error(after), 0.0, atol=1e-8)
 
 
 def test_turns_and_thrust_are_exact_at_the_time_of_a_scan():
     """One manoeuvre from the start to the end: a circle, or a parabola."""
-    task, said = rolled(
+    model, said = rolled(
         "gain", [True] * 60, 0.9, count=64, maneuver_count=(1, 1), maneuver_duration=(100, 100), horizon=100
     )
     start = said[0][1].truth
-    context = task.context(said[1][0])
+    context = model.context(said[1][0])
     turn = context["maneuver_turn"][0] / T
     turning = turn != 0.0
     assert 10 < turning.sum() < 54
@@ -371,7 +371,7 @@ def test_turns_and_thrust_are_exact_at_the_time_of_a_scan():
 def test_legs_are_flown_by_time():
     legs = {"legs": ((20.0, 0.0), (90.0, 2.0), (40.0, -1.0))}
     keywords = {"flight": "legs", "initial_velocity": (150.0, 0.0), "initial_position": (8e3, 1e3)}
-    task, said = rolled("gain", [True] * 40, 0.9, scenario="paper", **legs, **keywords)
+    model, said = rolled("gain", [True] * 40, 0.9, scenario="paper", **legs, **keywords)
     time = np.zeros(8)
     for before, _ in said[1:]:
         time = time + before.measurement.interval
@@ -382,22 +382,22 @@ def test_legs_are_flown_by_time():
             before.truth.velocity, 150.0 * np.stack([np.cos(angle), np.sin(angle)]), rtol=0, atol=1e-9
         )
         turning = (time >= 20.0) & (time < 150.0)
-        np.testing.assert_array_equal(task.context(before)["maneuvering"] > 0.0, turning)
+        np.testing.assert_array_equal(model.context(before)["maneuvering"] > 0.0, turning)
 
 
 def test_scans_see_the_target_as_often_and_come_as_early_as_they_should():
     scans = {"detection_probability": (0.2, 0.9), "scan_jitter": (0.1, 0.8), "undisturbed": 0.0}
-    task = make_task(ID, None, "random", **scans)
+    model = make_model(ID, None, "random", **scans)
     rng = np.random.default_rng(1)
     count, scans = 400, 90
-    episode = task.begin(rng.random((task.noise.uniforms, count)), rng.standard_normal((4, count)))
+    episode = model.begin(rng.random((model.task.noise.uniforms, count)), rng.standard_normal((4, count)))
     seen, times = [], [np.zeros(count)]
     for _ in range(scans):
         row = np.concatenate([rng.standard_normal((2, count)), rng.random((2, count))])
-        episode = task.measure(episode, row)
+        episode = model.measure(episode, row)
         seen.append(episode.measurement.available)
         times.append(times[-1] + episode.measurement.interval)
-    context = task.context(episode)
+    context = model.context(episode)
     probability, jitter = context["detection_probability"], context["scan_jitter"]
     for values, (low, high) in ((probability, (0.2, 0.9)), (jitter, (0.1, 0.8))):
         assert low <= values.min() < low + 0.01
@@ -449,7 +449,7 @@ def test_backends_agree_and_one_episode_is_the_lane(control):
             observation, reward, *_ = single.step(action[2])
             np.testing.assert_array_equal(observation, shown[backend][0][k + 1, 2])
             assert reward == shown[backend][1][k, 2]
-    missed = env.unwrapped.task.columns(["available"])[0]
+    missed = env.unwrapped.model.columns(["available"])[0]
     assert 0.2 < (shown["numpy"][0][..., missed] == 0.0).mean() < 0.5
     for backend in ("compiled", "torch"):
         for one, other in zip(shown["numpy"], shown[backend], strict=True):
@@ -463,7 +463,7 @@ def test_gradients_are_finite_and_zero_where_the_target_was_missed(control):
         ID, num_envs=8, backend="torch", control=control, horizon=25, reward="cost", **IRREGULAR
     )
     observation, _ = env.reset(seed=0)
-    seen = env.unwrapped.task.columns(["available"])[0]
+    seen = env.unwrapped.model.columns(["available"])[0]
     actions, available, total = [], [], 0.0
     for _ in range(24):
         action = torch.full(env.action_space.shape, 0.2, dtype=torch.float64, requires_grad=True)
@@ -482,7 +482,7 @@ def test_gradients_are_finite_and_zero_where_the_target_was_missed(control):
 def test_the_ramp_waits_for_a_measurement():
     """Its gains are those of the scans that see the target; the others are no step of it."""
     env = gym.make(ID, control="gain", scenario="paper", detailed_info=True, **IRREGULAR)
-    policy = AdaptiveGain(env.unwrapped.task, false_alarm_probability=1e-300)
+    policy = AdaptiveGain(env.unwrapped.model, false_alarm_probability=1e-300)
     observation, _ = env.reset(seed=1)
     state, used, truncated = None, [], False
     while not truncated:
@@ -496,8 +496,8 @@ def test_the_ramp_waits_for_a_measurement():
 
 
 def test_bound_gains_nothing_where_the_target_is_missed():
-    task, said = rolled("gain", [True, False, False, True, True, False] * 5, 0.8, normals=1.0)
-    bound = KnownInputBound(task)
+    model, said = rolled("gain", [True, False, False, True, True, False] * 5, 0.8, normals=1.0)
+    bound = KnownInputBound(model.task)
     memory = bound.start(said[0][1].measurement, said[0][1].truth)
     expected = np.moveaxis(memory, -1, 0)
     for before, _ in said[1:]:
@@ -564,7 +564,7 @@ TRACK = {"flight": "track", "horizon": 2, "track": ((0.0, 1.0, 2.0, 3.0),) * 4}
 )
 def test_wrong_values_are_a_sentence(keywords, sentence):
     with pytest.raises(ValueError, match=sentence):
-        make_task(ID, **keywords)
+        make_model(ID, **keywords)
 
 
 def test_a_table_may_be_missed():
@@ -581,7 +581,7 @@ def test_pictures_leave_out_what_was_missed():
         ID, render_mode="rgb_array", detection_probability=(0.3, 0.3), scan_jitter=(0.5, 0.5), horizon=8
     )
     env.reset(seed=0)
-    picture = env.unwrapped.task.picture()
+    picture = env.unwrapped.model.picture()
     missed = []
     for _ in range(8):
         state = env.unwrapped.fleet.only.state

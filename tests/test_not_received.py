@@ -5,9 +5,10 @@ import re
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.rollout import rollout
+from models import make_model
 
 from filtergym import evaluate, record
 
@@ -76,14 +77,14 @@ CASES = [(id, replayed) for id in UNRELIABLE for replayed in (False, True) if "U
 def test_what_is_not_received_is_nan(id, replayed):
     scenario, horizon, field = UNRELIABLE[id]
     if replayed:
-        task = make_task(id, scenario=record(id, scenario, episodes=4, horizon=horizon))
+        model = make_model(id, scenario=record(id, scenario, episodes=4, horizon=horizon))
     else:
-        task = make_task(id, scenario=scenario, horizon=horizon)
+        model = make_model(id, scenario=scenario, horizon=horizon)
     watch = Watch()
-    for _ in rollout(task, watch, range(4)):
+    for _ in rollout(model, watch, range(4)):
         pass
     values = np.stack([getattr(m, field) for m in watch.given])
-    there = np.stack([received(task, m, field) for m in watch.given])
+    there = np.stack([received(model.task, m, field) for m in watch.given])
     assert 0 < (~there).sum() < there.size
     np.testing.assert_array_equal(np.isnan(values), ~there)
     for m in watch.given:

@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.observation import (
     BOUNDED_LOG,
     KEPT_AS_LOG1P,
@@ -16,6 +15,7 @@ from filtergym.envs.observation import (
     Quantity,
     scaled,
 )
+from models import make_model
 
 BLOCKS = (
     Block("a", lambda state, _: state.a, "two numbers", ("x", "y"), SIGNED_LOG),
@@ -102,14 +102,14 @@ def test_unknown_names_and_names_said_twice():
 
 
 def test_innovation_in_metres_is_the_measured_minus_the_predicted_position():
-    task = make_task("filtergym/ManeuveringTarget-v0", "gain", "missed-detections")
+    model = make_model("filtergym/ManeuveringTarget-v0", "gain", "missed-detections")
     rng = np.random.default_rng(5)
-    episode = task.begin(rng.random((task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
+    episode = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.normal(size=(4, 8)))
     for _ in range(20):
-        episode = task.measure(episode, np.concatenate([rng.normal(size=(2, 8)), rng.random((2, 8))]))
-        read = task.reader("innovation_in_metres")(task.observe(episode).T)
+        episode = model.measure(episode, np.concatenate([rng.normal(size=(2, 8)), rng.random((2, 8))]))
+        read = model.reader("innovation_in_metres")(model.observe(episode).T)
         seen = episode.measurement.available > 0.0
         expected = np.where(seen, episode.measurement.position - episode.filter.predicted, 0.0).T
         # The share 1 - R/S that it is read from cancels digits when S is little larger than R.
         np.testing.assert_allclose(read, expected, rtol=1e-12, atol=1e-9)
-        episode = task.act(episode, np.zeros((1, 8)))
+        episode = model.act(episode, np.zeros((1, 8)))

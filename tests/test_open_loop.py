@@ -8,11 +8,11 @@ import sys
 
 import numpy as np
 import pytest
-from filtergym.envs.backend import array_backend
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.lanes import Lanes
 from filtergym.evaluation.competitors import Policy
 from filtergym.evaluation.seeds import episode_seeds
+from models import make_model
 
 from filtergym import evaluate, tidy_records
 
@@ -23,21 +23,20 @@ def best_schedule(scenario, episodes, iterations):
     """Actions by step number that cost least on average over training episodes, ``(decisions, actions)``."""
     import torch
 
-    xp, device = array_backend("torch", None)
-    task = make_task(ID, "gain", scenario, xp, device)
+    model = make_model(ID, "gain", scenario, backend="torch")
     seeds = episode_seeds("train", 0, episodes)
-    decisions = task.horizon // task.decision_interval
-    actions = torch.zeros((decisions, task.action_space.shape[0]), dtype=torch.float64, requires_grad=True)
+    decisions = model.task.horizon // model.task.decision_interval
+    actions = torch.zeros((decisions, model.action_space.shape[0]), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([actions], lr=0.15)
     for _ in range(iterations):
-        lanes = Lanes(task, episodes)
+        lanes = Lanes(model, episodes)
         for lane, seed in enumerate(seeds):
             lanes.seed(lane, np.random.default_rng(seed))
         lanes.restart()
         costs = []
         for k in range(decisions):
             for state, _ in lanes.decide(actions[k].expand(episodes, -1)):
-                costs.append(task.cost(state)[:episodes].mean())
+                costs.append(model.cost(state)[:episodes].mean())
         optimiser.zero_grad()
         # The logarithm, so that the step does not depend on the size of the cost.
         torch.stack(costs).mean().log().backward()

@@ -11,11 +11,12 @@ import warnings
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, find_scenario, make_task
+from filtergym.envs.catalogue import catalogue, find_scenario
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.parameters import declared
-from filtergym.envs.reward import REWARDS, paper_task
+from filtergym.envs.reward import REWARDS, paper_model
 from filtergym.envs.step_report import step_report
+from models import make_model
 
 ENDLESS = {float: (-1e6, -1e-6, 1e-6, 1e6), int: (1, 2, 300)}
 """Where a limit leaves a number open: extreme, and still sensible in some unit."""
@@ -91,8 +92,8 @@ def actions(space, rng, step):
 def finding(env_id, keywords, kind, rng):
     """Run three episodes with these keywords: "" if all is well, "refused: ..." or what went wrong."""
     try:
-        task = make_task(env_id, **{"horizon": 60, "decision_interval": 1, **keywords})
-        lanes = Lanes(task, 3, paper_task(task) if kind == "relative" else None)
+        model = make_model(env_id, **{"horizon": 60, "decision_interval": 1, **keywords})
+        lanes = Lanes(model, 3, paper_model(model) if kind == "relative" else None)
     except np.linalg.LinAlgError as error:
         return f"LinAlgError: {error}"
     except ValueError as error:
@@ -103,10 +104,10 @@ def finding(env_id, keywords, kind, rng):
     wrong, report = [], step_report(kind, episode=True)
 
     def check(state, paid):
-        P = np.moveaxis(task.covariance(state), -1, 0)
+        P = np.moveaxis(model.covariance(state), -1, 0)
         found = {
-            "error": task.error(state),
-            "cost": task.cost(state),
+            "error": model.error(state),
+            "cost": model.cost(state),
             "reward": paid,
             "covariance": P,
         }
@@ -120,10 +121,10 @@ def finding(env_id, keywords, kind, rng):
     last = min(DECISIONS, lanes.decisions_per_episode)
     for step in range(last + 1):
         shown = np.isfinite(lanes.observe()).all(axis=0)
-        wrong.extend(f"observation {task.fields[i].name}" for i in np.flatnonzero(~shown))
+        wrong.extend(f"observation {model.fields[i].name}" for i in np.flatnonzero(~shown))
         if wrong:
             return f"step {step}: {', '.join(wrong)}"
-        action = actions(task.action_space, rng, step)
+        action = actions(model.action_space, rng, step)
         if step < last:
             for own, paper in lanes.decide(action, report):
                 check(own.episode, own.reward if paper is None else own.reward - paper.reward)
@@ -180,7 +181,7 @@ def test_extreme_parameters_are_finite_or_refused(env_id):
 )
 def test_what_no_filter_can_answer_is_refused(environment, parameters):
     with pytest.raises(ValueError, match=r"must") as caught:
-        make_task(environment, **parameters)
+        make_model(environment, **parameters)
     assert caught.type is ValueError, "not one of NumPy or SciPy, which names no parameter"
 
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.parameters import TaskParameters, parameter, sized, square_matrix
+from models import make_model
 
 from filtergym.commands.terminal import parse_settings
 
@@ -106,4 +106,4 @@ TARGET, NAVIGATION = "ManeuveringTarget", "TightlyCoupledNavigation"
 )
 def test_types_are_checked_also_from_the_command_line(id, setting, message):
     with pytest.raises(ValueError, match=message):
-        make_task(id, **parse_settings([setting]))
+        make_model(id, **parse_settings([setting]))

@@ -6,9 +6,10 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.privileged import context_shapes
 from filtergym.envs.world import World
+from models import make_model
 
 from filtergym import evaluate, make_policy
 
@@ -37,18 +38,18 @@ def rollout(id, steps, seed=0, **keywords):
 def test_context_is_finite_of_one_shape_and_the_truths_own(env_id, short, scenario_number):
     name = list(catalogue()[env_id].scenarios)[scenario_number]
     contexts, states = rollout(env_id, 4, scenario=name, **short)
-    task = make_task(env_id, scenario=name, **short)
-    shapes = context_shapes(task)
+    model = make_model(env_id, scenario=name, **short)
+    shapes = context_shapes(model.task)
     for context, state in zip(contexts, states, strict=True):
         assert {key: values.shape for key, values in context.items()} == shapes
-        for key, values in task.world.context(state.truth).items():
+        for key, values in model.task.world.context(state.truth).items():
             assert np.isfinite(values).all(), key
             np.testing.assert_array_equal(context[key], values[..., 0])
 
 
 def test_every_environment_has_a_context(env_id):
     assert catalogue()[env_id].World.context is not World.context
-    assert context_shapes(make_task(env_id))
+    assert context_shapes(make_model(env_id).task)
 
 
 def test_context_does_not_change_the_episode(env_id, short):
@@ -265,8 +266,8 @@ def test_a_policy_that_is_corrected_sees_the_observation_only():
     from filtergym.agents import ResidualActions, to_sb3
     from filtergym.baselines.problem import problem_of
 
-    task = make_task(ID, "weights")
-    policy = problem_of(ID).competitor("imm")(task)
+    model = make_model(ID, "weights")
+    policy = problem_of(ID).competitor("imm")(model)
     keywords = {"control": "weights", "horizon": 4}
     paid = []
     for observation in ("measured", "asymmetric"):
@@ -278,7 +279,7 @@ def test_a_policy_that_is_corrected_sees_the_observation_only():
         vector = to_sb3(many, residual_to=policy)
         vector.seed(0)
         vector.reset()
-        zero = np.zeros(task.action_space.shape)
+        zero = np.zeros(model.action_space.shape)
         paid.append([(env.step(zero)[1], vector.step(zero[None])[1][0]) for _ in range(4)])
     assert paid[0] == paid[1]
 

@@ -8,13 +8,14 @@ import functools
 import gymnasium as gym
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.radar_esm_tracking.task import RadarEsmTracking, RadarEsmTrackingParameters
 from filtergym.envs.trajectory import Trajectory
 from filtergym.filters import class_fusion, imm
 from gymnasium.vector import AutoresetMode
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from models import make_model
 
 import filtergym  # noqa: F401  (registers the environments)
 
@@ -30,7 +31,7 @@ ROUNDS = st.lists(st.tuples(STEPS, MASKS | st.none(), st.none() | SEEDS), min_si
 
 def environment_keywords(env_id, control):
     """Episodes of two decisions, of two measurements at most."""
-    interval = min(make_task(env_id).decision_interval, 2)
+    interval = min(make_model(env_id).task.decision_interval, 2)
     return {"control": control, "horizon": 2 * interval, "decision_interval": interval}
 
 

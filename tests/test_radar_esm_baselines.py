@@ -9,11 +9,11 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.radar_esm_tracking import policies as baselines
 from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import start_lanes
 from filtergym.papers.measured import Measured
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
+from models import make_model
 
 import filtergym  # noqa: F401  # registers the environments
 from filtergym import evaluate, tidy_records
@@ -129,7 +129,7 @@ def test_non_adaptive_and_ideal_have_their_exact_errors(target):
     dataset = evaluate(
         ID, ["non-adaptive", "ideal", "known-class-bound"], "paper", 1500, true_class=f"S{target}"
     )
-    p = make_task(ID, scenario="paper").parameters
+    p = make_model(ID, scenario="paper").task.parameters
     for name, channel in (("non-adaptive", 2), ("ideal", target)):
         exact = experiment.exact_mean_squares(p, target, channel)
         squares = dataset["error"].sel(policy=name).values ** 2
@@ -143,7 +143,7 @@ def test_non_adaptive_and_ideal_have_their_exact_errors(target):
 
 def test_exact_errors_after_a_minute():
     """Published to 0.01 (range to 0.01 m), the columns being the filters of S0, S1, S2 on an S0 target."""
-    p = make_task(ID, scenario="paper").parameters
+    p = make_model(ID, scenario="paper").task.parameters
     last = numpy.array([numpy.sqrt(experiment.exact_mean_squares(p, 0, c)[:, -1]) for c in range(3)])
     expected = [(279.77, 6.85, 1.29), (279.78, 8.71, 2.17), (279.79, 11.74, 5.86)]
     assert last == pytest.approx(numpy.array(expected), abs=0.0055)
@@ -152,22 +152,22 @@ def test_exact_errors_after_a_minute():
 # --- the ideal filter
 
 
-def played(task, estimator, seeds, decisions):
+def played(model, estimator, seeds, decisions):
     """What was told of the start; then episodes after each measurement, and the estimator's mean and covariance."""
     begun, states = [], []
-    lanes = start_lanes(task, seeds, begun.append)
+    lanes = start_lanes(model, seeds, begun.append)
     (start,) = begun
     memory = estimator.start(start.measurement, start.truth)
     for _ in range(decisions):
-        ((episode, _),) = lanes.decide(numpy.zeros((len(seeds), task.classes)))
+        ((episode, _),) = lanes.decide(numpy.zeros((len(seeds), model.task.classes)))
         mean, covariance, memory, _ = estimator.update(episode.measurement, episode.truth, memory)
         states.append((episode, mean, covariance))
     return start.measurement, states
 
 
 def test_ideal_is_the_channel_of_the_true_class():
-    task = make_task(ID, scenario="random", class_change=None)
-    _, states = played(task, Ideal(task), range(24), 120)
+    model = make_model(ID, scenario="random", class_change=None)
+    _, states = played(model, Ideal(model.task), range(24), 120)
     for episode, mean, covariance in states:
         lane, true = numpy.arange(24), episode.truth.target_class
         # The channel's gains were computed in advance; 120 scans of rounding.
@@ -178,11 +178,11 @@ def test_ideal_is_the_channel_of_the_true_class():
 
 def test_ideal_switches_its_model_at_the_change():
     """Against a Kalman filter written out for each lane, which keeps state and covariance at the change."""
-    task = make_task(ID, scenario="class-change")
-    models, start = task.design_models(task.parameters)
+    model = make_model(ID, scenario="class-change")
+    models, start = model.task.design_models(model.task.parameters)
     H, R = models.H, models.R
-    told, states = played(task, Ideal(task), range(8), 120)
-    first = task.parameters.class_change[0]
+    told, states = played(model, Ideal(model.task), range(8), 120)
+    first = model.task.parameters.class_change[0]
     for lane in range(8):
         changes = 0
         governed = int(states[0][0].truth.target_class[lane])
@@ -221,9 +221,9 @@ def test_ideal_keeps_its_bound_where_the_class_changes():
 # --- policies
 
 
-def decided(task, policy, seeds, decisions):
+def decided(model, policy, seeds, decisions):
     """States after measurement and after the policy's action."""
-    lanes = start_lanes(task, seeds)
+    lanes = start_lanes(model, seeds)
     for _ in range(decisions):
         before = lanes.state
         action, _ = policy.predict(lanes.observe())
@@ -241,15 +241,15 @@ def decided(task, policy, seeds, decisions):
 )  # fmt: skip
 def test_weights_against_bayes_written_out(cls, arguments):
     """Every lane's weights from the states, with products in place of sums of logarithms."""
-    task = make_task(ID, "weights", "crowded")
-    p = task.parameters
+    model = make_model(ID, "weights", "crowded")
+    p = model.task.parameters
     recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
     pi = composition @ recognition
-    policy = cls(task, **arguments)
+    policy = cls(model, **arguments)
     leak, esm = arguments.get("leak", 0.01), arguments.get("esm", 1.0)
     q = numpy.array([[1.0 - leak if i == j else leak / 2.0 for j in range(3)] for i in range(3)])
     radar, previous = numpy.ones((3, 16)), None
-    for before, after in decided(task, policy, range(16), 60):
+    for before, after in decided(model, policy, range(16), 60):
         likelihood = numpy.exp(before.filter.log_likelihood - before.filter.log_likelihood.max(axis=0))
         radar = radar * likelihood
         for n in range(16):
@@ -275,16 +275,16 @@ def test_weights_against_bayes_written_out(cls, arguments):
 
 @pytest.mark.parametrize("arguments", [{}, {"change": 0.1, "refused": 0.7, "esm": 0.4}])
 def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
-    task = make_task(ID, "weights", "crowded")
-    p = task.parameters
+    model = make_model(ID, "weights", "crowded")
+    p = model.task.parameters
     recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
-    policy = baselines.ForgettingJointType(task, **arguments)
+    policy = baselines.ForgettingJointType(model, **arguments)
     change, refused, esm = (
         arguments.get(n, d) for n, d in (("change", 0.002), ("refused", 0.0), ("esm", 1.0))
     )
     joint = numpy.repeat((composition / 3.0)[:, :, None], 8, axis=2)
     last, state = numpy.zeros((4, 8)), None
-    lanes = start_lanes(task, range(8))
+    lanes = start_lanes(model, range(8))
     for step in range(60):
         bank = lanes.state.filter
         action, state = policy.predict(lanes.observe(), state, numpy.full(8, step == 0))
@@ -304,10 +304,10 @@ def test_forgetting_is_bayes_over_class_and_type_written_out(arguments):
 
 
 def test_forgetting_nothing_is_the_joint_posterior():
-    task = make_task(ID, "weights", "random")
-    joint, kept = baselines.JointType(task), baselines.ForgettingJointType(task, change=0.0)
+    model = make_model(ID, "weights", "random")
+    joint, kept = baselines.JointType(model), baselines.ForgettingJointType(model, change=0.0)
     state = None
-    lanes = start_lanes(task, range(8))
+    lanes = start_lanes(model, range(8))
     for step in range(60):
         shown = lanes.observe()
         action, state = kept.predict(shown, state, numpy.full(8, step == 0))

@@ -4,6 +4,7 @@ import math
 
 import numpy
 import pytest
+from filtergym.envs.model import Model
 from filtergym.envs.radar_esm_tracking.task import TASK
 from filtergym.filters import class_fusion, imm
 
@@ -11,31 +12,31 @@ SCENARIOS = tuple(TASK.scenarios)
 LEAKY = ((0.9, 0.08, 0.02), (0.0, 0.7, 0.3), (0.25, 0.05, 0.7))
 
 
-def make(scenario="paper", control="evidence", xp=numpy, **keywords):
+def make(scenario="paper", control="evidence", xp=numpy, **keywords) -> Model:
     parameters = TASK.Parameters(**{**TASK.scenarios[scenario].parameters, **keywords})
-    return TASK(parameters, control, xp)
+    return Model(TASK(parameters, xp), control)
 
 
-def draw(task, N, seed):
+def draw(model, N, seed):
     """Noise of an episode for N lanes: uniforms, normals, rows."""
-    rng, layout = numpy.random.default_rng(seed), task.noise
+    rng, layout = numpy.random.default_rng(seed), model.task.noise
     start = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
     rows = (
         numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
-        for _ in range(task.horizon + 1)
+        for _ in range(model.task.horizon + 1)
     )
     return *start, rows
 
 
-def roll(task, noise, policy=None):
+def roll(model, noise, policy=None):
     """States after every ``measure`` and after every ``act``, the latter with its observation."""
     uniforms, normals, rows = noise
-    state = task.begin(uniforms, normals)
-    zero = numpy.zeros((task.classes, uniforms.shape[-1]))
+    state = model.begin(uniforms, normals)
+    zero = numpy.zeros((model.task.classes, uniforms.shape[-1]))
     for row in rows:
-        measured = task.measure(state, row)
-        observation = task.observe(measured)
-        state = task.act(measured, zero if policy is None else policy(observation))
+        measured = model.measure(state, row)
+        observation = model.observe(measured)
+        state = model.act(measured, zero if policy is None else policy(observation))
         yield measured, observation, state
 
 
@@ -55,11 +56,11 @@ def monte_carlo():
     """Squared errors, reported variances and P(true class) of 6000 targets of each class, 120 scans."""
     results = []
     for s in range(3):
-        task = make(true_class=f"S{s}")
+        model = make(true_class=f"S{s}")
         errors, variances, probabilities = [], [], []
-        for _, _, state in roll(task, draw(task, 6000, 2008 + s)):
-            covariance = task.covariance(state)
-            errors.append(task.error(state) ** 2)
+        for _, _, state in roll(model, draw(model, 6000, 2008 + s)):
+            covariance = model.covariance(state)
+            errors.append(model.error(state) ** 2)
             variances.append(numpy.stack([covariance[i, i] for i in range(3)]))
             probabilities.append(state.filter.probabilities[s])
         results.append((numpy.stack(errors), numpy.stack(variances), numpy.stack(probabilities)))
@@ -111,8 +112,8 @@ def test_the_paper_filter_is_bayesian(monte_carlo):
 
 
 def test_class_probabilities_are_calibrated():
-    task = make(horizon=20)
-    states = [state for *_, state in roll(task, draw(task, 20000, 5))]
+    model = make(horizon=20)
+    states = [state for *_, state in roll(model, draw(model, 20000, 5))]
     P = numpy.concatenate([states[k].filter.probabilities.ravel() for k in (4, 9)])
     true = numpy.concatenate(
         [(states[k].truth.target_class == numpy.arange(3)[:, None]).ravel() for k in (4, 9)]
@@ -125,9 +126,9 @@ def test_class_probabilities_are_calibrated():
 
 
 def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_repairs_it():
-    task = make("fixed-type")
-    p = task.parameters
-    *_, (_, _, state) = roll(task, draw(task, 4000, 7))
+    model = make("fixed-type")
+    p = model.task.parameters
+    *_, (_, _, state) = roll(model, draw(model, 4000, 7))
     floor = numpy.array(p.composition)
     joint = class_fusion.fixed_type_log_likelihood(
         state.filter.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
@@ -148,27 +149,27 @@ def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_
 
 def test_fields_and_shapes():
     for control in TASK.controls:
-        task = make("random", control)
-        uniforms, normals, rows = draw(task, 8, 0)
-        state = task.measure(task.begin(uniforms, normals), next(rows))
-        observation = task.observe(state)
-        assert observation.shape == (len(task.fields), 8)
-        assert len({f.name for f in task.fields}) == len(task.fields)
+        model = make("random", control)
+        uniforms, normals, rows = draw(model, 8, 0)
+        state = model.measure(model.begin(uniforms, normals), next(rows))
+        observation = model.observe(state)
+        assert observation.shape == (len(model.fields), 8)
+        assert len({f.name for f in model.fields}) == len(model.fields)
         assert observation.dtype == numpy.float64
         action = numpy.zeros(8, dtype=int) if control == "mode" else numpy.zeros((3, 8))
-        state = task.act(state, action)
-        assert task.error(state).shape == (3, 8)
-        assert task.covariance(state).shape == (3, 3, 8)
-        assert task.cost(state).shape == (8,)
-        assert task.records(state)["mode_probability"].shape == (3, 8)
+        state = model.act(state, action)
+        assert model.error(state).shape == (3, 8)
+        assert model.covariance(state).shape == (3, 3, 8)
+        assert model.cost(state).shape == (8,)
+        assert model.records(state)["mode_probability"].shape == (3, 8)
 
 
 def test_observation_shows_what_it_names():
-    task = make("random", averaging_measurements=1.0, second_emitter_probability=(0.0, 0.0))
-    noise = draw(task, 64, 3)
+    model = make("random", averaging_measurements=1.0, second_emitter_probability=(0.0, 0.0))
+    noise = draw(model, 64, 3)
     decided = refused = 0
-    for k, (state, observation, _) in enumerate(roll(task, noise), start=1):
-        shown = {f.name: observation[i] for i, f in enumerate(task.fields)}
+    for k, (state, observation, _) in enumerate(roll(model, noise), start=1):
+        shown = {f.name: observation[i] for i, f in enumerate(model.fields)}
         one_hot = numpy.stack([shown[f"decision_{j}"] for j in range(4)])
         assert (one_hot.sum(axis=0) + shown["decision_none"] == 1.0).all()
         if k % 4:
@@ -179,12 +180,12 @@ def test_observation_shows_what_it_names():
         counts = sum(shown[f"{kind}_count_{j}"] for kind in ("used", "refused") for j in range(4))
         assert (counts * 10.0).round(9).max() <= k // 4 + 1
         read = {
-            name: task.reader(name)(observation.T) for name in ("innovation_range", "innovation_range_rate")
+            name: model.reader(name)(observation.T) for name in ("innovation_range", "innovation_range_rate")
         }
         nis = sum(innovation[:, 1] ** 2 for innovation in read.values())
         assert numpy.log1p(nis) == pytest.approx(shown["log_squared_innovation_S1"], rel=1e-12)
-        assert task.reader("log_squared_innovation")(observation.T)[:, 1] == pytest.approx(nis, rel=1e-11)
-        degrees = task.reader("bearing_difference")(observation.T)[:, 0]
+        assert model.reader("log_squared_innovation")(observation.T)[:, 1] == pytest.approx(nis, rel=1e-11)
+        degrees = model.reader("bearing_difference")(observation.T)[:, 0]
         assert degrees == pytest.approx(state.measurement.bearing_difference, rel=1e-12)
         assert shown["time"] == pytest.approx(k * 0.5 / 60.0)
     assert decided > 500
@@ -193,15 +194,15 @@ def test_observation_shows_what_it_names():
 
 
 def test_first_observation_holds_the_decision_at_scan_0():
-    task = make()
-    _, observation, _ = next(roll(task, draw(task, 512, 1)))
-    p = task.parameters
-    counts = observation[task.columns([f"used_count_{j}" for j in range(4)])] * 10.0
+    model = make()
+    _, observation, _ = next(roll(model, draw(model, 512, 1)))
+    p = model.task.parameters
+    counts = observation[model.columns([f"used_count_{j}" for j in range(4)])] * 10.0
     assert set(counts.sum(axis=0).round(12)) == {0.0, 1.0}
     pi = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
     posterior = numpy.where(counts.sum(axis=0) > 0.5, pi @ counts, 1.0 + 0.0 * counts[:3])
     posterior = posterior / posterior.sum(axis=0)
-    weights = observation[task.columns([f"last_weight_S{s}" for s in range(3)])]
+    weights = observation[model.columns([f"last_weight_S{s}" for s in range(3)])]
     assert weights == pytest.approx(posterior, rel=1e-12)
 
 
@@ -209,9 +210,9 @@ def test_first_observation_holds_the_decision_at_scan_0():
 def test_zero_evidence_is_the_recursion(transition):
     """The paper's algorithm as a policy equals the plain filter fed with the measurements alone."""
     more = {} if transition is None else {"class_transition": transition}
-    task = make("random", **more)
-    p = task.parameters
-    models, start = task.design_models(p)
+    model = make("random", **more)
+    p = model.task.parameters
+    models, start = model.task.design_models(p)
     q = numpy.array(p.class_transition)
     pi = class_fusion.decision_probabilities(numpy.array(p.recognition), numpy.array(p.composition))
     pi = numpy.concatenate([pi, numpy.ones((3, 1))], axis=1)
@@ -221,35 +222,35 @@ def test_zero_evidence_is_the_recursion(transition):
         passes = numpy.abs(measurement.bearing_difference) <= gate
         return pi[:, numpy.where(passes, measurement.decision, 4)]
 
-    uniforms, normals, rows = draw(task, 16, 4)
-    state = task.begin(uniforms, normals)
+    uniforms, normals, rows = draw(model, 16, 4)
+    state = model.begin(uniforms, normals)
     first = state.measurement.first
     mean = numpy.stack([numpy.concatenate([first.radar, numpy.zeros((1, 16))])] * 3, axis=1)
     covariance = start[..., None] + numpy.zeros(16)
     P = numpy.full((3, 16), 1 / 3) * likelihood(first)
     P = P / P.sum(axis=0)
     for row in rows:
-        state = task.measure(state, row)
+        state = model.measure(state, row)
         step = class_fusion.advance(P, mean, covariance, state.measurement.radar, models, q)
         P = imm.mode_posterior(step.log_predicted, numpy.log(likelihood(state.measurement)))
         mean, covariance = step.mean, step.covariance
         estimate, reported = imm.combine(mean, covariance, P)
-        state = task.act(state, numpy.zeros((3, 16), dtype=numpy.float32))
-        assert task.mean(state) == pytest.approx(estimate, rel=1e-10, abs=1e-8)
-        assert task.covariance(state) == pytest.approx(reported, rel=1e-9, abs=1e-9)
+        state = model.act(state, numpy.zeros((3, 16), dtype=numpy.float32))
+        assert model.mean(state) == pytest.approx(estimate, rel=1e-10, abs=1e-8)
+        assert model.covariance(state) == pytest.approx(reported, rel=1e-9, abs=1e-9)
         assert state.filter.probabilities == pytest.approx(P, rel=1e-8, abs=1e-14)
 
 
 @pytest.mark.parametrize("transition", [None, LEAKY], ids=["constant", "jumping"])
 def test_evidence_acts_on_the_weights_of_its_scan_only(transition):
     keywords = {} if transition is None else {"class_transition": transition}
-    task = make("random", horizon=60, evidence_scale=3.0, **keywords)
+    model = make("random", horizon=60, evidence_scale=3.0, **keywords)
     rng = numpy.random.default_rng(3)
     actions = rng.uniform(-1.2, 1.2, (61, 3, 8))
-    paper = list(roll(task, draw(task, 8, 4)))
+    paper = list(roll(model, draw(model, 8, 4)))
     chosen = iter(actions)
     for (measured, _, state), (paper_measured, _, paper_state), action in zip(
-        roll(task, draw(task, 8, 4), lambda _: next(chosen)), paper, actions, strict=True
+        roll(model, draw(model, 8, 4), lambda _: next(chosen)), paper, actions, strict=True
     ):
         # All that is known before the action is as without the actions before, but for the weights that were reported.
         kept = measured.filter._replace(probabilities=paper_measured.filter.probabilities)
@@ -261,16 +262,16 @@ def test_evidence_acts_on_the_weights_of_its_scan_only(transition):
 
 @pytest.mark.parametrize("control", ["mode", "weights"])
 def test_weights_that_are_stated_are_the_prior_of_the_next_scan(control):
-    task = make("random", control, horizon=20)
+    model = make("random", control, horizon=20)
     stated = numpy.full(8, 2) if control == "mode" else numpy.tile([[0.0], [0.0], [1.0]], 8)
-    for _, _, state in roll(task, draw(task, 8, 4), lambda _: stated):
+    for _, _, state in roll(model, draw(model, 8, 4), lambda _: stated):
         numpy.testing.assert_array_equal(state.filter.believed, [[0.0] * 8, [0.0] * 8, [1.0] * 8])
 
 
 def test_everyone_is_told_the_first_measurement_and_how_good_it_is():
-    task = make("fixed-type", prior=(0.2, 0.3, 0.5))
-    uniforms, normals, _ = draw(task, 40000, 15)
-    episode = task.begin(uniforms, normals)
+    model = make("fixed-type", prior=(0.2, 0.3, 0.5))
+    uniforms, normals, _ = draw(model, 40000, 15)
+    episode = model.begin(uniforms, normals)
     told, error = episode.measurement, episode.measurement.mean - episode.truth.motion
     assert numpy.array_equal(told.mean[:2], told.first.radar)
     assert told.first.looked.all()
@@ -294,35 +295,35 @@ WORLDS = {
 def test_nothing_but_the_measurement_reaches_the_bank(scenario, transition):
     """A bank made for another world shows and estimates the same from the same measurements."""
     more = {"horizon": 40, **({} if transition is None else {"class_transition": transition})}
-    task, other = make(scenario, **more), make(scenario, **{**more, **WORLDS})
-    uniforms, normals, rows = draw(task, 8, 11)
-    episode = task.begin(uniforms, normals)
-    theirs = other.bank.start(episode.measurement)
+    model, other = make(scenario, **more), make(scenario, **{**more, **WORLDS})
+    uniforms, normals, rows = draw(model, 8, 11)
+    episode = model.begin(uniforms, normals)
+    theirs = other.filter.start(episode.measurement)
     rng = numpy.random.default_rng(0)
     for row in rows:
-        episode = task.measure(episode, row)
+        episode = model.measure(episode, row)
         measurement = episode.measurement
-        theirs = other.bank.predict(theirs, measurement)
+        theirs = other.filter.predict(theirs, measurement)
         shown = other.observe(episode._replace(truth=None, filter=theirs))
-        assert numpy.array_equal(task.observe(episode), shown)
+        assert numpy.array_equal(model.observe(episode), shown)
         action = rng.uniform(-1.0, 1.0, (3, 8))
-        episode, theirs = task.act(episode, action), other.bank.act(theirs, measurement, action)
-        assert numpy.array_equal(task.mean(episode), other.bank.mean(theirs))
-        assert numpy.array_equal(task.covariance(episode), other.bank.covariance(theirs))
+        episode, theirs = model.act(episode, action), other.filter.act(theirs, measurement, action)
+        assert numpy.array_equal(model.mean(episode), other.filter.mean(theirs))
+        assert numpy.array_equal(model.covariance(episode), other.filter.covariance(theirs))
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_lanes_do_not_know_their_neighbours(scenario):
     """A lane gives the same bits in any batch, also next to lanes at other times."""
-    task = make(scenario, horizon=30)
-    uniforms, normals, rows = draw(task, 16, 2)
+    model = make(scenario, horizon=30)
+    uniforms, normals, rows = draw(model, 16, 2)
     rows = list(rows)
-    wide = task.begin(uniforms, normals)
-    narrow = task.begin(uniforms[:, :8], normals[:, :8])
+    wide = model.begin(uniforms, normals)
+    narrow = model.begin(uniforms[:, :8], normals[:, :8])
     for row in rows[:9]:
-        wide = task.act(task.measure(wide, row), numpy.zeros((3, 16)))
+        wide = model.act(model.measure(wide, row), numpy.zeros((3, 16)))
     # Lanes 0 to 7 start again at scan 0 beside lanes 8 to 15 at scan 9.
-    fresh = task.begin(uniforms, normals)
+    fresh = model.begin(uniforms, normals)
     first = numpy.arange(16) < 8
 
     def merged(a, b):
@@ -332,10 +333,10 @@ def test_lanes_do_not_know_their_neighbours(scenario):
 
     wide = wide._replace(truth=merged(fresh.truth, wide.truth), filter=merged(fresh.filter, wide.filter))
     for row in rows[9:]:
-        wide, narrow = task.measure(wide, row), task.measure(narrow, row[:, :8])
-        assert numpy.array_equal(task.observe(wide)[:, :8], task.observe(narrow))
-        wide, narrow = task.act(wide, numpy.zeros((3, 16))), task.act(narrow, numpy.zeros((3, 8)))
-        assert numpy.array_equal(task.cost(wide)[:8], task.cost(narrow))
+        wide, narrow = model.measure(wide, row), model.measure(narrow, row[:, :8])
+        assert numpy.array_equal(model.observe(wide)[:, :8], model.observe(narrow))
+        wide, narrow = model.act(wide, numpy.zeros((3, 16))), model.act(narrow, numpy.zeros((3, 8)))
+        assert numpy.array_equal(model.cost(wide)[:8], model.cost(narrow))
 
 
 @pytest.mark.parametrize("scenario", ["paper", "crowded", "silent", "class-change"])
@@ -359,16 +360,16 @@ def test_torch_plays_the_same_episode(torch, scenario, transition):
 
 def test_gradient_from_cost_to_evidence(torch):
     """Derivative of the summed cost by torch against central differences."""
-    task = make("random", xp=torch, horizon=6)
-    uniforms, normals, rows = draw(task, 8, 8)
+    model = make("random", xp=torch, horizon=6)
+    uniforms, normals, rows = draw(model, 8, 8)
     rows = [torch.asarray(row) for row in rows]
 
     def total(action):
-        state = task.begin(torch.asarray(uniforms), torch.asarray(normals))
+        state = model.begin(torch.asarray(uniforms), torch.asarray(normals))
         result = 0.0
         for row in rows:
-            state = task.act(task.measure(state, row), action)
-            result = result + task.cost(state).sum()
+            state = model.act(model.measure(state, row), action)
+            result = result + model.cost(state).sum()
         return result
 
     action = torch.asarray(numpy.random.default_rng(0).uniform(-0.3, 0.3, (3, 8)))
@@ -378,18 +379,18 @@ def test_gradient_from_cost_to_evidence(torch):
 
 
 def test_other_emitter_is_heard_as_often_as_stated():
-    task = make("crowded", radar_bearing_sigma=0.01, esm_bearing_sigma=0.01)
-    *_, (_, _, state) = roll(task, draw(task, 500, 9))
+    model = make("crowded", radar_bearing_sigma=0.01, esm_bearing_sigma=0.01)
+    *_, (_, _, state) = roll(model, draw(model, 500, 9))
     refused = state.filter.refused_counts.sum(axis=0).mean()
     # 31 or so looks, half at least 2 degrees off a gate of 0.02, a tenth of the others refused by chance.
-    looks = state.measurement.scan[0] // task.parameters.esm_period + 1
+    looks = state.measurement.scan[0] // model.task.parameters.esm_period + 1
     assert refused / looks == pytest.approx(0.5 + 0.05, abs=4.0 * 0.5 / math.sqrt(500 * looks))
     assert (state.truth.other_class != state.truth.target_class).all()
 
 
 def test_class_changes_once_within_its_limits():
-    task = make("class-change")
-    classes = numpy.stack([m.truth.target_class for m, _, _ in roll(task, draw(task, 400, 10))])
+    model = make("class-change")
+    classes = numpy.stack([m.truth.target_class for m, _, _ in roll(model, draw(model, 400, 10))])
     changes = numpy.diff(classes, axis=0) != 0
     assert (changes.sum(axis=0) == 1).all()
     scans = changes.argmax(axis=0) + 2
@@ -399,13 +400,13 @@ def test_class_changes_once_within_its_limits():
 
 
 def test_random_targets_are_silent_crowded_or_change_or_none_of_it():
-    task, N = make("random"), 8000
-    uniforms, normals, _ = draw(task, N, 14)
-    truth = task.begin(uniforms, normals).truth
+    model, N = make("random"), 8000
+    uniforms, normals, _ = draw(model, N, 14)
+    truth = model.begin(uniforms, normals).truth
     four = 4.0 * math.sqrt(0.25 / N)
     calm = (truth.silence_start == 0.0) & (truth.silence_end == 1.0) & (truth.second_emitter == 0.0)
     assert abs(calm.mean() - 1 / 6) < four
-    changes = truth.change_scan <= task.horizon
+    changes = truth.change_scan <= model.task.horizon
     assert not changes[calm].any()
     assert abs(changes[~calm].mean() - 1 / 3) < four
     assert truth.change_scan[changes].min() >= 10
@@ -427,11 +428,11 @@ def test_random_targets_are_silent_crowded_or_change_or_none_of_it():
 
 
 def test_glint_is_as_frequent_and_as_large_as_stated():
-    task = make("glint", horizon=60)
-    uniforms, normals, rows = draw(task, 1000, 15)
-    state, factors = task.begin(uniforms, normals), []
+    model = make("glint", horizon=60)
+    uniforms, normals, rows = draw(model, 1000, 15)
+    state, factors = model.begin(uniforms, normals), []
     for row in rows:
-        state = task.measure(state, row)
+        state = model.measure(state, row)
         error = state.measurement.radar - state.truth.motion[:2]
         factor = error / (numpy.array([[3000.0], [20.0]]) * row[3:5])
         # The error is what is left of a range of 1e5 m; normal numbers near zero magnify its rounding.
@@ -444,9 +445,9 @@ def test_glint_is_as_frequent_and_as_large_as_stated():
 
 
 def test_silent_targets_radiate_in_bursts():
-    task = make("silent")
-    *_, (_, _, state) = roll(task, draw(task, 2000, 13))
-    looks = state.measurement.scan[0] // task.parameters.esm_period + 1
+    model = make("silent")
+    *_, (_, _, state) = roll(model, draw(model, 2000, 13))
+    looks = state.measurement.scan[0] // model.task.parameters.esm_period + 1
     heard = (state.filter.used_counts + state.filter.refused_counts).sum(axis=0).mean() / looks
     assert heard == pytest.approx(0.08 / 0.48, abs=0.015)
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas
 import pytest
 import xarray
-from filtergym.envs.catalogue import make_task, task_class
+from filtergym.envs.catalogue import task_class
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
@@ -27,6 +27,7 @@ from filtergym.evaluation.metrics import chi_square_band
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters.gaussian import log_density
 from filtergym.filters.imm import log_mixture_density
+from models import make_model
 
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.__main__ import main
@@ -63,7 +64,7 @@ def blind(recording):
 @pytest.mark.parametrize("env", OPEN)
 def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
     keywords = OPEN[env]
-    control = make_task(env).controls[-1]
+    control = make_model(env).task.controls[-1]
     made = record(env, episodes=3, backend=backend, **keywords)
     made.write(tmp_path / "recording.nc")
     read = read_recording(tmp_path / "recording.nc")
@@ -108,9 +109,9 @@ def _names(env):
 
 def test_types_of_measurements_come_back(recordings):
     for env, recording in recordings.items():
-        task = make_task(env, scenario=recording)
-        expected = dict(named_arrays(measure_once(make_task(env, **OPEN[env]))[1]))
-        lanes = Lanes(task, 2)
+        model = make_model(env, scenario=recording)
+        expected = dict(named_arrays(measure_once(make_model(env, **OPEN[env]).task)[1]))
+        lanes = Lanes(model, 2)
         for lane in range(2):
             lanes.seed(lane, np.random.default_rng(lane))
         lanes.restart()
@@ -138,14 +139,14 @@ def test_episodes_of_different_lengths_end_where_they_do(tmp_path):
     cut.write(tmp_path / "cut.nc")
     read = read_recording(tmp_path / "cut.nc", TARGET)
     assert read.rows.tolist() == lengths.tolist()
-    task = make_task(TARGET, scenario=read)
-    assert task.flights == (12, 7, 4)
-    assert task.horizon == 12
+    model = make_model(TARGET, scenario=read)
+    assert model.task.flights == (12, 7, 4)
+    assert model.task.horizon == 12
     dataset = evaluate(TARGET, ["imm"], scenario=read, backend="numpy")
     assert dataset["length"].values.tolist() == lengths.tolist()
     assert np.isfinite(dataset["cost"].values[0]).sum(axis=1).tolist() == lengths.tolist()
-    assert make_task(TARGET, scenario=read, horizon=5).flights == (5, 5, 4)
-    assert make_task(TARGET, scenario=read, decision_interval=3).flights == (12, 6, 3)
+    assert make_model(TARGET, scenario=read, horizon=5).task.flights == (5, 5, 4)
+    assert make_model(TARGET, scenario=read, decision_interval=3).task.flights == (12, 6, 3)
     env = gym.make(TARGET, scenario=read, context=True)
     for seed in range(4):
         _, info = env.reset(seed=seed)
@@ -171,10 +172,10 @@ def test_flights_and_user_keywords_go_with_a_recording():
     made = record(TARGET, scenario, episodes=4, backend="numpy", range_sigma=50.0)
     assert made.parameters == {"range_sigma": 50.0}  # and no table of the flights
     assert sorted(set(made.lengths.tolist())) == [24, 39]
-    assert make_task(TARGET, scenario=made).parameters.range_sigma == 50.0
-    assert make_task(TARGET, scenario=made, range_sigma=70.0).parameters.range_sigma == 70.0
+    assert make_model(TARGET, scenario=made).task.parameters.range_sigma == 50.0
+    assert make_model(TARGET, scenario=made, range_sigma=70.0).task.parameters.range_sigma == 70.0
     timed = record(LOOSE, episodes=1, backend="numpy", duration=0.3)
-    assert make_task(LOOSE, scenario=timed).horizon == 30
+    assert make_model(LOOSE, scenario=timed).task.horizon == 30
     assert "duration" not in timed.parameters
 
 
@@ -192,7 +193,7 @@ def test_a_recording_travels(recordings, tmp_path):
     recording.write(tmp_path / "esm.nc")
     named = gym.make(ESM, scenario=str(tmp_path / "esm.nc"))
     np.testing.assert_array_equal(named.reset(seed=5)[0], shown)
-    assert make_task(ESM, scenario=recording).under("mode").recording is recording
+    assert make_model(ESM, scenario=recording).under("mode").task.recording is recording
 
 
 # --- without truth
@@ -259,15 +260,15 @@ def test_every_environment_has_a_likelihood_without_truth(env, recordings):
 
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 def test_log_likelihood_is_the_density_of_what_was_predicted(control):
-    task = make_task(TARGET, control, horizon=10)
-    lanes = Lanes(task, 3)
+    model = make_model(TARGET, control, horizon=10)
+    lanes = Lanes(model, 3)
     for lane in range(3):
         lanes.seed(lane, np.random.default_rng(lane))
     lanes.restart()
     for _ in range(3):
-        lanes.decide(np.full((3, *task.action_space.shape), 0.3))
-    action = np.full((*task.action_space.shape, 8), 0.3)
-    bank, said = lanes.state.filter, task.records(task.act(lanes.state, action))
+        lanes.decide(np.full((3, *model.action_space.shape), 0.3))
+    action = np.full((*model.action_space.shape, 8), 0.3)
+    bank, said = lanes.state.filter, model.records(model.act(lanes.state, action))
     if control == "gain":
         S = np.stack([np.diag(v) for v in bank.innovation_variance.T], axis=-1)
         expected = log_density(bank.innovation, S)[0]
@@ -458,7 +459,7 @@ def test_ranges_and_decisions(tmp_path):
     assert read.initial["first_decision"][0] == 1
     assert read.initial["first_bearing_difference"][0] == -3.0
     # Everyone is told what the simulation tells.
-    initial, _ = measure_once(make_task(ESM))
+    initial, _ = measure_once(make_model(ESM).task)
     np.testing.assert_allclose(read.initial["covariance"][0], initial.covariance[..., 0])
     assert np.isfinite(evaluate(ESM, _names(ESM)[:1], scenario=read, tracks=True)["estimate"].values).all()
 
@@ -578,8 +579,8 @@ def test_files_with_and_without_truth_are_not_judged(recordings, tmp_path):
 def test_a_horizon_makes_episodes_shorter(recordings, tmp_path):
     recordings[TARGET].write(tmp_path / "plots.nc")
     read = read_recording(tmp_path / "plots.nc", horizon=10)
-    assert make_task(TARGET, scenario=read).flights == (10, 10, 10)
-    assert make_task(TARGET, scenario=read, horizon=7).horizon == 7
+    assert make_model(TARGET, scenario=read).task.flights == (10, 10, 10)
+    assert make_model(TARGET, scenario=read, horizon=7).task.horizon == 7
 
 
 def changed(**columns):
@@ -772,7 +773,7 @@ def test_a_single_mistake_of_arrays_is_told(recordings):
     with pytest.raises(ValueError, match="as many different names"):
         dataclasses.replace(made, names=("a", "a", "b"))
     with pytest.raises(ValueError, match="horizon must be at most 24"):
-        make_task(TARGET, scenario=made, horizon=30)
+        make_model(TARGET, scenario=made, horizon=30)
 
 
 def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
@@ -781,8 +782,8 @@ def test_truth_needs_a_cost_of_the_error(recordings, monkeypatch):
 
     monkeypatch.setattr(RadarWorld, "error_cost", World.error_cost)
     with pytest.raises(ValueError, match="does not say what an error costs"):
-        make_task(TARGET, scenario=recordings[TARGET])
-    make_task(TARGET, scenario=blind(recordings[TARGET]))
+        make_model(TARGET, scenario=recordings[TARGET])
+    make_model(TARGET, scenario=blind(recordings[TARGET]))
 
 
 # --- the page

@@ -15,11 +15,12 @@ from filtergym.baselines import catalogue as baselines
 from filtergym.baselines.problem import import_problem
 from filtergym.baselines.table import Baselines
 from filtergym.envs import registration
-from filtergym.envs.catalogue import catalogue, make_task, task_class
+from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.envs.maneuvering_target.task import ManeuveringTarget
 from filtergym.envs.observation import Block, Quantity
 from filtergym.envs.task import Task
 from filtergym.evaluation.competitors import ConstantPolicy
+from models import make_model
 
 import filtergym
 
@@ -35,7 +36,7 @@ class Turns(ManeuveringTarget):
     id = "mine/Turns-v0"
     paper_source = "nobody's"
 
-    def picture(self):
+    def picture(self, model):
         return None
 
 
@@ -184,7 +185,7 @@ def test_registering_again_changes_nothing(turns):
     filtergym.register_task(turns)
     filtergym.register_task(turns)
     assert task_class("mine/Turns-v0") is turns
-    assert make_task("mine/Turns-v0", "mode").control == "mode"
+    assert make_model("mine/Turns-v0", "mode").control == "mode"
 
 
 def test_what_ships_keeps_the_contract():

@@ -11,6 +11,7 @@ import pytest
 from filtergym.envs import rendering
 from filtergym.envs.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
+from filtergym.envs.model import Model
 from filtergym.evaluation.animation import episode_frames, write_animation
 
 import filtergym  # noqa: F401  # registers the environments
@@ -183,10 +184,10 @@ def test_limits_grow_on_a_ladder(limits, low, high, expected):
 
 
 def test_task_without_a_picture_of_its_own_gets_the_general_one():
-    task = TaskEnv(ID).task
-    assert isinstance(rendering.picture_of(task), ManeuveringTargetPicture)
-    stranger = type("Stranger", (type(task),), {"picture": lambda self: None})
-    assert type(rendering.picture_of(stranger(task.parameters, "gain"))) is rendering.Picture
+    model = TaskEnv(ID).model
+    assert isinstance(rendering.picture_of(model), ManeuveringTargetPicture)
+    stranger = type("Stranger", (type(model.task),), {"picture": lambda self, model: None})
+    assert type(rendering.picture_of(Model(stranger(model.task.parameters), "gain"))) is rendering.Picture
 
 
 def test_record_video_writes_the_episode(tmp_path):

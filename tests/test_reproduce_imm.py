@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.envs.catalogue import make_task
 from filtergym.papers.imm_alpha_beta import claims, experiment, figures
 from filtergym.papers.imm_alpha_beta.experiment import recorded
 from filtergym.papers.imm_alpha_beta.gain_schedules import (
@@ -22,6 +21,7 @@ from filtergym.papers.imm_alpha_beta.imm_readings import (
 )
 from filtergym.papers.measured import Measured
 from filtergym.papers.reproduction import judged
+from models import make_model
 
 from filtergym import evaluate
 from filtergym.papers import imm_alpha_beta as paper
@@ -122,7 +122,7 @@ def test_the_canonical_reading_equals_the_policy_on_every_step(keywords: dict[st
 
 
 def test_the_flight_is_the_environments(recording: Recording) -> None:
-    flight = maneuver_flight(make_task(ID, "gain", "paper").parameters)
+    flight = maneuver_flight(make_model(ID, "gain", "paper").task.parameters)
     x, vx = recording.truth[:, 0, 0], recording.truth[:, 2, 0]
     beyond_straight = x[1:] - x[:-1] - flight.interval * vx[:-1]
     numpy.testing.assert_allclose(flight.displacement[1:], beyond_straight, rtol=0, atol=1e-9)
@@ -133,7 +133,7 @@ def test_the_flight_is_the_environments(recording: Recording) -> None:
 
 def test_exact_errors_agree_with_monte_carlo() -> None:
     error = evaluate(ID, ["fixed-low"], "paper", 3000, seed=11)["error"].values[0]
-    flight = maneuver_flight(make_task(ID, "gain", "paper").parameters)
+    flight = maneuver_flight(make_model(ID, "gain", "paper").task.parameters)
     exact = mean_square_errors(flight, numpy.full(100, 0.3))
     for component, expected in ((0, exact.position), (2, exact.velocity)):
         squares = error[:, :, component] ** 2
@@ -143,7 +143,7 @@ def test_exact_errors_agree_with_monte_carlo() -> None:
 
 
 def test_exact_errors_of_constant_gains_in_the_windows() -> None:
-    flight = maneuver_flight(make_task(ID, "gain", "paper").parameters)
+    flight = maneuver_flight(make_model(ID, "gain", "paper").task.parameters)
     squares = mean_square_errors(flight, numpy.array([[0.3, 0.7]] * 100))
     turn = numpy.sqrt(squares.position[49:55].mean(axis=0))
     numpy.testing.assert_allclose(turn, [418.6, 101.7], atol=0.05)
@@ -160,7 +160,7 @@ def test_the_ramp_starts_again_at_the_detection() -> None:
 
 
 def test_no_nearby_schedule_is_better_than_the_best() -> None:
-    flight = maneuver_flight(make_task(ID, "gain", "paper").parameters)
+    flight = maneuver_flight(make_model(ID, "gain", "paper").task.parameters)
     best = best_schedule(flight)
     least = mean_square_errors(flight, best).position.sum()
     others = best[:, None] + 0.02 * numpy.random.default_rng(0).standard_normal((100, 200))

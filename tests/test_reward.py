@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.reward import paper_task
+from filtergym.envs.reward import paper_model
+from models import make_model
 
 import filtergym
 
@@ -17,23 +17,26 @@ ID = "filtergym/ManeuveringTarget-v0"
 
 def test_reward_is_the_compressed_charge(env_id):
     """By hand: with the charge x in units of the paper's, -30 log(1 + x / 30); relative adds the paper's own."""
-    task = make_task(env_id)
-    paper = paper_task(task)
-    watched, plain, relative = (Lanes(task, 8, beside) for beside in (paper, None, paper))
+    model = make_model(env_id)
+    paper = paper_model(model)
+    watched, plain, relative = (Lanes(model, 8, beside) for beside in (paper, None, paper))
     for lanes in (watched, plain, relative):
         for lane in range(8):
             lanes.seed(lane, np.random.default_rng(lane))
         lanes.restart()
     # Of one sign and the other: evidence that is the same for all hypotheses would change nothing.
-    action = np.resize([0.5, -0.5], task.action_space.shape) + np.zeros((8, 1))
+    action = np.resize([0.5, -0.5], model.action_space.shape) + np.zeros((8, 1))
     seen = []
     for _ in range(5):
         ours, theirs = (
             np.mean(
-                [[-30.0 * math.log1p(x / task.reward_unit / 30.0) for x in t.charge(s)] for s in states],
+                [
+                    [-30.0 * math.log1p(x / model.task.reward_unit / 30.0) for x in t.charge(s)]
+                    for s in states
+                ],
                 axis=0,
             )
-            for t, states in zip((task, paper), zip(*watched.decide(action), strict=True), strict=True)
+            for t, states in zip((model, paper), zip(*watched.decide(action), strict=True), strict=True)
         )
         np.testing.assert_allclose(plain.pay(action, "cost"), ours, rtol=1e-12)
         difference = np.subtract(ours, theirs)
@@ -57,7 +60,7 @@ def test_one_is_what_the_paper_pays_on_average(env_id):
 
 
 def test_the_default_is_the_environments_own(env_id, short, random_actions):
-    own = make_task(env_id).reward
+    own = make_model(env_id).task.reward
     envs = [TaskVectorEnv(env_id, 2, reward=kind, **short) for kind in (None, own, "cost", "relative")]
     for env in envs:
         env.reset(seed=4)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import xarray
 from filtergym.baselines.catalogue import baselines_of
-from filtergym.envs.catalogue import make_task
 from filtergym.evaluation.dataset import (
     group_of_each,
     groups_of,
@@ -20,6 +19,7 @@ from filtergym.evaluation.dataset import (
     seed_of,
     windows_of,
 )
+from models import make_model
 
 import filtergym
 from filtergym import evaluate, record, tidy_records
@@ -110,12 +110,12 @@ def test_tracks_and_a_seed_of_any_size(tmp_path):
 
 
 def test_seconds_where_measurements_come_regularly():
-    task = make_task("filtergym/UavAutopilot-v0", None, "paper-noise")
-    assert task.parameters.sampling_interval is None  # left to the plant
-    dataset = evaluate(task.id, ["kalman"], "paper-noise", 2, horizon=8)
-    np.testing.assert_allclose(dataset["elapsed"], task.interval * np.arange(1, 9))
+    model = make_model("filtergym/UavAutopilot-v0", None, "paper-noise")
+    assert model.task.parameters.sampling_interval is None  # left to the plant
+    dataset = evaluate(model.task.id, ["kalman"], "paper-noise", 2, horizon=8)
+    np.testing.assert_allclose(dataset["elapsed"], model.task.interval * np.arange(1, 9))
     assert dataset["elapsed"].attrs["units"] == "s"
-    assert evaluate(task.id, ["kalman"], "paper-noise", 2, horizon=8, sampling_interval=0.1).elapsed[
+    assert evaluate(model.task.id, ["kalman"], "paper-noise", 2, horizon=8, sampling_interval=0.1).elapsed[
         0
     ] == pytest.approx(0.1)
     # Scans that miss the target leave gaps; the number of a plot then says nothing about its time.

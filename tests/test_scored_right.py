@@ -324,7 +324,7 @@ class TestMadePolicy:
         np.testing.assert_array_equal(found, dataset["cost"].values.ravel())
 
         with pytest.raises(ValueError, match="the state is not one of 130 episodes"):
-            policy.predict(np.zeros((130, len(policy.task.fields))), policy.begin([0]))
+            policy.predict(np.zeros((130, len(policy.model.fields))), policy.begin([0]))
 
     def test_of_a_run_and_of_an_object(self, tmp_path):
         for policy in (str(run_folder(tmp_path / "run")), Sluggish):
@@ -335,7 +335,7 @@ class TestMadePolicy:
 
     def test_the_first_call_begins_an_episode(self):
         policy = make_policy(ID, Sluggish)
-        shown = np.zeros((2, len(policy.task.fields)))
+        shown = np.zeros((2, len(policy.model.fields)))
         expected = np.full((2, 1), np.tanh(0.9 * 3.0))
         for state in (None, policy.begin([0, 1])):
             action, after = policy.predict(shown, state)
@@ -351,7 +351,7 @@ class TestMadePolicy:
         policy = make_policy(env, name)
         observation, _ = env.reset(seed=0, options={"shortened_by": np.arange(11)})
         state, start, actions = None, np.ones(11, dtype=bool), []
-        inner, memory = competitor(ID, name)(env.unwrapped.task), None
+        inner, memory = competitor(ID, name)(env.unwrapped.model), None
         alone = [make_policy(env, name) for _ in range(11)]
         states = [None] * 11
         for _ in range(40):

@@ -21,7 +21,8 @@ from filtergym.agents.search import (
 )
 from filtergym.agents.training_run import RunOptions, load_run, new_run, save_run
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
+from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
 SPACE = {"learning_rate": {"low": 1e-4, "high": 1e-2, "log": True, "prefix": "lin_"}, "hidden_size": [2, 4]}
@@ -159,8 +160,11 @@ def test_shipped_spaces_are_of_settings_that_there_are(algorithm):
             assert rollout % chosen.get("batch_size", 1) == 0
     if algorithm == "bptt":
         for id in catalogue():
-            task = make_task(id)
-            assert max(read_space(id, "bptt")["truncation"]) == task.horizon // task.decision_interval
+            model = make_model(id)
+            assert (
+                max(read_space(id, "bptt")["truncation"])
+                == model.task.horizon // model.task.decision_interval
+            )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tightly_coupled_navigation import estimators, metrics, policies, references
 from filtergym.baselines.tuning import Search, tune
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.filter import Initial
 from filtergym.envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from filtergym.envs.tightly_coupled_navigation.world import Measurement
@@ -18,6 +17,7 @@ from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
 from filtergym.papers.measured import Measured
 from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
+from models import make_model
 from naive import dense
 
 from filtergym import evaluate, tidy_records
@@ -69,7 +69,7 @@ def test_bound_is_the_dense_recursion():
         "satellites_outage_duration": (0.1, 0.1), "rest_probability": 0.5, "horizon": 40, "decision_interval": 1,
         "manoeuvre_throughout": 0.0, "undisturbed": 0.0, "urban": False, "aperture": False,
     }  # fmt: skip
-    task = make_task(ID, **keywords)
+    model = make_model(ID, **keywords)
     seen = []
 
     class Watched(references.KnownModeBound):
@@ -77,23 +77,25 @@ def test_bound_is_the_dense_recursion():
             seen.append((measurement, truth))
             return super().update(measurement, truth, memory)
 
-    run = rollout(task, Watched(task), episode_seeds("test", 3, 8))
+    run = rollout(model, Watched(model.task), episode_seeds("test", 3, 8))
     bounds = [episode.filter.mean_square for episode, _ in run]
     assert (numpy.stack([s.jumped for _, s in seen]).sum(axis=0) > 1).all()
     assert numpy.stack([s.stuck for _, s in seen]).any(axis=0).all()
-    p, S = task.parameters, task.satellites
+    p, S = model.task.parameters, model.task.satellites
     identity = numpy.eye(17)[:, :, None, None]
     F = [
-        gnss_ins.advance(identity, task.axis[:, :, i : i + 1], task.common.T, task.common.decay)[..., 0, 0]
+        gnss_ins.advance(
+            identity, model.task.axis[:, :, i : i + 1], model.task.common.T, model.task.common.decay
+        )[..., 0, 0]
         for i in range(3)
     ]
     user = [0, 1, 2, 4, 5, 6, 8, 9, 10]
-    Q = [task.process_noise[:, :, i, 0].copy() for i in range(3)]
+    Q = [model.task.process_noise[:, :, i, 0].copy() for i in range(3)]
     Q[REST][numpy.ix_(user, user)] = 0.0
     for i in (8, 9, 10):
         Q[LINE][i, i] = 0.0  # the acceleration of straight flight is zero, not nearly
     for lane in range(8):
-        P = numpy.diag(task.world.initial_sigma[:, 0] ** 2)
+        P = numpy.diag(model.task.world.initial_sigma[:, 0] ** 2)
         mode = int(seen[0][1].mode[lane])
         for (said, truth), mean_square in zip(seen, bounds, strict=True):
             jumped = truth.jumped[lane] > 0.0
@@ -101,10 +103,10 @@ def test_bound_is_the_dense_recursion():
             P = F[i] @ P @ F[i].T + Q[i]
             if jumped:
                 P[8:11] = P[:, 8:11] = 0.0
-            position, velocity = task.satellites_at(truth.step)
+            position, velocity = model.task.satellites_at(truth.step)
             _, rows = gnss_ins.observe(truth.state, position, velocity, said.ins_angles, p.gravity)
             H = dense(rows, truth.state)[..., lane]
-            R = numpy.array(task.sensor_variance) * truth.noise_factor[:, lane] ** 2
+            R = numpy.array(model.task.sensor_variance) * truth.noise_factor[:, lane] ** 2
             there = said.available[:, lane] > 0.0
             there[2 * S : 2 * S + 3] &= truth.stuck[lane] == 0.0
             H, R = H[there], numpy.diag(R[there])
@@ -147,44 +149,48 @@ def test_bound_is_below_the_reference(on_random):
 
 
 def test_sticky_changes_the_chain_of_the_bank(on_random):
-    assert make_task(ID, **policies.Sticky.task_keywords).parameters.transition == policies.chain(0.9999)
-    assert policies.chain(0.998) == pytest.approx(numpy.array(make_task(ID).parameters.transition), abs=1e-15)
+    assert make_model(ID, **policies.Sticky.task_keywords).task.parameters.transition == policies.chain(
+        0.9999
+    )
+    assert policies.chain(0.998) == pytest.approx(
+        numpy.array(make_model(ID).task.parameters.transition), abs=1e-15
+    )
     error = on_random["error"]
     assert (error.sel(policy="sticky") != error.sel(policy="multi-hypothesis")).any()
 
 
-def observed(task, **values):
+def observed(model, **values):
     """Two quiet observations with some fields replaced."""
-    observation = numpy.zeros((2, len(task.fields)))
+    observation = numpy.zeros((2, len(model.fields)))
     for name, value in values.items():
-        columns = [i for i, f in enumerate(task.fields) if f.name.startswith(name)]
+        columns = [i for i, f in enumerate(model.fields) if f.name.startswith(name)]
         assert columns, name
         observation[0, columns] = value
     return observation
 
 
 def test_nis_adaptive_divides_the_excess():
-    task = make_task(ID, "gain")
-    policy = policies.NisAdaptive(task, threshold=2.0, rates=0.5, accelerometers=3.0, base=0.1)
+    model = make_model(ID, "gain")
+    policy = policies.NisAdaptive(model, threshold=2.0, rates=0.5, accelerometers=3.0, base=0.1)
     shown = math.log1p(2.0 * 9.0) / (1.0 + math.log1p(2.0 * 9.0) / 8.0)
-    action, _ = policy.predict(observed(task, average_nis_rates=shown))
+    action, _ = policy.predict(observed(model, average_nis_rates=shown))
     excess = math.log(9.0) / (2 * math.log(300.0))
     assert action[0] == pytest.approx([0.0, 0.5 * excess, 0.1 + 3.0 * excess, 0.0], rel=1e-12)
     assert action[1] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
-    policy = policies.NisAdaptive(task, threshold=2.0, own=0.5)
-    action, _ = policy.predict(observed(task, average_nis_accelerometers=shown))
+    policy = policies.NisAdaptive(model, threshold=2.0, own=0.5)
+    action, _ = policy.predict(observed(model, average_nis_accelerometers=shown))
     assert action[0] == pytest.approx([0.0, 0.0, 0.5 * excess, 0.0], rel=1e-12)
 
 
 def test_nis_adaptive_listens_to_the_hypothesis_that_is_content():
-    task = make_task(ID, "gain")
-    policy = policies.NisAdaptive(task, threshold=2.0, base=0.1)
-    quiet = observed(task, average_nis_rates=5.0, average_nis_rates_rest=0.0)
+    model = make_model(ID, "gain")
+    policy = policies.NisAdaptive(model, threshold=2.0, base=0.1)
+    quiet = observed(model, average_nis_rates=5.0, average_nis_rates_rest=0.0)
     assert policy.predict(quiet)[0][0] == pytest.approx([0.0, 0.0, 0.1, 0.0], abs=0.0)
 
 
 def test_stuck_check_switches_stuck_accelerometers_off():
-    task = make_task(ID, "gain", rate_fault_probability=0.0, stick_probability=1.0, horizon=200)
+    model = make_model(ID, "gain", rate_fault_probability=0.0, stick_probability=1.0, horizon=200)
     actions = []
 
     class Watched(policies.StuckCheck):
@@ -193,24 +199,24 @@ def test_stuck_check_switches_stuck_accelerometers_off():
             actions.append(action[:, 2])
             return action, state
 
-    states = [episode for episode, _ in rollout(task, Watched(task), episode_seeds("test", 5, 8))]
+    states = [episode for episode, _ in rollout(model, Watched(model), episode_seeds("test", 5, 8))]
     stuck = numpy.stack([s.truth.stuck for s in states]) > 0.0
     assert stuck.any(axis=0).all()
     # A decision is told of the measurements since the last one; the first of one.
-    first = [max(0, (k - 1) * task.decision_interval + 1) for k in range(len(actions))]
-    told = [stuck[i : k * task.decision_interval + 1].any(axis=0) for k, i in enumerate(first)]
+    first = [max(0, (k - 1) * model.task.decision_interval + 1) for k in range(len(actions))]
+    told = [stuck[i : k * model.task.decision_interval + 1].any(axis=0) for k, i in enumerate(first)]
     assert ((numpy.stack(actions) == 1.0) == told).all()
 
 
 def test_fallback_says_nothing_of_other_sensors():
-    task = make_task(ID, "gain")
-    check, fallback = policies.StuckCheck(task), policies.StuckCheckFallback(task)
-    bad = observed(task, average_nis=math.log1p(30.0))
+    model = make_model(ID, "gain")
+    check, fallback = policies.StuckCheck(model), policies.StuckCheckFallback(model)
+    bad = observed(model, average_nis=math.log1p(30.0))
     assert (check.predict(bad)[0][0] > 0.0).tolist() == [True, False, True, True]
     action, _ = fallback.predict(bad)
     assert action[0] == pytest.approx([0.0, 0.0, check.predict(bad)[0][0, 2], 0.0], abs=0.0)
     assert (action[1] == 0.0).all()
-    repeated = observed(task, average_nis=math.log1p(30.0), accelerometers_repeat=0.1)
+    repeated = observed(model, average_nis=math.log1p(30.0), accelerometers_repeat=0.1)
     assert fallback.predict(repeated)[0].tolist() == [[0.0, 0.0, 1.0, 0.0], [0.0] * 4]
 
 
@@ -267,26 +273,28 @@ def test_robust_is_between_the_paper_and_hubers_update():
 
 
 def test_accelerometers_are_noisier_while_they_repeat_themselves():
-    task = make_task(ID, "robust", scenario="accelerometer-failure")
-    state = task.bank.start(Initial(numpy.zeros((17, 2)), numpy.stack([numpy.eye(17)] * 2, axis=2)))
+    model = make_model(ID, "robust", scenario="accelerometer-failure")
+    state = model.filter.start(Initial(numpy.zeros((17, 2)), numpy.stack([numpy.eye(17)] * 2, axis=2)))
     state = state._replace(repeated=numpy.array([0.0, 1.0]))
     action = numpy.array([[0.1, 0.0, 0.2, 0.0, 0.5, 1.0, 0.5]] * 2).T
-    variance = numpy.stack(task.bank._variance(action, state))
-    nominal = numpy.array(task.sensor_variance)[:, None]
+    variance = numpy.stack(model.filter._variance(action, state))
+    nominal = numpy.array(model.task.sensor_variance)[:, None]
     exponent = numpy.zeros((14, 2))
     exponent[:4] = 0.1
     exponent[8:11] = [0.2, 0.7]
     numpy.testing.assert_allclose(variance, nominal * 300.0 ** (2.0 * exponent), rtol=1e-12)
-    assert [float(k[0]) for k in task.bank._thresholds(action)] == [1.345] * 4 + [2.69] * 4 + [math.inf] * 6
+    assert [float(k[0]) for k in model.filter._thresholds(action)] == [1.345] * 4 + [2.69] * 4 + [
+        math.inf
+    ] * 6
 
 
 def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
-    task = make_task(ID)
+    model = make_model(ID)
     available = numpy.ones((14, 4))
     available[8:11, 1] = 0.0
     available[9, 2:] = 0.0
     measurement = Measurement(*[None] * 2, available, *[None] * 4)
-    check = estimators.HuberStuckCheck(task, rates=2.0, manoeuvre=3.0).huber.bank
+    check = estimators.HuberStuckCheck(model.task, rates=2.0, manoeuvre=3.0).huber.bank
     average = numpy.full((4, 3, 4), 9.0)
     average[1, 2, 3] = 2.9
     state = check.start(Initial(numpy.ones((17, 4)), numpy.ones((17, 17, 4))))._replace(average_nis=average)
@@ -295,11 +303,11 @@ def test_updates_are_plain_where_a_manoeuvre_may_begin_unfelt():
     for lane, plain in enumerate([False, True, True, False]):
         expected = [math.inf] * 14 if plain else [usual] * 4 + [2.0] * 4 + [math.inf] * 6
         assert thresholds[:, lane].tolist() == expected
-    assert (numpy.stack(estimators.Huber(task).bank.thresholds(state, measurement)) == usual).all()
+    assert (numpy.stack(estimators.Huber(model.task).bank.thresholds(state, measurement)) == usual).all()
 
 
 def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
-    task = make_task(
+    model = make_model(
         ID,
         rate_fault_probability=0.0,
         stick_probability=1.0,
@@ -307,7 +315,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
         satellites_outage_probability=1.0,
         satellites_outage_duration=(0.5, 0.5),
     )
-    estimator = estimators.HuberStuckCheck(task)
+    estimator = estimators.HuberStuckCheck(model.task)
     seen = []
     predict = estimator.huber.bank.predict
 
@@ -316,7 +324,7 @@ def test_stuck_accelerometers_are_left_out_from_the_first_repeated_reading_on():
         return predict(state, measurement)
 
     estimator.huber.bank.predict = watched
-    told = [episode for episode, _ in rollout(task, estimator, episode_seeds("test", 5, 8))]
+    told = [episode for episode, _ in rollout(model, estimator, episode_seeds("test", 5, 8))]
     stuck = numpy.stack([episode.truth.stuck for episode in told])
     there = numpy.stack([episode.measurement.available for episode in told])
     assert (stuck.sum(axis=0) > 0).all()
@@ -393,8 +401,8 @@ def test_loss_of_track_is_found_and_timed():
 
 
 def test_known_mode_keeps_its_tracking_loops():
-    task = make_task(ID, "evidence", "paper", leg_steps=(40, 80), horizon=120)
-    run = rollout(task, references.KnownMode, episode_seeds("test", 6, 8))
+    model = make_model(ID, "evidence", "paper", leg_steps=(40, 80), horizon=120)
+    run = rollout(model, references.KnownMode, episode_seeds("test", 6, 8))
     available = [episode.measurement.available for episode, _ in run]
     assert numpy.stack(available).min() == 1.0
 

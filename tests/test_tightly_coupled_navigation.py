@@ -4,8 +4,7 @@ import math
 
 import numpy
 import pytest
-from filtergym.envs.backend import task_on
-from filtergym.envs.task import Episode
+from filtergym.envs.model import Episode, Model
 from filtergym.envs.tightly_coupled_navigation.parameters import (
     SINGER,
     TightlyCoupledNavigationParameters,
@@ -13,20 +12,21 @@ from filtergym.envs.tightly_coupled_navigation.parameters import (
 from filtergym.envs.tightly_coupled_navigation.scenarios import SCENARIOS
 from filtergym.envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from filtergym.filters import gnss_ins
+from models import make_model
 from naive import dense
 
 ZERO = {"evidence": 3, "weights": 3, "gain": 4}
 
 
-def make(scenario, control="evidence", xp=numpy, **keywords):
+def make(scenario, control="evidence", xp=numpy, **keywords) -> Model:
     parameters = TightlyCoupledNavigationParameters(**{**SCENARIOS[scenario].parameters, **keywords})
-    return TightlyCoupledNavigation(parameters, control, xp)
+    return Model(TightlyCoupledNavigation(parameters, xp), control)
 
 
-def numbers(task, N, seed, steps):
+def numbers(model, N, seed, steps):
     """Uniforms, initial normals, and one row for each step."""
     rng = numpy.random.default_rng(seed)
-    layout = task.noise
+    layout = model.task.noise
     uniforms, normals = rng.random((layout.uniforms, N)), rng.standard_normal((layout.initial_normals, N))
     rows = (
         numpy.concatenate([rng.standard_normal((layout.normals, N)), rng.random((layout.row_uniforms, N))])
@@ -35,15 +35,15 @@ def numbers(task, N, seed, steps):
     return uniforms, normals, rows
 
 
-def drive(task, N, seed, steps, action=None, kind=numpy.asarray):
+def drive(model, N, seed, steps, action=None, kind=numpy.asarray):
     """Yield step, state after ``measure``, observation and state after ``act``."""
-    uniforms, normals, rows = numbers(task, N, seed, steps)
-    state = task.begin(kind(uniforms), kind(normals))
+    uniforms, normals, rows = numbers(model, N, seed, steps)
+    state = model.begin(kind(uniforms), kind(normals))
     for k, row in enumerate(rows, 1):
-        measured = task.measure(state, kind(row))
-        observation = task.observe(measured)
-        zero = kind(numpy.zeros((ZERO.get(task.control, 3), N)))
-        state = task.act(measured, zero if action is None else action(k, observation, measured))
+        measured = model.measure(state, kind(row))
+        observation = model.observe(measured)
+        zero = kind(numpy.zeros((ZERO.get(model.control, 3), N)))
+        state = model.act(measured, zero if action is None else action(k, observation, measured))
         yield k, measured, observation, state
 
 
@@ -51,9 +51,9 @@ def singer(k, observation, state):
     return numpy.full(state.truth.step.shape, SINGER)
 
 
-def naive_bank(task, state, posterior):
+def naive_bank(model, state, posterior):
     """Steps 1 to 8 of the paper for one lane, with dense matrices and the information form."""
-    p = task.parameters
+    p = model.task.parameters
     means, covariances, probabilities = posterior
     pi = numpy.array(p.transition)
     predicted = probabilities @ pi
@@ -66,16 +66,19 @@ def naive_bank(task, state, posterior):
             for w, m, c in zip(weight, means, covariances, strict=True)
         )
         F = gnss_ins.advance(
-            numpy.eye(17)[:, :, None, None], task.axis[:, :, i : i + 1], task.common.T, task.common.decay
+            numpy.eye(17)[:, :, None, None],
+            model.task.axis[:, :, i : i + 1],
+            model.task.common.T,
+            model.task.common.decay,
         )[..., 0, 0]
-        mean, P = F @ mean, F @ P @ F.T + task.process_noise[:, :, i, 0]
+        mean, P = F @ mean, F @ P @ F.T + model.task.process_noise[:, :, i, 0]
         said = state.measurement
         expected, rows = gnss_ins.observe(
             mean[:, None], said.satellite_position, said.satellite_velocity, said.ins_angles, p.gravity
         )
         H = dense(rows, mean[:, None])[..., 0]
         nu = (said.readings - expected)[:, 0]
-        R = numpy.diag(task.sensor_variance)
+        R = numpy.diag(model.task.sensor_variance)
         S = H @ P @ H.T + R
         log_likelihoods.append(
             -0.5 * (nu @ numpy.linalg.solve(S, nu) + numpy.linalg.slogdet(2 * numpy.pi * S)[1])
@@ -92,17 +95,17 @@ def naive_bank(task, state, posterior):
 
 @pytest.mark.parametrize(("scenario", "seed"), [("random", 0), ("random", 1), ("paper", 2)])
 def test_zero_evidence_is_the_algorithm_of_the_paper(scenario, seed):
-    task = make(scenario, leg_steps=(20, 40))
+    model = make(scenario, leg_steps=(20, 40))
     posterior = None
-    for _, measured, _, state in drive(task, 1, seed, 60):
+    for _, measured, _, state in drive(model, 1, seed, 60):
         if posterior is None:
-            start = task.begin(*numbers(task, 1, seed, 0)[:2]).filter
+            start = model.begin(*numbers(model, 1, seed, 0)[:2]).filter
             posterior = (
                 list(start.means[..., 0].T),
                 [start.covariances[:, :, i, 0] for i in range(3)],
                 start.probabilities[:, 0],
             )
-        posterior, estimate = naive_bank(task, measured, posterior)
+        posterior, estimate = naive_bank(model, measured, posterior)
         # The information form inverts a covariance with a condition near 1e11; the mixture amplifies it.
         numpy.testing.assert_allclose(state.filter.mean[:, 0], estimate, rtol=1e-6, atol=1e-5)
         numpy.testing.assert_allclose(state.filter.probabilities[:, 0], posterior[2], atol=1e-5)
@@ -143,27 +146,27 @@ def test_truth_and_noise_do_not_depend_on_the_control():
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_lanes_do_not_depend_on_their_neighbours(scenario):
     """16 lanes at different times give bit for bit what each gives alone (padded to 8)."""
-    task = make(scenario)
-    uniforms, normals, rows = numbers(task, 16, 5, 12)
+    model = make(scenario)
+    uniforms, normals, rows = numbers(model, 16, 5, 12)
     rows = list(rows)
-    state = task.begin(uniforms, normals)
+    state = model.begin(uniforms, normals)
     for row in rows:
-        state = task.act(task.measure(state, row), numpy.zeros((3, 16)))
-    half = task.begin(uniforms[:, 8:], normals[:, 8:])
+        state = model.act(model.measure(state, row), numpy.zeros((3, 16)))
+    half = model.begin(uniforms[:, 8:], normals[:, 8:])
     for row in rows:
-        half = task.act(task.measure(half, row[:, 8:]), numpy.zeros((3, 8)))
-    assert (task.observe(state)[:, 8:] == task.observe(half)).all()
-    assert (task.cost(state)[8:] == task.cost(half)).all()
+        half = model.act(model.measure(half, row[:, 8:]), numpy.zeros((3, 8)))
+    assert (model.observe(state)[:, 8:] == model.observe(half)).all()
+    assert (model.cost(state)[8:] == model.cost(half)).all()
 
 
 def test_lanes_may_stand_at_different_times():
-    task = make("random")
-    uniforms, normals, rows = numbers(task, 8, 6, 10)
+    model = make("random")
+    uniforms, normals, rows = numbers(model, 8, 6, 10)
     rows, zero = list(rows), numpy.zeros((3, 8))
-    ahead = task.begin(uniforms, normals)
+    ahead = model.begin(uniforms, normals)
     for row in rows[:5]:
-        ahead = task.act(task.measure(ahead, row), zero)
-    fresh = task.begin(uniforms, normals)
+        ahead = model.act(model.measure(ahead, row), zero)
+    fresh = model.begin(uniforms, normals)
     mask = numpy.arange(8) < 4
 
     def chosen(a, b):
@@ -172,87 +175,87 @@ def test_lanes_may_stand_at_different_times():
         return numpy.where(mask, a, b)
 
     mixed = Episode(chosen(ahead.truth, fresh.truth), None, chosen(ahead.filter, fresh.filter))
-    both = task.measure(mixed, rows[5])
-    for lanes, alone in ((mask, task.measure(ahead, rows[5])), (~mask, task.measure(fresh, rows[5]))):
-        assert (task.observe(both)[:, lanes] == task.observe(alone)[:, lanes]).all()
+    both = model.measure(mixed, rows[5])
+    for lanes, alone in ((mask, model.measure(ahead, rows[5])), (~mask, model.measure(fresh, rows[5]))):
+        assert (model.observe(both)[:, lanes] == model.observe(alone)[:, lanes]).all()
 
 
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 @pytest.mark.parametrize("scenario", ["random", "two-satellites", "urban", "paper"])
 def test_no_truth_in_the_observation(scenario, control):
     """The measurements alone, replayed over no truth at all, give the same observations and estimates."""
-    task = make(scenario, control)
-    start = task.begin(*numbers(task, 8, 7, 0)[:2]).measurement
-    state = Episode(None, start, task.bank.start(start))
-    for _, measured, observation, after in drive(task, 8, 7, 30):
-        bank = task.bank.predict(state.filter, measured.measurement)
+    model = make(scenario, control)
+    start = model.begin(*numbers(model, 8, 7, 0)[:2]).measurement
+    state = Episode(None, start, model.filter.start(start))
+    for _, measured, observation, after in drive(model, 8, 7, 30):
+        bank = model.filter.predict(state.filter, measured.measurement)
         state = Episode(None, measured.measurement, bank)
-        assert (task.observe(state) == observation).all()
-        state = task.act(state, numpy.zeros((ZERO[control], 8)))
-        assert (task.mean(state) == task.mean(after)).all()
+        assert (model.observe(state) == observation).all()
+        state = model.act(state, numpy.zeros((ZERO[control], 8)))
+        assert (model.mean(state) == model.mean(after)).all()
 
 
 @pytest.mark.parametrize("hidden", ["noise_factor", "stuck", "mode", "jumped"])
 def test_what_the_sensors_hide_is_not_measured(hidden):
     """A truth that differs in what nobody is told, in a step where it has no effect, measures alike."""
-    task = make("random", stick_probability=0.0, rate_fault_probability=0.0)
-    uniforms, normals, rows = numbers(task, 8, 7, 2)
+    model = make("random", stick_probability=0.0, rate_fault_probability=0.0)
+    uniforms, normals, rows = numbers(model, 8, 7, 2)
     first, second = rows
-    truth = task.measure(task.begin(uniforms, normals), first).truth
+    truth = model.measure(model.begin(uniforms, normals), first).truth
     other = truth._replace(**{hidden: 1 + getattr(truth, hidden)})
-    (_, said), (_, same) = (task.world.advance(t, second, None) for t in (truth, other))
+    (_, said), (_, same) = (model.task.world.advance(t, second, None) for t in (truth, other))
     for name, value in said._asdict().items():
         numpy.testing.assert_array_equal(value, getattr(same, name), err_msg=name)
 
 
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 def test_tracking_loops_lose_what_the_feedback_does_not_expect(control):
-    task = make("paper", control)
-    *_, (_, _, _, state) = drive(task, 8, 7, 5)
-    expected = task.bank.feedback(state.filter, state.measurement)
-    row = numpy.zeros((task.noise.normals, 8))
+    model = make("paper", control)
+    *_, (_, _, _, state) = drive(model, 8, 7, 5)
+    expected = model.filter.feedback(state.filter, state.measurement)
+    row = numpy.zeros((model.task.noise.normals, 8))
     far = expected.copy()
     far[7, :4] += 10.0  # clock drift, m/s: more than the rates' aperture
     far[3, 4:] += 300.0  # clock bias, m: more than the ranges' aperture
     for feedback, rates, ranges in ((None, 1.0, 1.0), (expected, 1.0, 1.0), (far, 0.0, 0.0)):
-        _, said = task.world.advance(state.truth, row, feedback)
+        _, said = model.task.world.advance(state.truth, row, feedback)
         assert (said.available[4:8, :4] == rates).all()
         assert (said.available[:4, 4:] == ranges).all()
         assert (said.available[:4, :4] == 1.0).all()
         assert (said.available[4:8, 4:] == 1.0).all()
         assert (said.available[8:] == 1.0).all()
-    assert make("matched", control).bank.feedback(state.filter, state.measurement) is None
+    assert make("matched", control).filter.feedback(state.filter, state.measurement) is None
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
 def test_fields_match_the_observation_and_are_of_order_one(scenario):
-    task = make(scenario)
-    assert len({f.name for f in task.fields}) == len(task.fields)
-    for *_, observation, _ in drive(task, 8, 8, 20):
-        assert observation.shape == (len(task.fields), 8)
+    model = make(scenario)
+    assert len({f.name for f in model.fields}) == len(model.fields)
+    for *_, observation, _ in drive(model, 8, 8, 20):
+        assert observation.shape == (len(model.fields), 8)
         assert numpy.isfinite(observation).all()
         assert abs(observation).max() < 10.0
 
 
 def test_innovations_are_read_in_their_units():
-    task = make("paper")
-    for _, measured, observation, _ in drive(task, 8, 8, 5):
+    model = make("paper")
+    for _, measured, observation, _ in drive(model, 8, 8, 5):
         innovation = measured.filter.range_innovation * measured.measurement.available[:8]
         for part, name in (
             (slice(0, 4), "pseudorange_innovation_in_metres"),
             (slice(4, 8), "rate_innovation_in_metres_per_second"),
         ):
             # Through a logarithm and back.
-            read = task.reader(name)(observation.T)
+            read = model.reader(name)(observation.T)
             numpy.testing.assert_allclose(read.T, innovation[part], rtol=1e-13, atol=1e-15)
 
 
 @pytest.mark.parametrize("slots", [(19,), (1, 19), (1, 11, 19), (1, 2, 11, 19, 20)])
 def test_other_numbers_of_satellites(slots):
-    task = make("random", satellites=slots, satellites_outage_probability=0.0)
-    *_, (*_, observation, state) = drive(task, 8, 9, 60)
-    assert observation.shape[0] == len(task.fields)
-    assert numpy.isfinite(task.cost(state)).all()
+    model = make("random", satellites=slots, satellites_outage_probability=0.0)
+    *_, (*_, observation, state) = drive(model, 8, 9, 60)
+    assert observation.shape[0] == len(model.fields)
+    assert numpy.isfinite(model.cost(state)).all()
     sigma = numpy.sqrt(numpy.einsum("iin->in", state.filter.covariance)[:3]).mean()
     full = make("random", satellites_outage_probability=0.0)
     *_, (*_, reference) = drive(full, 8, 9, 60)
@@ -285,13 +288,13 @@ def test_bad_parameters_are_refused_with_the_reason(keywords, message):
 
 
 def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
-    task = make("random", stick_probability=0.0, rate_fault_probability=0.0)
-    *_, (_, measured, _, _) = drive(task, 8, 10, 5)
+    model = make("random", stick_probability=0.0, rate_fault_probability=0.0)
+    *_, (_, measured, _, _) = drive(model, 8, 10, 5)
     thrown = measured.measurement.readings.copy()
     thrown[4:8] += 8.0  # 80 sigma of four rates
-    bank = task.bank.predict(measured.filter, measured.measurement._replace(readings=thrown))
+    bank = model.filter.predict(measured.filter, measured.measurement._replace(readings=thrown))
     assert (bank.log_likelihood < -2800.0).any()
-    probabilities = task.bank.act(bank, measured.measurement, numpy.zeros((3, 8))).probabilities
+    probabilities = model.filter.act(bank, measured.measurement, numpy.zeros((3, 8))).probabilities
     numpy.testing.assert_allclose(probabilities.sum(axis=0), 1.0, rtol=1e-15)
     winner = (bank.predicted.log_probabilities + bank.log_likelihood).argmax(axis=0)
     assert (probabilities.argmax(axis=0) == winner).all()
@@ -303,10 +306,10 @@ UNMIXED = {"urban": False, "aperture": False, "undisturbed": 0.0}
 
 
 def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre():
-    task, N = make("random", horizon=300), 4000
-    uniforms, normals, _ = numbers(task, N, 21, 0)
-    truth = task.begin(uniforms, normals).truth
-    faults, p = truth.faults, task.parameters
+    model, N = make("random", horizon=300), 4000
+    uniforms, normals, _ = numbers(model, N, 21, 0)
+    truth = model.begin(uniforms, normals).truth
+    faults, p = truth.faults, model.task.parameters
     four = 4.0 * math.sqrt(0.25 / N)
     windows = numpy.stack([faults.noisy, faults.stuck, faults.no_rates, faults.hidden, faults.ramp])[:, 1]
     calm = (windows < 0.0).all(axis=0) & (faults.urban == 0.0) & (faults.aperture == 0.0)
@@ -328,9 +331,11 @@ def test_some_episodes_are_undisturbed_between_houses_steered_or_one_manoeuvre()
 
 
 def test_only_some_tracking_loops_have_an_aperture_and_only_some_receivers_reflections():
-    task = make("random", aperture_probability=0.5, urban_probability=0.5, undisturbed=0.0, rate_aperture=0.1)
+    model = make(
+        "random", aperture_probability=0.5, urban_probability=0.5, undisturbed=0.0, rate_aperture=0.1
+    )
     lost, off = numpy.zeros(16), numpy.zeros(16)
-    for _, state, _, _ in drive(task, 16, 22, 60):
+    for _, state, _, _ in drive(model, 16, 22, 60):
         faults, step = state.truth.faults, state.truth.step
         excused = numpy.zeros(16, dtype=bool)
         for first, last in (faults.no_rates, faults.hidden):
@@ -355,7 +360,10 @@ def test_a_pseudorange_drifts_off_as_stated():
         error[place, numpy.arange(8)] = expected
         assert s.range_error == pytest.approx(error, abs=1e-12)
         ranges, _ = gnss_ins.observe(
-            s.state, *quiet.satellites_at(s.step), state.measurement.ins_angles, quiet.parameters.gravity
+            s.state,
+            *quiet.task.satellites_at(s.step),
+            state.measurement.ins_angles,
+            quiet.task.parameters.gravity,
         )
         # Ranges of 2e7 m are rounded by 4e-9, the noise is 1e-4: ten sigma.
         assert state.measurement.readings[:4] - ranges[:4] == pytest.approx(error, abs=1e-3)
@@ -364,7 +372,7 @@ def test_a_pseudorange_drifts_off_as_stated():
 
 
 def test_faults_and_outages_happen_when_and_where_they_are_drawn():
-    task = make(
+    model = make(
         "random",
         stick_probability=1.0,
         rate_fault_probability=1.0,
@@ -376,7 +384,7 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
         **UNMIXED,
     )
     previous, noisy, stuck, out = None, 0, 0, 0
-    for k, state, _, _ in drive(task, 8, 11, 600):
+    for k, state, _, _ in drive(model, 8, 11, 600):
         s, said = state.truth, state.measurement
         assert ((s.noise_factor[4:8] == 1.0) | (s.noise_factor[4:8] == s.faults.rate_factor)).all()
         noisy = noisy + (s.noise_factor[4:8] > 1.0).sum(axis=0)
@@ -400,9 +408,9 @@ def test_faults_and_outages_happen_when_and_where_they_are_drawn():
 
 
 def test_rates_are_lost_when_it_is_drawn():
-    task = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5, **UNMIXED)
+    model = make("random", satellites_outage_probability=0.0, rates_outage_probability=0.5, **UNMIXED)
     lost, drawn = 0, 0
-    for _, state, _, _ in drive(task, 16, 11, 600):
+    for _, state, _, _ in drive(model, 16, 11, 600):
         (first, last), step = state.truth.faults.no_rates, state.truth.step
         inside = (first <= step) & (step <= last)
         assert (state.measurement.available[4:8] == ~inside).all()
@@ -414,9 +422,9 @@ def test_rates_are_lost_when_it_is_drawn():
 
 def test_outages_are_as_probable_and_as_long_as_stated():
     runs = 4000
-    task = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6, **UNMIXED)
-    p = task.parameters
-    faults = task.begin(*numbers(task, runs, 14, 0)[:2]).truth.faults
+    model = make("random", rates_outage_probability=0.3, satellites_outage_probability=0.6, **UNMIXED)
+    p = model.task.parameters
+    faults = model.begin(*numbers(model, runs, 14, 0)[:2]).truth.faults
     for (first, last), probability, seconds in (
         (faults.no_rates, 0.3, p.rates_outage_duration),
         (faults.hidden, 0.6, p.satellites_outage_duration),
@@ -434,10 +442,10 @@ def test_outages_are_as_probable_and_as_long_as_stated():
 
 
 def test_urban_errors_have_the_stated_quantiles():
-    task = make("urban")
+    model = make("urban")
     rng = numpy.random.default_rng(12)
     N = 40000
-    truth = task.begin(rng.random((task.noise.uniforms, 8)), rng.standard_normal((17, 8))).truth
+    truth = model.begin(rng.random((model.task.noise.uniforms, 8)), rng.standard_normal((17, 8))).truth
     wide = numpy.zeros((4, N))
 
     def noise():
@@ -446,21 +454,23 @@ def test_urban_errors_have_the_stated_quantiles():
     for cn0, median, upper in ((25.0, 50.0, 152.0), (34.0, 25.0, 79.0), (41.0, 7.0, 49.0), (47.0, 0.0, 19.0)):
         s = truth._replace(cn0=wide + cn0, multipath=wide, hold=wide)
         s = s._replace(faults=s.faults._replace(urban=numpy.ones(N)))
-        s = task.world._reflect(s, noise())
+        s = model.task.world._reflect(s, noise())
         assert (s.multipath >= 0.0).all()
         # 160,000 draws: four standard errors of the quantiles.
         assert numpy.median(s.multipath) == pytest.approx(median, abs=0.02 * median + 0.15)
         assert numpy.quantile(s.multipath, 0.95) == pytest.approx(upper, rel=0.03)
         assert s.hold.min() >= 48.0
         assert s.hold.max() <= 199.0
-        held = task.world._reflect(s, noise())
+        held = model.task.world._reflect(s, noise())
         assert (held.multipath == s.multipath).all()
 
 
 def test_random_course_has_every_leg_and_bounded_strength():
-    task = make("random", manoeuvre_throughout=0.0, **UNMIXED)
+    model = make("random", manoeuvre_throughout=0.0, **UNMIXED)
     rng = numpy.random.default_rng(13)
-    legs = task.begin(rng.random((task.noise.uniforms, 512)), rng.standard_normal((17, 512))).truth.legs
+    legs = model.begin(
+        rng.random((model.task.noise.uniforms, 512)), rng.standard_normal((17, 512))
+    ).truth.legs
     kinds = legs.kind
     assert set(numpy.unique(kinds[0])) == {0.0, 1.0}
     assert set(numpy.unique(kinds[1:])) == {1.0, 2.0}
@@ -483,12 +493,12 @@ def test_torch_rolls_out_as_numpy_does(torch):
 
 def test_gradient_from_cost_to_action(torch):
     # Where loops lose what they do not expect the cost has steps.
-    task = make("random", "gain", torch, aperture=False)
+    model = make("random", "gain", torch, aperture=False)
 
     def loss(action):
         total = 0.0
-        for *_, state in drive(task, 8, 15, 4, lambda k, o, s: action, torch.asarray):
-            total = total + task.cost(state).sum()
+        for *_, state in drive(model, 8, 15, 4, lambda k, o, s: action, torch.asarray):
+            total = total + model.cost(state).sum()
         return total
 
     action = torch.full((4, 8), 0.1, dtype=torch.float64, requires_grad=True)
@@ -510,13 +520,13 @@ def within(values, reference, error, allowance=0.0):
 
 def test_reference_table_of_the_adaptive_filter():
     """Increment course, 24 runs: RMS errors of three legs, NIS, probabilities and adaptation times."""
-    N, task = 24, task_on("auto", TightlyCoupledNavigation.id, "evidence", "paper")
+    N, model = 24, make_model(TightlyCoupledNavigation.id, "evidence", "paper", backend="auto")
     windows = SCENARIOS["paper"].windows
     squares = {leg: numpy.zeros((3, N)) for leg in ("leg1", "leg2", "leg3")}
     nis = dict.fromkeys(squares, 0.0)
     probability = {}
-    for k, _, _, state in drive(task, N, 16, 3000):
-        error, records = task.error(state), task.records(state)
+    for k, _, _, state in drive(model, N, 16, 3000):
+        error, records = model.error(state), model.records(state)
         probability[k] = records["mode_probability"]
         assert (records["rate_outside_aperture"] == 0.0).all() or k < 5
         for leg, total in squares.items():
@@ -572,11 +582,11 @@ def test_loss_of_track_with_the_aperture(course, hypothesis, band):
 
     A shorter leg 1 than the paper's, 300 steps, suffices for a steady filter.
     """
-    task = make("paper", "mode", course=course, leg_steps=(300, 1300))
+    model = make("paper", "mode", course=course, leg_steps=(300, 1300))
     outside = []
-    for k, _, _, state in drive(task, 16, 17, 420, lambda k, o, s: numpy.full(16, hypothesis)):
+    for k, _, _, state in drive(model, 16, 17, 420, lambda k, o, s: numpy.full(16, hypothesis)):
         if k > 300:
-            outside.append(task.records(state)["rate_outside_aperture"] > 0.0)
+            outside.append(model.records(state)["rate_outside_aperture"] > 0.0)
     lasting = numpy.stack([numpy.all(outside[j : j + 10], axis=0) for j in range(len(outside) - 9)])
     if band is None:
         assert not lasting.any()
@@ -587,13 +597,13 @@ def test_loss_of_track_with_the_aperture(course, hypothesis, band):
 
 def test_matched_filter_is_consistent():
     """NEES / 17 and NIS / 14 of the Singer filter on its own model: 0.987 +- 0.018 and 1.001."""
-    task, N = make("matched", "mode"), 32
+    model, N = make("matched", "mode"), 32
     nees, nis = [], []
-    for k, _, _, state in drive(task, N, 18, 600, singer):
+    for k, _, _, state in drive(model, N, 18, 600, singer):
         if k >= 200:
-            nis.append(task.records(state)["nis"].mean() / 14)
+            nis.append(model.records(state)["nis"].mean() / 14)
             if k % 20 == 0:
-                error, P = task.error(state).T, numpy.moveaxis(state.filter.covariance, -1, 0)
+                error, P = model.error(state).T, numpy.moveaxis(state.filter.covariance, -1, 0)
                 nees.append((error * numpy.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 17)
     means = numpy.mean(nees, axis=0)
     assert abs(means.mean() - 1.0) < 4.0 * means.std() / numpy.sqrt(N)

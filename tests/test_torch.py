@@ -6,9 +6,10 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.envs.catalogue import catalogue, make_task
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.reward import charge
+from models import make_model
 from rounding import REPETITIONS, assert_same, move_roundings
 
 torch = pytest.importorskip("torch")
@@ -21,7 +22,7 @@ CONTROLS = [(id, control) for id, task in catalogue().items() for control in tas
 CONTINUOUS = [
     (id, control)
     for id, control in CONTROLS
-    if isinstance(make_task(id, control).action_space, gymnasium.spaces.Box)
+    if isinstance(make_model(id, control).action_space, gymnasium.spaces.Box)
 ]
 MODES = [mode.value for mode in gymnasium.vector.AutoresetMode]
 
@@ -172,13 +173,13 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
     A pseudorange of 2.5e7 m is rounded to 4e-9 m: there the balance lies at 1e-4.
     """
     horizon, lanes, step = 6, 8, 1e-4 if id == "filtergym/TightlyCoupledNavigation-v0" else 1e-5
-    task = make_task(id, control, xp=xp)
+    model = make_model(id, control, backend="torch")
     generator = numpy.random.default_rng(0)
-    noise = task.noise
+    noise = model.task.noise
 
-    uniforms = task.constant(generator.random((noise.uniforms, lanes)))
-    normals = task.constant(generator.standard_normal((noise.initial_normals, lanes)))
-    rows = task.constant(
+    uniforms = model.task.constant(generator.random((noise.uniforms, lanes)))
+    normals = model.task.constant(generator.standard_normal((noise.initial_normals, lanes)))
+    rows = model.task.constant(
         numpy.concatenate(
             [
                 generator.standard_normal((horizon + 1, noise.normals, lanes)),
@@ -187,7 +188,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
             axis=1,
         )
     )
-    space = task.action_space
+    space = model.action_space
     low, high = space.low[:, None] + 0.3, space.high[:, None] - 0.3  # away from where clipping has a kink
     actions = torch.tensor(
         generator.uniform(low, high, (horizon, *low.shape[:1], lanes)),
@@ -196,12 +197,12 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
     )
 
     def loss(actions):
-        state = task.measure(task.begin(uniforms, normals), rows[0])
+        state = model.measure(model.begin(uniforms, normals), rows[0])
         total = 0.0
         for k in range(horizon):
-            state = task.act(state, actions[k])
-            total = total + charge(task, state)
-            state = task.measure(state, rows[k + 1])
+            state = model.act(state, actions[k])
+            total = total + charge(model, state)
+            state = model.measure(state, rows[k + 1])
         return total.mean()
 
     (gradient,) = torch.autograd.grad(loss(actions), actions)

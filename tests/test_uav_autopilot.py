@@ -3,7 +3,8 @@ from typing import Any
 
 import numpy
 import pytest
-from filtergym.envs.task import Episode, Scenario
+from filtergym.envs.model import Episode, Model
+from filtergym.envs.task import Scenario
 from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.envs.uav_autopilot.parameters import COORDINATES, UavAutopilotParameters
 from filtergym.envs.uav_autopilot.task import UavAutopilot
@@ -14,23 +15,25 @@ BOTH = pytest.mark.parametrize("plant", ["P", "U"])
 
 def make(
     plant: str = "U", scenario: str = "random", control: str = "gain", xp: Any = numpy, **kw: Any
-) -> UavAutopilot:
+) -> Model:
     chosen: Scenario = UavAutopilot.scenarios[scenario]
-    return UavAutopilot(UavAutopilotParameters(**{**chosen.parameters, "plant": plant, **kw}), control, xp)
+    return Model(
+        UavAutopilot(UavAutopilotParameters(**{**chosen.parameters, "plant": plant, **kw}), xp), control
+    )
 
 
 class Noise:
     """What the engine will hand to the task."""
 
-    def __init__(self, task: UavAutopilot, N: int, seed: int, steps: int) -> None:
+    def __init__(self, model: Model, N: int, seed: int, steps: int) -> None:
         rng = numpy.random.default_rng(seed)
-        self.uniforms = rng.random((task.noise.uniforms, N))
-        self.initial = rng.standard_normal((task.noise.initial_normals, N))
-        self.rows = rng.standard_normal((steps, task.noise.normals, N))
+        self.uniforms = rng.random((model.task.noise.uniforms, N))
+        self.initial = rng.standard_normal((model.task.noise.initial_normals, N))
+        self.rows = rng.standard_normal((steps, model.task.noise.normals, N))
 
 
-def begin(task: UavAutopilot, noise: Noise) -> Episode:
-    return task.measure(task.begin(noise.uniforms, noise.initial), noise.rows[0])
+def begin(model: Model, noise: Noise) -> Episode:
+    return model.measure(model.begin(noise.uniforms, noise.initial), noise.rows[0])
 
 
 def leaves(part: Any) -> list[Any]:
@@ -40,9 +43,9 @@ def leaves(part: Any) -> list[Any]:
     return [part]
 
 
-def actions(task: UavAutopilot, seed: int, steps: int, N: int) -> numpy.ndarray:
+def actions(model: Model, seed: int, steps: int, N: int) -> numpy.ndarray:
     rng = numpy.random.default_rng(seed)
-    if task.control == "gain":
+    if model.control == "gain":
         return rng.uniform(-1.2, 1.2, (steps, 1, N))
     return rng.integers(0, len(MODES), (steps, N))
 
@@ -51,7 +54,7 @@ def actions(task: UavAutopilot, seed: int, steps: int, N: int) -> numpy.ndarray:
 
 
 def theory(plant: str, feedback: str, **kw: Any) -> tuple[float, float, float]:
-    d = make(plant, "paper-noise", **kw).design
+    d = make(plant, "paper-noise", **kw).task.design
     F, B, L, H, R = d.model.F, d.model.B, d.feedback, d.H, d.R
     Q, n = d.model.scaled_noise + d.model.other_noise, len(d.model.F)
     output = [c.name for c in COORDINATES[plant]].index({"P": "position", "U": "pitch"}[plant])
@@ -94,14 +97,14 @@ def test_theory_of_the_reference_table(
 
 
 def test_raw_position_alone_cannot_fly() -> None:
-    d = make("P", "paper-noise", sensors=("position",)).design
+    d = make("P", "paper-noise", sensors=("position",)).task.design
     Q = d.model.scaled_noise
     loop = linear_systems.measurement_feedback_loop(d.model.F, d.model.B, d.H, d.feedback, Q, d.R)
     assert linear_systems.spectral_radius(loop.transition) == pytest.approx(1.0125, abs=5e-5)
 
 
 def test_design_of_plant_p() -> None:
-    d = make("P").design
+    d = make("P").task.design
     numpy.testing.assert_allclose(d.feedback, [[0.80578, 1.50361]], atol=5e-6)
     numpy.testing.assert_allclose(d.steady.gain, [[0.12827, 0.03835], [0.03835, 0.02641]], atol=5e-6)
     numpy.testing.assert_allclose(numpy.sqrt(numpy.diag(d.steady.posterior)), [0.35815, 0.16252], atol=5e-6)
@@ -109,13 +112,13 @@ def test_design_of_plant_p() -> None:
     numpy.testing.assert_allclose([control[0].real, abs(control[0].imag)], [0.7995, 0.1007], atol=5e-5)
     filter_pole = d.steady.poles[0]
     numpy.testing.assert_allclose([filter_pole.real, abs(filter_pole.imag)], [0.9179, 0.0690], atol=5e-5)
-    one = make("P", sensors=("position",)).design.steady
+    one = make("P", sensors=("position",)).task.design.steady
     numpy.testing.assert_allclose(one.gain[:, 0], [0.14621, 0.04620], atol=5e-6)
     numpy.testing.assert_allclose(numpy.sqrt(numpy.diag(one.posterior)), [0.38238, 0.17435], atol=5e-6)
 
 
 def test_design_of_plant_u() -> None:
-    d = make("U").design
+    d = make("U").task.design
     numpy.testing.assert_allclose(d.feedback, [[0.88253, -0.34716, -1.63714, 0.51561, 0.83282]], atol=6e-6)
     assert d.feedforward == pytest.approx(-1.63714, abs=5e-6)
     poles = numpy.sort_complex(numpy.log(numpy.linalg.eigvals(d.model.F)) / 0.02)
@@ -125,7 +128,7 @@ def test_design_of_plant_u() -> None:
 
 @BOTH
 def test_poles_of_the_loop_are_those_of_control_and_filter(plant: str) -> None:
-    d = make(plant).design
+    d = make(plant).task.design
     assert linear_systems.separation_defect(d.model.F, d.model.B, d.H, d.feedback, d.steady.gain) < 1e-12
 
 
@@ -139,7 +142,7 @@ def test_discrete_model_agrees_with_finite_differences_of_the_equations_of_motio
         A[1, [0, 3, 4]] = -27.168, -35.748, -27.168
         A[2, 1] = 1.0
         b, T = numpy.array([0.0, 0.0, 0.0, 20.0, 0.0]), 0.02
-    model = make(plant).design.model
+    model = make(plant).task.design.model
     x, u, steps = numpy.ones(len(A)), 2.0, 4000
     expected = model.F @ x + model.B[:, 0] * u
     for _ in range(steps):  # midpoint rule: error of order (T / 4000)^2
@@ -157,7 +160,7 @@ def test_discrete_model_agrees_with_finite_differences_of_the_equations_of_motio
 @BOTH
 def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, seed: int) -> None:
     steps, N = 60, 8
-    task = make(
+    model = make(
         plant,
         "random",
         control,
@@ -166,16 +169,16 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         sensor_times=((10, 50),),
         undisturbed=0.0,
     )
-    noise, a = Noise(task, N, seed, steps + 1), actions(task, seed, steps, N)
-    d, p = task.design, task.parameters
+    noise, a = Noise(model, N, seed, steps + 1), actions(model, seed, steps, N)
+    d, p = model.task.design, model.task.parameters
     scales = {"wide-band": p.wide_band_scale, "over-smoothed": p.over_smoothed_scale}
     F, B, H, R, L = d.model.F, d.model.B[:, 0], d.H, d.R, d.feedback[0]
     Q = d.model.scaled_noise + d.model.other_noise
-    state = begin(task, noise)
+    state = begin(model, noise)
     lane = seed
     x, P, scale, raw = (
         numpy.zeros(len(F)),
-        numpy.diag(numpy.square(task.parameters.value("initial_sigmas"))),
+        numpy.diag(numpy.square(model.task.parameters.value("initial_sigmas"))),
         1.0,
         None,
     )
@@ -205,34 +208,34 @@ def test_task_equals_a_plain_kalman_filter_in_a_loop(plant: str, control: str, s
         rest = numpy.eye(len(F)) - K @ H[rows]
         P = rest @ P @ rest.T + K @ R[numpy.ix_(rows, rows)] @ K.T
         raw = control == "mode" and MODES[choice] == "raw-sensors"
-        state = task.act(state, a[k])
+        state = model.act(state, a[k])
         estimate = H.T @ held if raw else x
         numpy.testing.assert_allclose(state.filter.estimate[:, lane], estimate, rtol=0, atol=1e-9)
         if not raw:
             steered = control == "gain" and choice[0] != 0.0
             told = max(1.0, state.filter.mean_nis[lane]) if steered else 1.0
-            numpy.testing.assert_allclose(task.covariance(state)[..., lane], told * P, rtol=1e-9, atol=1e-9)
+            numpy.testing.assert_allclose(model.covariance(state)[..., lane], told * P, rtol=1e-9, atol=1e-9)
         u = d.feedforward * state.measurement.command[lane] - L @ estimate
         truth = state.truth.state[:, lane].copy()
-        truth[task.output] -= state.measurement.command[lane]
-        cost = (truth @ d.weight @ truth + d.control_weight * u**2) / task.cost_unit
-        assert task.cost(state)[lane] == pytest.approx(cost, rel=1e-9)
+        truth[model.task.output] -= state.measurement.command[lane]
+        cost = (truth @ d.weight @ truth + d.control_weight * u**2) / model.task.cost_unit
+        assert model.cost(state)[lane] == pytest.approx(cost, rel=1e-9)
         numpy.testing.assert_allclose(
-            task.error(state)[:, lane], estimate - state.truth.state[:, lane], rtol=0, atol=1e-9
+            model.error(state)[:, lane], estimate - state.truth.state[:, lane], rtol=0, atol=1e-9
         )
-        state = task.measure(state, noise.rows[k + 1])
+        state = model.measure(state, noise.rows[k + 1])
         assert state.measurement.control[lane] == pytest.approx(u, abs=1e-9)
     assert dropped > 0
 
 
 @BOTH
 def test_truth_follows_from_the_control_and_noise_covariances_are_those_stated(plant: str) -> None:
-    task = make(plant, "gust-front", disturbance_times=((2, 2),), command_amplitude=(0.0, 0.0))
-    noise = Noise(task, 80_000, 1, 2)
-    before = task.begin(noise.uniforms, noise.initial)
-    d = task.design
+    model = make(plant, "gust-front", disturbance_times=((2, 2),), command_amplitude=(0.0, 0.0))
+    noise = Noise(model, 80_000, 1, 2)
+    before = model.begin(noise.uniforms, noise.initial)
+    d = model.task.design
     for level in (1.0, 4.0):
-        after = task.measure(before, noise.rows[int(level > 1)])
+        after = model.measure(before, noise.rows[int(level > 1)])
         w = (
             after.truth.state
             - d.true_model.F @ before.truth.state
@@ -246,7 +249,7 @@ def test_truth_follows_from_the_control_and_noise_covariances_are_those_stated(p
         )
         v = (after.measurement.reading - d.H @ after.truth.state) / numpy.sqrt(numpy.diag(d.R))[:, None]
         numpy.testing.assert_allclose(v @ v.T / 80_000, numpy.eye(len(d.R)), rtol=0, atol=0.025)
-        before = task.act(after, numpy.zeros((1, 80_000)))
+        before = model.act(after, numpy.zeros((1, 80_000)))
 
 
 # ---------------------------------------------------------------- Monte Carlo of the reference table
@@ -257,49 +260,49 @@ def test_monte_carlo_of_the_reference_table(
     plant: str, feedback: str, kw: dict[str, Any], output: float, control: float, cost: float
 ) -> None:
     N, burn, steps = 200, 200, 300
-    task = make(plant, "paper-noise", "mode", horizon=burn + steps, **kw)
-    noise = Noise(task, N, 7, burn + steps + 1)
-    state, action = begin(task, noise), numpy.full(N, 2 if feedback == "raw" else 0)
+    model = make(plant, "paper-noise", "mode", horizon=burn + steps, **kw)
+    noise = Noise(model, N, 7, burn + steps + 1)
+    state, action = begin(model, noise), numpy.full(N, 2 if feedback == "raw" else 0)
     sums = numpy.zeros((5, N))
-    n, m = task.covariance(state).shape[0], len(task.sensors)
+    n, m = model.covariance(state).shape[0], len(model.task.sensors)
     for k in range(burn + steps):
         shown = state.filter.nis
-        state = task.act(state, action)
+        state = model.act(state, action)
         if feedback == "true":
             state = state._replace(filter=state.filter._replace(estimate=state.truth.state))
         if k >= burn:
-            _, nees = gaussian.log_density(task.error(state), task.covariance(state))
-            record = task.records(state)
+            _, nees = gaussian.log_density(model.error(state), model.covariance(state))
+            record = model.records(state)
             sums += numpy.stack(
                 [
                     record["output"] ** 2,
                     record["control_signal"] ** 2,
-                    task.cost(state) * task.cost_unit,
+                    model.cost(state) * model.task.cost_unit,
                     nees / n,
                     shown,
                 ]
             )
-        state = task.measure(state, noise.rows[k + 1])
+        state = model.measure(state, noise.rows[k + 1])
     runs = sums / steps
     expected = [output, control, cost] + ([1.0, 1.0] if feedback == "filter" else [])
     for values, value in zip(runs, expected, strict=False):
         assert abs(values.mean() - value) < 4 * values.std(ddof=1) / math.sqrt(N)
-    assert m == len(task.design.R)
+    assert m == len(model.task.design.R)
 
 
 @pytest.mark.parametrize(
     ("plant", "overshoot", "rise", "settling"), [("P", 0.0045, 3.5, 4.0), ("U", 0.0, 0.46, 0.54)]
 )
 def test_step_of_the_command(plant: str, overshoot: float, rise: float, settling: float) -> None:
-    task = make(plant, "paper-step", step_time=1, horizon=100)
-    noise = Noise(task, 8, 0, 101)
+    model = make(plant, "paper-step", step_time=1, horizon=100)
+    noise = Noise(model, 8, 0, 101)
     noise.rows[:] = 0.0
     noise.initial[:] = 0.0
-    state, outputs = begin(task, noise), []
+    state, outputs = begin(model, noise), []
     for k in range(100):
-        outputs.append(task.records(state)["output"][0])
-        state = task.measure(task.act(state, numpy.zeros((1, 8))), noise.rows[k + 1])
-    y, T = numpy.array(outputs), task.parameters.value("sampling_interval")
+        outputs.append(model.records(state)["output"][0])
+        state = model.measure(model.act(state, numpy.zeros((1, 8))), noise.rows[k + 1])
+    y, T = numpy.array(outputs), model.task.parameters.value("sampling_interval")
     assert max(y.max() - 1.0, 0.0) == pytest.approx(overshoot, abs=5e-5)
     assert numpy.argmax(y >= 0.9) * T == pytest.approx(rise)
     assert (numpy.flatnonzero(abs(y - 1.0) > 0.05)[-1] + 1) * T == pytest.approx(settling)
@@ -309,13 +312,13 @@ def test_step_of_the_command(plant: str, overshoot: float, rise: float, settling
 @BOTH
 def test_mean_output_after_a_unit_step_in_noise_is_one(plant: str) -> None:
     N = 200
-    task = make(plant, "paper-step", step_time=1, horizon=400)
-    noise = Noise(task, N, 3, 401)
-    state, total = begin(task, noise), numpy.zeros(N)
+    model = make(plant, "paper-step", step_time=1, horizon=400)
+    noise = Noise(model, N, 3, 401)
+    state, total = begin(model, noise), numpy.zeros(N)
     for k in range(400):
-        state = task.act(state, numpy.zeros((1, N)))
-        total += task.records(state)["output"] * (k >= 150)
-        state = task.measure(state, noise.rows[k + 1])
+        state = model.act(state, numpy.zeros((1, N)))
+        total += model.records(state)["output"] * (k >= 150)
+        state = model.measure(state, noise.rows[k + 1])
     mean = total / 250
     assert abs(mean.mean() - 1.0) < 4 * mean.std(ddof=1) / math.sqrt(N)
 
@@ -329,23 +332,23 @@ def test_shapes_names_and_finiteness_in_every_scenario(plant: str, control: str)
     for name in UavAutopilot.scenarios:
         if plant == "P" and name == "actuator-lag":
             continue
-        task = make(plant, name, control)
-        noise = Noise(task, 8, 0, 41)
-        state, a = begin(task, noise), actions(task, 1, 40, 8)
+        model = make(plant, name, control)
+        noise = Noise(model, 8, 0, 41)
+        state, a = begin(model, noise), actions(model, 1, 40, 8)
         for k in range(40):
-            observation = task.observe(state)
-            assert observation.shape == (len(task.fields), 8)
+            observation = model.observe(state)
+            assert observation.shape == (len(model.fields), 8)
             assert observation.dtype == numpy.float64
             assert numpy.isfinite(observation).all()
-            state = task.act(state, a[k])
-            n = len(task.components)
-            assert task.error(state).shape == (n, 8)
-            assert task.covariance(state).shape == (n, n, 8)
-            assert (numpy.linalg.eigvalsh(numpy.moveaxis(task.covariance(state), -1, 0)) > 0).all()
-            assert (task.cost(state) >= 0).all()
-            state = task.measure(state, noise.rows[k + 1])
+            state = model.act(state, a[k])
+            n = len(model.task.components)
+            assert model.error(state).shape == (n, 8)
+            assert model.covariance(state).shape == (n, n, 8)
+            assert (numpy.linalg.eigvalsh(numpy.moveaxis(model.covariance(state), -1, 0)) > 0).all()
+            assert (model.cost(state) >= 0).all()
+            state = model.measure(state, noise.rows[k + 1])
         assert all(array.shape[-1] == 8 for array in leaves(state))
-        assert len({f.name for f in task.fields}) == len(task.fields)
+        assert len({f.name for f in model.fields}) == len(model.fields)
 
 
 @pytest.mark.parametrize("control", ["gain", "mode"])
@@ -353,39 +356,47 @@ def test_shapes_names_and_finiteness_in_every_scenario(plant: str, control: str)
 def test_observation_is_recomputed_from_the_measurements_alone(plant: str, control: str) -> None:
     """Two different truths, sensor noise chosen so that the readings agree: the agent sees the same."""
     N, steps = 8, 80
-    task = make(plant, "random", control, dropout_period=75)
-    noise, other, a = Noise(task, N, 0, steps + 1), Noise(task, N, 1, steps + 1), actions(task, 0, steps, N)
-    drives = task.noise.normals - len(task.sensors)
-    one = task.begin(noise.uniforms, noise.initial)
+    model = make(plant, "random", control, dropout_period=75)
+    noise, other, a = (
+        Noise(model, N, 0, steps + 1),
+        Noise(model, N, 1, steps + 1),
+        actions(model, 0, steps, N),
+    )
+    drives = model.task.noise.normals - len(model.task.sensors)
+    one = model.begin(noise.uniforms, noise.initial)
     levels = one.truth.levels._replace(values=3.0 * one.truth.levels.values)
     truth = one.truth._replace(state=5.0 * other.initial, level=levels.values[0], levels=levels)
     two = one._replace(truth=truth)
-    sigmas = numpy.array(task.parameters.value("sensor_sigmas"))[:, None]
+    sigmas = numpy.array(model.task.parameters.value("sensor_sigmas"))[:, None]
     for k in range(steps):
-        one = task.measure(one, noise.rows[k])
+        one = model.measure(one, noise.rows[k])
         drive = other.rows[k].copy()
         drive[drives:] = 0.0
-        trial = task.measure(two, drive)
-        wanted = task.design.H @ one.truth.state + sigmas * one.truth.sensor_level * noise.rows[k][drives:]
-        drive[drives:] = (wanted - task.design.H @ trial.truth.state) / (sigmas * trial.truth.sensor_level)
-        two = task.measure(two, drive)
+        trial = model.measure(two, drive)
+        wanted = (
+            model.task.design.H @ one.truth.state + sigmas * one.truth.sensor_level * noise.rows[k][drives:]
+        )
+        drive[drives:] = (wanted - model.task.design.H @ trial.truth.state) / (
+            sigmas * trial.truth.sensor_level
+        )
+        two = model.measure(two, drive)
         assert numpy.abs(one.truth.state - two.truth.state).max() > 0.1
         # The readings agree to rounding, amplified by the filter for 80 steps.
-        numpy.testing.assert_allclose(task.observe(one), task.observe(two), rtol=0, atol=1e-9)
-        one, two = task.act(one, a[k]), task.act(two, a[k])
+        numpy.testing.assert_allclose(model.observe(one), model.observe(two), rtol=0, atol=1e-9)
+        one, two = model.act(one, a[k]), model.act(two, a[k])
         numpy.testing.assert_allclose(one.filter.estimate, two.filter.estimate, rtol=0, atol=1e-9)
 
 
 @BOTH
 def test_noise_does_not_depend_on_the_actions_but_the_truth_does(plant: str) -> None:
-    task = make(plant)
-    noise = Noise(task, 8, 0, 31)
-    low, high = begin(task, noise), begin(task, noise)
-    B, F = task.design.true_model.B, task.design.true_model.F
+    model = make(plant)
+    noise = Noise(model, 8, 0, 31)
+    low, high = begin(model, noise), begin(model, noise)
+    B, F = model.task.design.true_model.B, model.task.design.true_model.F
     for k in range(30):
-        low, high = task.act(low, numpy.full((1, 8), -1.0)), task.act(high, numpy.full((1, 8), 1.0))
+        low, high = model.act(low, numpy.full((1, 8), -1.0)), model.act(high, numpy.full((1, 8), 1.0))
         previous = low.truth.state, high.truth.state
-        low, high = task.measure(low, noise.rows[k + 1]), task.measure(high, noise.rows[k + 1])
+        low, high = model.measure(low, noise.rows[k + 1]), model.measure(high, noise.rows[k + 1])
         w = [
             s.truth.state - F @ x - B * s.measurement.control
             for s, x in zip((low, high), previous, strict=True)
@@ -405,21 +416,21 @@ def chosen(lanes: numpy.ndarray, one: Any, other: Any) -> Any:
 
 
 def test_lanes_at_different_times_and_batch_widths() -> None:
-    task = make("U")
-    noise = Noise(task, 16, 0, 61)
-    wide = begin(task, noise)
-    narrow = Noise(task, 16, 0, 61)
+    model = make("U")
+    noise = Noise(model, 16, 0, 61)
+    wide = begin(model, noise)
+    narrow = Noise(model, 16, 0, 61)
     narrow.uniforms, narrow.initial, narrow.rows = (
         a[..., :8] for a in (noise.uniforms, noise.initial, noise.rows)
     )
-    small, a = begin(task, narrow), actions(task, 0, 60, 16)
+    small, a = begin(model, narrow), actions(model, 0, 60, 16)
     for k in range(60):
         if k == 30:  # lanes 8 to 15 start again
-            fresh = begin(task, noise)
+            fresh = begin(model, noise)
             lane = numpy.arange(16) >= 8
             wide = chosen(lane, fresh, wide)
-        wide = task.measure(task.act(wide, a[k]), noise.rows[k + 1])
-        small = task.measure(task.act(small, a[k][:, :8]), narrow.rows[k + 1])
+        wide = model.measure(model.act(wide, a[k]), noise.rows[k + 1])
+        small = model.measure(model.act(small, a[k][:, :8]), narrow.rows[k + 1])
     for w, s in zip(leaves(wide), leaves(small), strict=True):
         numpy.testing.assert_array_equal(w[..., :8], s)
 
@@ -444,9 +455,9 @@ def test_modes_are_gains_bit_for_bit_or_nearly() -> None:
 
 
 def test_action_beyond_the_box_is_the_action_at_its_edge() -> None:
-    task = make("U")
-    state = begin(task, Noise(task, 8, 0, 1))
-    beyond, edge = task.act(state, numpy.full((1, 8), 9.0)), task.act(state, numpy.ones((1, 8)))
+    model = make("U")
+    state = begin(model, Noise(model, 8, 0, 1))
+    beyond, edge = model.act(state, numpy.full((1, 8), 9.0)), model.act(state, numpy.ones((1, 8)))
     for array, limit in zip(leaves(beyond), leaves(edge), strict=True):
         numpy.testing.assert_array_equal(array, limit)
 
@@ -482,21 +493,21 @@ def test_torch_gives_the_same_roll_out(torch: Any, plant: str, control: str) -> 
 @BOTH
 def test_charge_is_what_the_error_of_the_estimate_loses(plant: str) -> None:
     """With the command known, the control is off by L times the error; a command moves both alike."""
-    task = make(plant)
-    assert task.design.optimal is not None
-    L, regret = task.design.optimal
-    noise = Noise(task, 8, 3, 31)
-    episode = begin(task, noise)
+    model = make(plant)
+    assert model.task.design.optimal is not None
+    L, regret = model.task.design.optimal
+    noise = Noise(model, 8, 3, 31)
+    episode = begin(model, noise)
     for k in range(30):
-        episode = task.act(task.measure(episode, noise.rows[k + 1]) if k else episode, numpy.zeros((1, 8)))
-        lost = (L @ task.error(episode))[0]
-        expected = regret[0, 0] / task.cost_unit * lost**2
-        numpy.testing.assert_allclose(task.charge(episode), expected, rtol=1e-9, atol=1e-12)
+        episode = model.act(model.measure(episode, noise.rows[k + 1]) if k else episode, numpy.zeros((1, 8)))
+        lost = (L @ model.error(episode))[0]
+        expected = regret[0, 0] / model.task.cost_unit * lost**2
+        numpy.testing.assert_allclose(model.charge(episode), expected, rtol=1e-9, atol=1e-12)
 
 
-def values(task: UavAutopilot) -> tuple[numpy.ndarray, numpy.ndarray]:
+def values(model: Model) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Riccati's S by iteration, and the optimal feedback."""
-    d = task.design
+    d = model.task.design
     F, B, S = d.true_model.F, d.true_model.B, d.weight
     for _ in range(5000):
         L = numpy.linalg.solve(d.control_weight + B.T @ S @ B, B.T @ S @ F)
@@ -508,19 +519,19 @@ def values(task: UavAutopilot) -> tuple[numpy.ndarray, numpy.ndarray]:
 @BOTH
 def test_charge_is_what_bellmans_equation_leaves_of_the_cost(plant: str) -> None:
     """With value V = x'Sx: cost + V(next) - V(now) = charge + what the noise does, to rounding, at every step."""
-    task = make(plant, "paper-noise")
-    F, B, (S, _) = task.design.true_model.F, task.design.true_model.B, values(task)
-    noise, a = Noise(task, 8, 3, 41), actions(task, 3, 40, 8)
-    state = begin(task, noise)
+    model = make(plant, "paper-noise")
+    F, B, (S, _) = model.task.design.true_model.F, model.task.design.true_model.B, values(model)
+    noise, a = Noise(model, 8, 3, 41), actions(model, 3, 40, 8)
+    state = begin(model, noise)
     for k in range(40):
-        state = task.act(state, a[k])
-        x, paid, charged = state.truth.state, task.cost(state), task.charge(state)
-        state = task.measure(state, noise.rows[k + 1])
+        state = model.act(state, a[k])
+        x, paid, charged = state.truth.state, model.cost(state), model.charge(state)
+        state = model.measure(state, noise.rows[k + 1])
         predicted = F @ x + B * state.measurement.control
         w = state.truth.state - predicted
         before, after = ((y * (S @ y)).sum(axis=0) for y in (x, state.truth.state))
         by_noise = (w * (S @ (w + 2.0 * predicted))).sum(axis=0)
-        bellman = paid + (after - before - by_noise) / task.cost_unit
+        bellman = paid + (after - before - by_noise) / model.task.cost_unit
         numpy.testing.assert_allclose(charged, bellman, rtol=1e-6, atol=1e-9)
 
 
@@ -531,15 +542,15 @@ def test_charges_differ_by_the_whole_cost_of_what_was_done() -> None:
     """
     ends = {}
     for name, value in (("kalman", 0.0), ("steered", -1.0)):
-        task = make("U", "paper-noise")
-        S = values(task)[0] / task.cost_unit
-        noise = Noise(task, 256, 5, 601)
-        state = begin(task, noise)
+        model = make("U", "paper-noise")
+        S = values(model)[0] / model.task.cost_unit
+        noise = Noise(model, 256, 5, 601)
+        state = begin(model, noise)
         cost, charge = numpy.zeros((2, 256))
         for k in range(600):
-            state = task.act(state, numpy.full((1, 256), value))
-            cost, charge = cost + task.cost(state) / 600, charge + task.charge(state) / 600
-            state = task.measure(state, noise.rows[k + 1])
+            state = model.act(state, numpy.full((1, 256), value))
+            cost, charge = cost + model.cost(state) / 600, charge + model.charge(state) / 600
+            state = model.measure(state, noise.rows[k + 1])
         x = state.truth.state
         ends[name] = cost + (x * (S @ x)).sum(axis=0) / 600, charge
     cost, charge = (ends["steered"][i] - ends["kalman"][i] for i in (0, 1))
@@ -551,24 +562,26 @@ def test_charges_differ_by_the_whole_cost_of_what_was_done() -> None:
 
 
 def test_charge_is_the_cost_where_the_weights_leave_the_best_control_open() -> None:
-    task = make("P", state_weights=(0.0, 1.0), feedback=(0.8, 1.5))
-    assert task.design.optimal is None
-    episode = task.act(begin(task, Noise(task, 8, 3, 1)), numpy.zeros((1, 8)))
-    numpy.testing.assert_array_equal(task.charge(episode), task.cost(episode))
+    model = make("P", state_weights=(0.0, 1.0), feedback=(0.8, 1.5))
+    assert model.task.design.optimal is None
+    episode = model.act(begin(model, Noise(model, 8, 3, 1)), numpy.zeros((1, 8)))
+    numpy.testing.assert_array_equal(model.charge(episode), model.cost(episode))
 
 
 def test_gradient_of_the_cost_through_the_closed_loop(torch: Any) -> None:
-    task = make("U", xp=torch)
-    noise = Noise(task, 8, 4, 7)
+    model = make("U", xp=torch)
+    noise = Noise(model, 8, 4, 7)
     rows = torch.asarray(noise.rows)
 
     def total(action: Any) -> Any:
-        state = task.measure(task.begin(torch.asarray(noise.uniforms), torch.asarray(noise.initial)), rows[0])
+        state = model.measure(
+            model.begin(torch.asarray(noise.uniforms), torch.asarray(noise.initial)), rows[0]
+        )
         value = torch.zeros((), dtype=torch.float64)
         for k in range(5):
-            state = task.act(state, action[k])
-            value = value + task.cost(state).sum()
-            state = task.measure(state, rows[k + 1])
+            state = model.act(state, action[k])
+            value = value + model.cost(state).sum()
+            state = model.measure(state, rows[k + 1])
         return value
 
     a = (
@@ -585,10 +598,10 @@ def test_gradient_of_the_cost_through_the_closed_loop(torch: Any) -> None:
 
 
 def test_random_episodes_hold_what_they_promise() -> None:
-    task = make("U", undisturbed=0.0)
-    N, p = 400, task.parameters
-    noise = Noise(task, N, 0, 1)
-    truth = task.begin(noise.uniforms, noise.initial).truth
+    model = make("U", undisturbed=0.0)
+    N, p = 400, model.task.parameters
+    noise = Noise(model, N, 0, 1)
+    truth = model.begin(noise.uniforms, noise.initial).truth
     times, levels = truth.commands.times, truth.levels.values
     assert (numpy.diff(times, axis=0) > 0).all()
     assert (times.max(axis=0) <= p.horizon).all()
@@ -607,9 +620,9 @@ def test_random_episodes_hold_what_they_promise() -> None:
 
 
 def test_nothing_befalls_one_of_six() -> None:
-    task, N = make("U"), 4000
-    noise = Noise(task, N, 0, 1)
-    truth = task.begin(noise.uniforms, noise.initial).truth
+    model, N = make("U"), 4000
+    noise = Noise(model, N, 0, 1)
+    truth = model.begin(noise.uniforms, noise.initial).truth
     calm = (truth.levels.values == 1.0).all(axis=0)
     assert abs(calm.mean() - 1 / 6) < 4 * math.sqrt(5 / 36 / N)
     assert (truth.sensor_levels.values[..., calm] == 1.0).all()
@@ -620,13 +633,13 @@ def test_nothing_befalls_one_of_six() -> None:
 
 def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone() -> None:
     for plant in "PU":
-        task = make(plant, "sensor-degradation")
-        noise = Noise(task, 8, 0, 1)
-        state = task.begin(noise.uniforms, noise.initial)
+        model = make(plant, "sensor-degradation")
+        noise = Noise(model, 8, 0, 1)
+        state = model.begin(noise.uniforms, noise.initial)
         after = state.truth.sensor_levels.values[1, :, 0]
-        assert dict(zip(task.sensors, after, strict=True))["rate"] == pytest.approx(5.0)
+        assert dict(zip(model.task.sensors, after, strict=True))["rate"] == pytest.approx(5.0)
         assert sorted(after)[:-1] == [1.0] * (len(after) - 1)
-    lag = make("U", "actuator-lag").design
+    lag = make("U", "actuator-lag").task.design
     assert lag.true_model.F[3, 3] == pytest.approx(math.exp(-0.02 / 0.1))
     assert lag.model.F[3, 3] == pytest.approx(math.exp(-0.02 / 0.05))
 
@@ -654,7 +667,7 @@ def test_degradation_touches_the_rate_sensor_alone_and_lag_the_true_plant_alone(
 )
 def test_bad_input_is_refused_with_the_reason(kw: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        UavAutopilot(UavAutopilotParameters(**kw), "gain")
+        UavAutopilot(UavAutopilotParameters(**kw))
 
 
 def test_parameters_from_json_equal_those_from_python() -> None:

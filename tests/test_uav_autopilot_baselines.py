@@ -14,7 +14,6 @@ from filtergym.baselines.uav_autopilot.estimators import AdaptiveKalman, GustInt
 from filtergym.baselines.uav_autopilot.metrics import METRICS
 from filtergym.baselines.uav_autopilot.references import Matched
 from filtergym.baselines.uav_autopilot.theory import stationary
-from filtergym.envs.catalogue import make_task
 from filtergym.envs.uav_autopilot.banks import MODES
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import Record
@@ -23,6 +22,7 @@ from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.statistics import reduce_run
 from filtergym.filters import linear_systems, packed_covariance
 from filtergym.papers.uav_autopilot_kalman import experiment
+from models import make_model
 
 from filtergym import evaluate, tidy_records
 from filtergym.papers import uav_autopilot_kalman as paper
@@ -103,7 +103,7 @@ def test_theory_of_the_mistuned_filters_agrees_with_their_episodes(plant: str) -
 def test_no_theory_where_the_loop_is_not_stationary_or_not_stable() -> None:
     def theory(name: str, scenario: str = "paper-noise", **keywords: Any) -> Any:
         control = "mode" if name == "raw-sensors" else "gain"
-        return stationary(make_task(ID, control, scenario, **keywords), name)
+        return stationary(make_model(ID, control, scenario, **keywords).task, name)
 
     assert theory("kalman") is not None
     assert theory("kalman", "random") is None
@@ -127,8 +127,8 @@ def innovations_of_matched(
     plant: str, scenario: str, episodes: int = EPISODES
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """NIS per available reading, and the innovation over its sigma of the output's sensor, ``(episodes, time)``."""
-    task: Any = make_task(ID, "gain", scenario, plant=plant)
-    shown, i = task.measured.index(task.output), task.output
+    model: Any = make_model(ID, "gain", scenario, plant=plant)
+    shown, i = model.task.measured.index(model.task.output), model.task.output
     nis: list[numpy.ndarray] = []
     innovation: list[numpy.ndarray] = []
 
@@ -136,7 +136,7 @@ def innovations_of_matched(
         def update(self, measurement: Any, truth: Any, memory: Any) -> Any:
             mean, covariance = self.predict(measurement, truth, memory)
             R, z, there = self.sensor_variances(truth), measurement.reading, measurement.available
-            update = packed_covariance.update_coordinates(mean, covariance, z, task.measured, R, there)
+            update = packed_covariance.update_coordinates(mean, covariance, z, model.task.measured, R, there)
             count = there.sum(axis=0)
             before = nis[-1] if nis else numpy.ones_like(count)
             nis.append(numpy.where(count > 0.0, update.squared_distance / numpy.maximum(count, 1.0), before))
@@ -144,7 +144,7 @@ def innovations_of_matched(
             innovation.append(there[shown] * (z[shown] - mean[i]) / numpy.sqrt(S))
             return super().update(measurement, truth, memory)
 
-    for _ in rollout(task, Watched(task), episode_seeds("test", 0, episodes)):
+    for _ in rollout(model, Watched(model.task), episode_seeds("test", 0, episodes)):
         pass
     return numpy.stack(nis, axis=-1)[:episodes], numpy.stack(innovation, axis=-1)[:episodes]
 
@@ -168,10 +168,10 @@ def test_matched_filter_is_consistent_and_attains_the_bound_where_noise_changes(
 
 @BOTH
 def test_bound_is_the_covariance_of_the_nominal_filter_when_the_noise_is_nominal(plant: str) -> None:
-    task = make_task(ID, "gain", "paper-noise", plant=plant)
+    model = make_model(ID, "gain", "paper-noise", plant=plant)
     bound = run(plant, "paper-noise")["mean_square"].sel(policy="known-noise-bound").values[0]
-    d = task.design  # type: ignore[attr-defined]
-    P = numpy.diag(numpy.square(task.parameters.value("initial_sigmas")))
+    d = model.task.design  # type: ignore[attr-defined]
+    P = numpy.diag(numpy.square(model.task.parameters.value("initial_sigmas")))
     Q = d.model.scaled_noise + d.model.other_noise
     for k in range(300):
         P = d.model.F @ P @ d.model.F.T + Q
@@ -200,8 +200,8 @@ def test_steady_filter_becomes_the_paper_filter(plant: str) -> None:
     dataset = run(plant, "paper-noise")
     error = dataset["error"].sel(policy=["kalman", "steady-kalman"])
     gap = numpy.abs(error.diff("policy")).max(["policy", "episode", "component"]).values
-    task = make_task(ID, "gain", "paper-noise", plant=plant)
-    slowest = linear_systems.spectral_radius(numpy.diag(task.design.steady.poles))  # type: ignore[attr-defined]
+    model = make_model(ID, "gain", "paper-noise", plant=plant)
+    slowest = linear_systems.spectral_radius(numpy.diag(model.task.design.steady.poles))  # type: ignore[attr-defined]
     # Both forget their start with the filter's slowest pole.
     assert gap[599] < 10.0 * gap[99] * slowest**500 + 1e-9
     assert gap[0] > 0.1
@@ -255,7 +255,7 @@ def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
         def act(
             self, observation: numpy.ndarray, state: Any, start: numpy.ndarray
         ) -> tuple[numpy.ndarray, Any]:
-            left = self.task.horizon * (1.0 - observation[:, self.task.columns(["time"])[0]])
+            left = self.task.horizon * (1.0 - observation[:, self.model.columns(["time"])[0]])
             decades = numpy.where(left < 9.5, -0.6, 0.0)
             return decades[:, None] / self.task.parameters.gain_decades, None
 
@@ -272,25 +272,25 @@ def test_a_policy_that_knows_the_time_saves_at_the_end_only() -> None:
 @BOTH
 def test_constant_policies_name_the_scales_and_modes_they_stand_for(plant: str) -> None:
     policies = baselines_of(ID).policies
-    task = make_task(ID, "gain", plant=plant)
-    observation = numpy.zeros((3, len(task.fields)))
-    numpy.testing.assert_array_equal(policies["kalman"](task).predict(observation)[0], numpy.zeros((3, 1)))
-    decades = task.parameters.value("gain_decades")
+    model = make_model(ID, "gain", plant=plant)
+    observation = numpy.zeros((3, len(model.fields)))
+    numpy.testing.assert_array_equal(policies["kalman"](model).predict(observation)[0], numpy.zeros((3, 1)))
+    decades = model.task.parameters.value("gain_decades")
     for scale, action in ((0.5, 0.5 / decades), (2.0 * decades, 1.0), (-2.0 * decades, -1.0)):
-        found, _ = module.FixedScale(task, scale).predict(observation)
+        found, _ = module.FixedScale(model, scale).predict(observation)
         numpy.testing.assert_allclose(found, numpy.full((3, 1), action), rtol=1e-12)
-    task = make_task(ID, "mode", plant=plant)
-    observation = numpy.zeros((3, len(task.fields)))
+    model = make_model(ID, "mode", plant=plant)
+    observation = numpy.zeros((3, len(model.fields)))
     for name in ("wide-band", "raw-sensors", "over-smoothed"):
-        found, _ = policies[name](task).predict(observation)
+        found, _ = policies[name](model).predict(observation)
         assert [MODES[i] for i in found] == [name] * 3
 
 
 def test_adaptive_policy_by_hand() -> None:
-    task = make_task(ID, "gain")
-    policy = module.InnovationAdaptive(task, window=4.0, memory=0.25, offset=0.1, weights=(0.5, -0.25, 0.0))
-    sensors = task.sensors  # type: ignore[attr-defined]
-    names = [f.name for f in task.fields]
+    model = make_model(ID, "gain")
+    policy = module.InnovationAdaptive(model, window=4.0, memory=0.25, offset=0.1, weights=(0.5, -0.25, 0.0))
+    sensors = model.task.sensors  # type: ignore[attr-defined]
+    names = [f.name for f in model.fields]
     rng = numpy.random.default_rng(0)
     nu, there, last = rng.standard_normal((3, 2, 3)), rng.integers(0, 2, (3, 2, 3)), [0.3, -0.7]
     memory: Any = None
@@ -309,13 +309,13 @@ def test_adaptive_policy_by_hand() -> None:
         mean = mean + 0.25 * there[k] * (nu[k] ** 2 - mean)
         decades = 0.1 + 0.5 * numpy.log10(mean[:, 0]) - 0.25 * numpy.log10(mean[:, 1])
         wanted = numpy.clip(
-            0.25 * numpy.array(last) + 0.75 * decades / task.parameters.value("gain_decades"), -1.0, 1.0
+            0.25 * numpy.array(last) + 0.75 * decades / model.task.parameters.value("gain_decades"), -1.0, 1.0
         )
         numpy.testing.assert_allclose(action[:, 0], wanted, rtol=1e-12)
 
 
 def test_adaptive_policy_follows_gusts_and_is_misled_by_a_worse_sensor() -> None:
-    action_field = [f.name for f in make_task(ID, "gain").fields].index("action")
+    action_field = [f.name for f in make_model(ID, "gain").fields].index("action")
     seen: list[numpy.ndarray] = []
 
     class Watched(module.InnovationAdaptive):
@@ -432,17 +432,17 @@ def test_reproduction_with_few_runs_tells_its_progress() -> None:
 
 @BOTH
 def test_theory_spectra_integrate_to_the_variances(plant: str) -> None:
-    task = make_task(ID, "gain", "paper-noise", plant=plant)
-    T = task.parameters.value("sampling_interval")
+    model = make_model(ID, "gain", "paper-noise", plant=plant)
+    T = model.task.parameters.value("sampling_interval")
     # A mean over equally spaced frequencies of a periodic function converges faster than any power.
     frequency = numpy.arange(4096) / 4096 / T
-    spectra = experiment.theory_spectra(task, frequency)  # type: ignore[arg-type]
-    d = task.design  # type: ignore[attr-defined]
-    theory = stationary(task, "kalman")  # type: ignore[arg-type]
+    spectra = experiment.theory_spectra(model.task, frequency)  # type: ignore[arg-type]
+    d = model.task.design  # type: ignore[attr-defined]
+    theory = stationary(model.task, "kalman")  # type: ignore[arg-type]
     assert theory is not None
     drive = 0.2**2 if plant == "P" else 0.0
-    i = task.output  # type: ignore[attr-defined]
-    shown = task.measured.index(i)  # type: ignore[attr-defined]
+    i = model.task.output  # type: ignore[attr-defined]
+    shown = model.task.measured.index(i)  # type: ignore[attr-defined]
     sums = {name: float(values.mean() / T) for name, values in spectra.items()}
     assert sums["plant_input"] == pytest.approx(theory.control_variance + drive, rel=1e-9)
     assert sums["observation"] == pytest.approx(theory.output_variance + d.R[shown, shown], rel=1e-9)

@@ -2,7 +2,7 @@
 
 import numpy
 
-from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
+from ...envs.model import Model
 from ...envs.observation import signed_logarithm
 from ..alarm import Alarm, innovation_evidence
 
@@ -19,10 +19,10 @@ class FusionAlarm(Alarm):
     bank, which nobody steers. Under ``gain`` there is none, and the plain scheme's innovations are judged as they are.
     """
 
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task)
-        self.innovation, self.available = task.reader("innovation_over_sigma"), task.reader("available")
-        self.axes = task.parameters.axes
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.innovation, self.available = model.reader("innovation_over_sigma"), model.reader("available")
+        self.axes = self.task.parameters.axes
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh the innovations of each axis."""

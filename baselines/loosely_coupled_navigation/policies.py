@@ -11,8 +11,7 @@ import xarray
 
 from ...envs.catalogue import task_class
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
-from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...envs.task import Task
+from ...envs.model import Model
 from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...evaluation.dataset import keywords_of
@@ -27,10 +26,10 @@ from .estimators import AugmentedEstimator
 from .references import Matched, MatchedCovariance
 
 
-def gain_bank(task: Task) -> GainBank:
+def gain_bank(model: Model) -> GainBank:
     """Bank of a task under control ``gain``."""
-    assert isinstance(task.bank, GainBank)
-    return task.bank
+    assert isinstance(model.filter, GainBank)
+    return model.filter
 
 
 # --- the plain scheme with a constant gain
@@ -41,9 +40,9 @@ class FixedGain(ConstantPolicy):
 
     control = "gain"
 
-    def __init__(self, task: LooselyCoupledNavigation, gain: float) -> None:
-        super().__init__(task)
-        self.action = (float(gain_bank(task).action_for_gain(gain)),) * task.parameters.axes
+    def __init__(self, model: Model, gain: float) -> None:
+        super().__init__(model)
+        self.action = (float(gain_bank(model).action_for_gain(gain)),) * self.task.parameters.axes
 
 
 class PlainReduced(PaperAction):
@@ -55,21 +54,21 @@ class PlainReduced(PaperAction):
 class PlainWhite(FixedGain):
     """Settled gain for the white part of the INS noise only, ``Ge = G``."""
 
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task, task.parameters.settled_gains[0])
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, model.task.parameters.settled_gains[0])
 
 
 class BestConstant(FixedGain):
     """The constant gain of least mean square error under the modelled noise levels, exact."""
 
-    def __init__(self, task: LooselyCoupledNavigation, gain: float | None = None) -> None:
+    def __init__(self, model: Model, gain: float | None = None) -> None:
         if gain is None:
-            p = task.parameters
+            p = model.task.parameters
             levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
             K = ins_gnss.best_constant_gain(*levels)
             growth = K * K * p.receiver_intensity * p.sampling_interval
             gain = float(ins_gnss.settled_gain(growth, p.receiver_variance))
-        super().__init__(task, gain)
+        super().__init__(model, gain)
 
 
 # --- the plain scheme with a gain that varies
@@ -95,14 +94,14 @@ class TimeVarying(Policy):
 
     control = "gain"
 
-    def __init__(self, task: LooselyCoupledNavigation, intensity: float | None = None) -> None:
-        super().__init__(task)
-        p = task.parameters
-        self.loose = task
+    def __init__(self, model: Model, intensity: float | None = None) -> None:
+        super().__init__(model)
+        p = self.task.parameters
+        self.loose = self.task
         self.growth = (p.equivalent_intensities[1] if intensity is None else intensity) * p.sampling_interval
-        self.available = task.reader("available")
-        self.reported_variance = task.reader("reported_variance")
-        self.innovation = task.reader("innovation_in_metres")
+        self.available = model.reader("available")
+        self.reported_variance = model.reader("reported_variance")
+        self.innovation = model.reader("innovation_in_metres")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Set the gain ``P / (P + R)``."""
@@ -120,7 +119,7 @@ class TimeVarying(Policy):
         P = memory.P + self.growth
         memory, R = self.noise(memory, P, self.reported_variance(observation), available, observation)
         gain = numpy.where(available, P / (P + R), 0.0)
-        return gain_bank(self.task).action_for_gain(gain), memory._replace(P=(1.0 - gain) * P)
+        return gain_bank(self.model).action_for_gain(gain), memory._replace(P=(1.0 - gain) * P)
 
     def noise(
         self,
@@ -137,8 +136,8 @@ class TimeVarying(Policy):
 class TimeVaryingWhite(TimeVarying):
     """The same for the white part of the INS noise only, ``Ge = G``."""
 
-    def __init__(self, task: LooselyCoupledNavigation) -> None:
-        super().__init__(task, task.parameters.equivalent_intensities[0])
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, model.task.parameters.equivalent_intensities[0])
 
 
 class InnovationAdaptive(TimeVarying):
@@ -148,11 +147,9 @@ class InnovationAdaptive(TimeVarying):
     begins with the reported noise as its first values.
     """
 
-    def __init__(
-        self, task: LooselyCoupledNavigation, intensity: float | None = None, window: float = 0.25
-    ) -> None:
-        super().__init__(task, intensity)
-        self.rate = -math.expm1(-task.parameters.sampling_interval / window)
+    def __init__(self, model: Model, intensity: float | None = None, window: float = 0.25) -> None:
+        super().__init__(model, intensity)
+        self.rate = -math.expm1(-self.task.parameters.sampling_interval / window)
 
     def noise(
         self,
@@ -189,10 +186,10 @@ class AugmentedGain(TimeVarying):
     """
 
     def __init__(
-        self, task: LooselyCoupledNavigation, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
+        self, model: Model, rule: type[MeasurementNoise] = MeasurementNoise, **values: float
     ) -> None:
-        super().__init__(task)
-        self.filter = AugmentedFilter(task.parameters, rule(**values))
+        super().__init__(model)
+        self.filter = AugmentedFilter(self.task.parameters, rule(**values))
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Run the augmented filter and choose the gain that brings the estimate nearest to its own."""
@@ -214,7 +211,7 @@ class AugmentedGain(TimeVarying):
         gain = numpy.where(usable, wanted / numpy.where(usable, innovation, 1.0), 0.0)
         gain = numpy.clip(gain, 0.0, 1.0)
         gain = numpy.where(gain <= p.smallest_gain, 0.0, gain)
-        return gain_bank(self.task).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
+        return gain_bank(self.model).action_for_gain(gain.T), _Offset(wanted - gain * innovation, rates)
 
 
 # --- metrics of one's own

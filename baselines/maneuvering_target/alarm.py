@@ -2,7 +2,7 @@
 
 import numpy
 
-from ...envs.task import Task
+from ...envs.model import Model
 from ..alarm import Alarm, certain, innovation_evidence
 
 ROUNDING = 1e-6
@@ -17,12 +17,12 @@ class RadarAlarm(Alarm):
     window = 50
     false_alarms = 0.3
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.bank = task.control != "gain"
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.bank = model.control != "gain"
         names = ("innovation_x", "innovation_y", "log_likelihood") if self.bank else ("innovation",)
-        self.read = [task.reader(name) for name in names]
-        self.available, self.elapsed = task.reader("available"), task.reader("elapsed")
+        self.read = [model.reader(name) for name in names]
+        self.available, self.elapsed = model.reader("available"), model.reader("elapsed")
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh scans, and what there is of them."""

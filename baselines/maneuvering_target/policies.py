@@ -10,8 +10,7 @@ from typing import Any
 import numpy
 
 from ...envs.maneuvering_target.banks import GainBank
-from ...envs.maneuvering_target.task import ManeuveringTarget
-from ...envs.task import Task
+from ...envs.model import Model
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable
@@ -26,10 +25,10 @@ class InteractingMultipleModel(Policy):
 
     control = "weights"
 
-    def __init__(self, task: ManeuveringTarget) -> None:
-        super().__init__(task)
-        self.log_likelihood = task.reader("log_likelihood")
-        self.log_predicted = task.reader("log_predicted")
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.log_likelihood = model.reader("log_likelihood")
+        self.log_predicted = model.reader("log_predicted")
 
     def probabilities(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Posterior mode probabilities, ``(N, M)``."""
@@ -62,10 +61,10 @@ class ZeroEvidence(PaperAction):
     control = "evidence"
 
 
-def gain_bank(task: Task) -> GainBank:
+def gain_bank(model: Model) -> GainBank:
     """Bank of a task under control ``gain``."""
-    assert isinstance(task.bank, GainBank)
-    return task.bank
+    assert isinstance(model.filter, GainBank)
+    return model.filter
 
 
 class FixedGain(ConstantPolicy):
@@ -73,30 +72,30 @@ class FixedGain(ConstantPolicy):
 
     control = "gain"
 
-    def __init__(self, task: ManeuveringTarget, alpha: float) -> None:
-        super().__init__(task)
-        self.action = (gain_bank(task).action_for_alpha(alpha),)
+    def __init__(self, model: Model, alpha: float) -> None:
+        super().__init__(model)
+        self.action = (gain_bank(model).action_for_alpha(alpha),)
 
 
 class FixedLow(FixedGain):
     """The smallest of the bank's gains, never changed."""
 
-    def __init__(self, task: ManeuveringTarget) -> None:
-        super().__init__(task, min(task.parameters.gains))
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, min(model.task.parameters.gains))
 
 
 class FixedHigh(FixedGain):
     """The largest of the bank's gains, never changed."""
 
-    def __init__(self, task: ManeuveringTarget) -> None:
-        super().__init__(task, max(task.parameters.gains))
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, max(model.task.parameters.gains))
 
 
 class FixedBest(FixedGain):
     """The constant gain of least whole-run error on the paper's flight, exact: alpha = 0.65."""
 
-    def __init__(self, task: ManeuveringTarget, alpha: float = 0.65) -> None:
-        super().__init__(task, alpha)
+    def __init__(self, model: Model, alpha: float = 0.65) -> None:
+        super().__init__(model, alpha)
 
 
 class AdaptiveGain(Policy):
@@ -111,14 +110,12 @@ class AdaptiveGain(Policy):
     control = "gain"
     rearm = False
 
-    def __init__(
-        self, task: ManeuveringTarget, false_alarm_probability: float = 1e-3, ramp_scans: float = 7.0
-    ) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model, false_alarm_probability: float = 1e-3, ramp_scans: float = 7.0) -> None:
+        super().__init__(model)
         self.threshold = -2.0 * math.log(false_alarm_probability)
         self.ramp_scans = ramp_scans
-        self.low, self.high = min(task.parameters.gains), max(task.parameters.gains)
-        self.squared, self.available = task.reader("log_squared_innovation"), task.reader("available")
+        self.low, self.high = min(self.task.parameters.gains), max(self.task.parameters.gains)
+        self.squared, self.available = model.reader("log_squared_innovation"), model.reader("available")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Go down the ramp, or start it again at an alarm; a scan that missed the target is no step of it."""
@@ -127,7 +124,9 @@ class AdaptiveGain(Policy):
         may = (step > 0) if self.rearm else (step >= self.ramp_scans)
         step = numpy.where(alarm & may & ~start, 0, step)
         alpha = self.high - (self.high - self.low) * numpy.minimum(step, self.ramp_scans) / self.ramp_scans
-        return gain_bank(self.task).action_for_alpha(alpha)[:, None], step + self.available(observation)[:, 0]
+        return gain_bank(self.model).action_for_alpha(alpha)[:, None], step + self.available(observation)[
+            :, 0
+        ]
 
 
 class RearmingAdaptiveGain(AdaptiveGain):
@@ -149,7 +148,7 @@ def _tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[A
 def _tunable_adaptive(cls: type[AdaptiveGain]) -> Tunable:
     def apply(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
         false_alarm, ramp = 10.0 ** values["log10_false_alarm"], values["ramp_scans"]
-        return {"gains": _gains(values)}, lambda task: cls(task, false_alarm, ramp)
+        return {"gains": _gains(values)}, lambda model: cls(model, false_alarm, ramp)
 
     return tunable(cls, apply, **_GAINS, log10_false_alarm=(-5.0, -3.0, -0.5), ramp_scans=(1.0, 7.0, 20.0))
 

@@ -4,8 +4,8 @@ import math
 
 import numpy
 
+from ...envs.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
-from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...filters import class_fusion, imm
 from ..alarm import Alarm
 
@@ -29,12 +29,12 @@ class ClassAlarm(Alarm):
     window = 1000  # what it finds lasts as long as the episode
     false_alarms = 1.0  # of a bound that is far from tight; measured: 0.03 in ``paper``
 
-    def __init__(self, task: RadarEsmTracking) -> None:
-        super().__init__(task)
-        p = task.parameters
-        self.squared = task.reader("log_squared_innovation")
-        self.log_likelihood, self.last_weight = task.reader("log_likelihood"), task.reader("last_weight")
-        self.used_count, self.refused_count = task.reader("used_count"), task.reader("refused_count")
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        p = self.task.parameters
+        self.squared = model.reader("log_squared_innovation")
+        self.log_likelihood, self.last_weight = model.reader("log_likelihood"), model.reader("last_weight")
+        self.used_count, self.refused_count = model.reader("used_count"), model.reader("refused_count")
         self.log_prior = imm.log_probabilities(numpy.array(p.prior))[:, None]
         recognition, composition = numpy.array(p.recognition), numpy.array(p.composition)
         self.log_recognition, self.log_composition = (

@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy
 
+from ...envs.model import Model
 from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
-from ...envs.radar_esm_tracking.task import RadarEsmTracking
-from ...envs.task import Task
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import class_fusion, imm
 from ...filters.small_matrices import apply
@@ -32,9 +31,9 @@ class FixedWeights(ConstantPolicy):
 
     control = "weights"
 
-    def __init__(self, task: Task, weights: tuple[float, ...] | None = None) -> None:
-        super().__init__(task)
-        self.action = weights or (1.0,) * len(task.modes)
+    def __init__(self, model: Model, weights: tuple[float, ...] | None = None) -> None:
+        super().__init__(model)
+        self.action = weights or (1.0,) * len(self.task.modes)
 
 
 class _Posterior(Policy):
@@ -42,11 +41,11 @@ class _Posterior(Policy):
 
     control = "weights"
 
-    def __init__(self, task: RadarEsmTracking) -> None:
-        super().__init__(task)
-        p = task.parameters
-        self.accumulated = task.reader("accumulated_log_likelihood")
-        self.used_count, self.refused_count = task.reader("used_count"), task.reader("refused_count")
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        p = self.task.parameters
+        self.accumulated = model.reader("accumulated_log_likelihood")
+        self.used_count, self.refused_count = model.reader("used_count"), model.reader("refused_count")
         self.log_prior = imm.log_probabilities(numpy.array(p.prior))[:, None]
         self.log_recognition = imm.log_probabilities(numpy.array(p.recognition))
         self.log_composition = imm.log_probabilities(numpy.array(p.composition))
@@ -118,13 +117,13 @@ class JointType(_Posterior):
     """Posterior over type and class together: right where a target has one type.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         refused: what a decision that the gate refuses counts for, 0 to 1.
         esm: what any decision counts for, 0 to 1.
     """
 
-    def __init__(self, task: RadarEsmTracking, refused: float = 0.0, esm: float = 1.0) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model, refused: float = 0.0, esm: float = 1.0) -> None:
+        super().__init__(model)
         self.refused, self.esm = refused, esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
@@ -138,17 +137,15 @@ class ForgettingJointType(JointType):
     """Posterior over type and class together where the class may change and bring its own type: old evidence fades.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         change: probability that the class changes from one decision to the next; by default once in 500 scans,
             four times the length of an episode.
         refused: as in :class:`JointType`.
         esm: likewise.
     """
 
-    def __init__(
-        self, task: RadarEsmTracking, change: float = 0.002, refused: float = 0.0, esm: float = 1.0
-    ) -> None:
-        super().__init__(task, refused, esm)
+    def __init__(self, model: Model, change: float = 0.002, refused: float = 0.0, esm: float = 1.0) -> None:
+        super().__init__(model, refused, esm)
         self.change = change
         self.log_start = self.log_prior[:, None] + self.log_composition[..., None]
 
@@ -173,18 +170,18 @@ class Leaky(_Posterior):
     Only the weights leak; the filters stay as they are (``class_transition`` would mix them too).
 
     Args:
-        task: the problem.
+        model: in which it acts.
         leak: probability that the class changes in one scan, shared equally by the others.
         esm: what a decision counts for, 0 to 1.
     """
 
-    def __init__(self, task: RadarEsmTracking, leak: float = 0.01, esm: float = 1.0) -> None:
-        super().__init__(task)
-        classes = len(task.modes)
+    def __init__(self, model: Model, leak: float = 0.01, esm: float = 1.0) -> None:
+        super().__init__(model)
+        classes = len(self.task.modes)
         others = (1.0 - numpy.eye(classes)) / (classes - 1)
         self.transition = (1.0 - leak) * numpy.eye(classes) + leak * others
-        self.last_weight, self.log_likelihood = task.reader("last_weight"), task.reader("log_likelihood")
-        self.decision, self.refused = task.reader("decision"), task.reader("decision_refused")
+        self.last_weight, self.log_likelihood = model.reader("last_weight"), model.reader("log_likelihood")
+        self.decision, self.refused = model.reader("decision"), model.reader("decision_refused")
         self.esm = esm
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
@@ -198,7 +195,7 @@ class Leaky(_Posterior):
 
 def _fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     weights = tuple(values[name] for name in ("S0", "S1", "S2"))
-    return {}, lambda task: FixedWeights(task, weights)
+    return {}, lambda model: FixedWeights(model, weights)
 
 
 _COUNTS = {"refused": (0.0, 0.0, 1.0), "esm": (0.0, 1.0, 1.0)}

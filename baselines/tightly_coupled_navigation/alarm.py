@@ -2,8 +2,8 @@
 
 import numpy
 
+from ...envs.model import Model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
-from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ..alarm import LARGER, Alarm, certain, scale_ratio
 
 
@@ -14,11 +14,11 @@ class SensorAlarm(Alarm):
 
     window = 20
 
-    def __init__(self, task: TightlyCoupledNavigation) -> None:
-        super().__init__(task)
-        self.nis, self.repeat = task.reader("nis"), task.reader("accelerometers_repeat")
-        self.available = task.reader("pseudorange_available"), task.reader("rate_available")
-        self.others = [sensor.readings.stop - sensor.readings.start for sensor in task.sensors[2:]]
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.nis, self.repeat = model.reader("nis"), model.reader("accelerometers_repeat")
+        self.available = model.reader("pseudorange_available"), model.reader("rate_available")
+        self.others = [sensor.readings.stop - sensor.readings.start for sensor in self.task.sensors[2:]]
 
     def evidence(self, observation: numpy.ndarray, before: numpy.ndarray) -> numpy.ndarray:
         """Weigh every group of sensors."""

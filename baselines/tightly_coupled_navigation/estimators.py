@@ -27,7 +27,7 @@ class HuberBank(HypothesisBank):
     def __init__(
         self, task: TightlyCoupledNavigation, thresholds: Mapping[str, float], manoeuvre: float
     ) -> None:
-        super().__init__(task)
+        super().__init__(task, "evidence")
         self.manoeuvre = manoeuvre
         self.of_reading = [
             thresholds.get(sensor.name, math.inf)

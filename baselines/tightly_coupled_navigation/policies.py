@@ -10,9 +10,8 @@ from typing import Any, ClassVar
 
 import numpy
 
-from ...envs.task import Task
+from ...envs.model import Model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
-from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import SensorAlarm
@@ -48,14 +47,14 @@ class FixedGain(ConstantPolicy):
     """The paper's probabilities over sensors whose noise is taken to be larger or smaller, always.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         action: of the control "gain"; by default the accelerometers are as good as switched off.
     """
 
     control = "gain"
 
-    def __init__(self, task: Task, action: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0)) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model, action: tuple[float, ...] = (0.0, 0.0, 0.8, 0.0)) -> None:
+        super().__init__(model)
         self.action = action
 
 
@@ -65,7 +64,7 @@ class FixedRobust(ConstantPolicy):
     The robust update makes nothing of an outlier, nor of a manoeuvre that begins; see ``HuberBank``.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         accelerometers: action that makes them noisier throughout.
         pseudoranges: strength of the robust update of these, 0 to 1.
         rates: likewise of their rates.
@@ -74,9 +73,9 @@ class FixedRobust(ConstantPolicy):
     control = "robust"
 
     def __init__(
-        self, task: Task, accelerometers: float = 0.0, pseudoranges: float = 1.0, rates: float = 1.0
+        self, model: Model, accelerometers: float = 0.0, pseudoranges: float = 1.0, rates: float = 1.0
     ) -> None:
-        super().__init__(task)
+        super().__init__(model)
         self.action = (0.0, 0.0, accelerometers, 0.0, 1.0, pseudoranges, rates)
 
 
@@ -91,7 +90,7 @@ class NisAdaptive(Policy):
     action ``base``.
 
     Args:
-        task: the problem.
+        model: in which it acts.
         threshold: of the average per observation; 1 is what a consistent filter has.
         rates: power of the rates' excess in their own variance.
         accelerometers: power of the rates' excess in the variance of the accelerometers.
@@ -103,16 +102,16 @@ class NisAdaptive(Policy):
 
     def __init__(
         self,
-        task: TightlyCoupledNavigation,
+        model: Model,
         threshold: float = 3.0,
         rates: float = 1.0,
         accelerometers: float = 1.0,
         own: float = 1.0,
         base: float = 0.0,
     ) -> None:
-        super().__init__(task)
-        self.average_nis = task.reader("average_nis")
-        self.nats = 2.0 * math.log(task.parameters.noise_scale)
+        super().__init__(model)
+        self.average_nis = model.reader("average_nis")
+        self.nats = 2.0 * math.log(self.task.parameters.noise_scale)
         self.threshold, self.rates, self.accelerometers = threshold, rates, accelerometers
         self.own, self.base = own, base
 
@@ -136,10 +135,10 @@ class StuckCheck(NisAdaptive):
     the filter trusts it.
     """
 
-    def __init__(self, task: TightlyCoupledNavigation, threshold: float = 3.0, rates: float = 0.0) -> None:
-        super().__init__(task, threshold, rates, accelerometers=0.0)
-        self.repeat = task.reader("accelerometers_repeat")
-        self.switch = [sensor.name for sensor in task.sensors].index("accelerometers")
+    def __init__(self, model: Model, threshold: float = 3.0, rates: float = 0.0) -> None:
+        super().__init__(model, threshold, rates, accelerometers=0.0)
+        self.repeat = model.reader("accelerometers_repeat")
+        self.switch = [sensor.name for sensor in self.task.sensors].index("accelerometers")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Look whether any reading of the last decision has repeated the one before it."""
@@ -168,7 +167,7 @@ class StuckCheckFallback(StuckCheck):
 
 def _fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     # The other two groups change nothing that can be measured.
-    return {}, lambda task: FixedGain(task, tuple(values.get(s.name, 0.0) for s in task.sensors))
+    return {}, lambda model: FixedGain(model, tuple(values.get(s.name, 0.0) for s in model.task.sensors))
 
 
 def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:

@@ -20,7 +20,7 @@ LOST_SIGMAS = 100.0
 
 def _task(evaluation: xarray.Dataset) -> UavAutopilot:
     attrs = evaluation.attrs
-    task = make_task(attrs["environment"], "gain", attrs["scenario"], **keywords_of(evaluation))
+    task = make_task(UavAutopilot, attrs["scenario"], **keywords_of(evaluation))
     assert isinstance(task, UavAutopilot)
     return task
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy
 
+from ...envs.model import Model
 from ...envs.uav_autopilot.banks import MODES
-from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ..table import Baselines, ConstantMode, Variant, tunable
 from .alarm import AutopilotAlarm
@@ -26,9 +26,9 @@ class FixedScale(ConstantPolicy):
 
     control = "gain"
 
-    def __init__(self, task: UavAutopilot, log10_scale: float = 0.0) -> None:
-        super().__init__(task)
-        self.action = (min(max(log10_scale / task.parameters.gain_decades, -1.0), 1.0),)
+    def __init__(self, model: Model, log10_scale: float = 0.0) -> None:
+        super().__init__(model)
+        self.action = (min(max(log10_scale / self.task.parameters.gain_decades, -1.0), 1.0),)
 
 
 class Kalman(FixedScale):
@@ -45,7 +45,7 @@ class InnovationAdaptive(Policy):
     tell gusts from a noisier sensor, for which the right answer is the opposite; tuned weights can.
 
     Args:
-        task: whose observation it reads.
+        model: whose observation it reads.
         window: effective length of the window, measurements.
         memory: share of the last factor's logarithm that is kept, 0 to 1.
         offset: logarithm (base 10) of the factor when the innovations are as predicted.
@@ -56,21 +56,21 @@ class InnovationAdaptive(Policy):
 
     def __init__(
         self,
-        task: UavAutopilot,
+        model: Model,
         window: float = 50.0,
         memory: float = 0.5,
         offset: float = 0.0,
         weights: tuple[float, ...] | None = None,
     ) -> None:
-        super().__init__(task)
+        super().__init__(model)
         self.forget, self.memory = 1.0 / window, memory
-        self.unit = 1.0 / task.parameters.gain_decades
+        self.unit = 1.0 / self.task.parameters.gain_decades
         self.offset = offset
-        m = len(task.sensors)
+        m = len(self.task.sensors)
         self.weights = numpy.array([1.0 / m] * m if weights is None else (*weights, *[0.0] * m)[:m])
-        self.innovation = task.reader("innovation")
-        self.available = task.reader("available")
-        self.last_action = task.reader("action")
+        self.innovation = model.reader("innovation")
+        self.available = model.reader("available")
+        self.last_action = model.reader("action")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Update the window and scale the noise."""
@@ -88,8 +88,8 @@ class InnovationAdaptive(Policy):
 def _tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     weights = tuple(values[name] for name in ("output_weight", "rate_weight", "elevator_weight"))
 
-    def make(task: UavAutopilot) -> Policy:
-        return InnovationAdaptive(task, values["window"], values["memory"], values["offset"], weights)
+    def make(model: Model) -> Policy:
+        return InnovationAdaptive(model, values["window"], values["memory"], values["offset"], weights)
 
     return {}, make
 
@@ -100,7 +100,7 @@ _WEIGHT = (-3.0, 1.0 / 3.0, 3.0)
 TUNABLE = {
     "fixed-best": tunable(
         FixedScale,
-        lambda values: ({}, lambda task: FixedScale(task, values["log10_scale"])),
+        lambda values: ({}, lambda model: FixedScale(model, values["log10_scale"])),
         log10_scale=(-0.5, 0.0, 0.5),
     ),
     "innovation-adaptive": tunable(

@@ -19,6 +19,7 @@ from filtergym.envs.draws import Draws
 from filtergym.envs.observation import LOG1P, SIGNED_LOG, Array, Block
 from filtergym.envs.parameters import TaskParameters, parameter
 from filtergym.envs.filter import Bank, Initial
+from filtergym.envs.model import Model
 from filtergym.envs.task import Component, PaperPolicy, Scenario, Task
 from filtergym.envs.world import World
 from filtergym.evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
@@ -224,9 +225,9 @@ class Matching(Policy):
 
     control = "gain"
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
-        self.nis, self.last_action = task.reader("nis"), task.reader("last_action")
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.nis, self.last_action = model.reader("nis"), model.reader("last_action")
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Take a step from the last action."""

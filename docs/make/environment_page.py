@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from filtergym.baselines.problem import Problem
-from filtergym.envs.catalogue import make_task
+from filtergym.envs.backend import make_model
+from filtergym.envs.model import Model
 from filtergym.envs.observation import Block
 from filtergym.envs.parameters import Limits, declared
 from filtergym.envs.task import Task
@@ -48,8 +49,8 @@ def measurement_class(cls: type[Task]) -> Any:
     return typing.get_args(typing.get_type_hints(cls.World.advance)["return"])[1]
 
 
-def _space(task: Task) -> str:
-    space: Any = task.action_space
+def _space(model: Model) -> str:
+    space: Any = model.action_space
     if hasattr(space, "n"):
         return f"`Discrete({space.n})`"
     return f"`Box({space.low.min():g}, {space.high.max():g}, {space.shape})`"
@@ -59,7 +60,7 @@ def _actions(cls: type[Task]) -> list[str]:
     rows = []
     for control in cls.controls:
         role = " (default)" if control == cls.controls[0] else ""
-        rows.append((f"`{control}`{role}", _space(make_task(cls.id, control)), cls.actions.get(control, "")))
+        rows.append((f"`{control}`{role}", _space(make_model(cls, control)), cls.actions.get(control, "")))
     return markdown_table(("control", "space", "meaning"), rows)
 
 
@@ -74,9 +75,9 @@ def _names(block: Block) -> str:
 def _fields(cls: type[Task]) -> list[str]:
     lines: list[str] = []
     tables: dict[tuple[Any, ...], list[str]] = {}
-    tasks = {control: make_task(cls.id, control) for control in cls.controls}
-    for control, task in tasks.items():
-        tables.setdefault(task.fields, []).append(control)
+    models = {control: make_model(cls, control) for control in cls.controls}
+    for control, model in models.items():
+        tables.setdefault(model.fields, []).append(control)
     for fields, controls in tables.items():
         named = ", ".join(f"`{control}`" for control in controls)
         rows = [
@@ -87,7 +88,7 @@ def _fields(cls: type[Task]) -> list[str]:
                 + block.text
                 + (" (mean over the interval)" if block.over_interval == "mean" else ""),
             )
-            for block in tasks[controls[0]].bank.blocks
+            for block in models[controls[0]].filter.blocks
         ]
         lines += [
             "",
@@ -95,10 +96,10 @@ def _fields(cls: type[Task]) -> list[str]:
             "",
             *markdown_table(("field", "unit", "what it is"), rows),
         ]
-        quantities = tasks[controls[0]].bank.quantities
+        quantities = models[controls[0]].filter.quantities
         if quantities:
             readable = "; ".join(f"`{q.name}`, {q.unit}: {q.text}" for q in quantities)
-            lines += ["", f"Read from them by `task.reader(NAME)`: {readable}."]
+            lines += ["", f"Read from them by `model.reader(NAME)`: {readable}."]
     return lines[1:]
 
 

@@ -277,7 +277,7 @@ def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationR
         if kind_of(makers[name]) == "bound":
             raise ValueError(f"{name!r} is a bound, which has no cost: name policies and references")
     members = {member.name: member for member in study.runs}
-    horizon = make_task(problem.id, None, scenario).horizon
+    horizon = make_task(problem.task, scenario).horizon
     found: dict[str, tuple[EvaluationRequest, Work | None]] = {}
     for name, maker in makers.items():
         member = members.get(name)

@@ -102,8 +102,8 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
     filters: tuple[str, ...] = ()
     """Names of the filters, where there are several."""
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, task: Task, control: str) -> None:
+        super().__init__(task, control)
         p = self.parameters
         self.axes = AXES[: p.axes] if p.axes > 1 else ()
         self.forgetting = -math.expm1(-1.0 / p.averaging_measurements)
@@ -346,8 +346,8 @@ class NoiseBank(_KalmanBucyBank):
 class GainBank(_KalmanBucyBank):
     """Control ``gain``: the plain scheme, whose gain on every axis the action sets."""
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, task: Task, control: str) -> None:
+        super().__init__(task, control)
         p = self.parameters
         self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
         smallest = math.log(p.smallest_gain)
@@ -434,14 +434,14 @@ class SchemeBank(_KalmanBucyBank):
 
     filters = SCHEMES
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, task: Task, control: str) -> None:
+        super().__init__(task, control)
         self.plain_growth = task.constant(self.parameters.plain_growth)[:, None, None]
 
     @property
     def action_space(self) -> gymnasium.Space:
         """One filter, or a weight for each."""
-        return bank_action_space(self.task.control, len(SCHEMES))
+        return bank_action_space(self.control, len(SCHEMES))
 
     def last_action(self) -> Block:
         """Block of the weights in force before."""
@@ -502,7 +502,7 @@ class SchemeBank(_KalmanBucyBank):
             drift=state.drift - gain.drift * innovation[2],
             coloured=state.coloured - gain.coloured * innovation[2],
             covariance=P,
-            weights=bank_probabilities(self.task.control, action, no_evidence, no_evidence, 0.0, xp),
+            weights=bank_probabilities(self.control, action, no_evidence, no_evidence, 0.0, xp),
         )
 
     def mean(self, state: Schemes) -> Array:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy
 from matplotlib.figure import Figure
 
+from ..model import Episode, Model
 from ..rendering import (
     BLACK,
     BLUE,
@@ -23,7 +24,6 @@ from ..rendering import (
     error_strip,
     grown,
 )
-from ..task import Episode, Task
 from .banks import NOISES, Augmented, Schemes, Steered
 from .task import LooselyCoupledNavigation
 
@@ -41,8 +41,8 @@ class LooselyCoupledNavigationPicture(Picture):
 
     task: LooselyCoupledNavigation
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self.disturbed: list[tuple[float, float]] = []
         self.limits = (-1.0, 1.0)
 
@@ -56,7 +56,7 @@ class LooselyCoupledNavigationPicture(Picture):
             "reference": state.truth.reference[0, 0],
             "ins": measurement.ins[0, 0],
             "measured": math.nan if missing else measurement.fix[0, 0],
-            "estimated": self.task.mean(state)[0, 0],
+            "estimated": self.model.mean(state)[0, 0],
         }
         normalised = filters.seen.normalised
         if isinstance(filters, Steered):
@@ -97,11 +97,11 @@ class LooselyCoupledNavigationPicture(Picture):
         """Innovation, what is steered, error."""
         suffix = "" if self.task.parameters.axes == 1 else ", x"
         component = self.task.components[0].name
-        if self.task.control == "gain":
+        if self.model.control == "gain":
             low = math.log10(self.task.parameters.smallest_gain)
             innovations = {"innovation": "innovation"}
             steered = Strip(f"log10 of the gain{suffix}", {"gain": "log_gain"}, (low, 0.2), steps=True)
-        elif self.task.control == "noise":
+        elif self.model.control == "noise":
             innovations = {"innovation": "innovation"}
             noises = {name: f"noise.{name}" for name in NOISES}
             steered = Strip("action: noises", noises, (-1.08, 1.08), guides=(0.0,), steps=True)

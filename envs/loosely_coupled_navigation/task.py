@@ -12,6 +12,7 @@ Reading: the paper prints no numbers; those marked "ours" make its Figs. 2, 4 an
 
 from typing import Any
 
+from ..model import Model
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .kalman_net import KalmanNetBank
@@ -123,14 +124,14 @@ class LooselyCoupledNavigation(Task):
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         self.components = tuple(Component(name, "m") for name in names)
         self.groups = {} if p.axes == 1 else {"position": names}
-        action = float(GainBank(self).action_for_gain(p.settled_gains[1]))
+        action = float(GainBank(self, "gain").action_for_gain(p.settled_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
 
-    def picture(self) -> Any:
+    def picture(self, model: Model) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
 
-        return PICTURE(self)
+        return PICTURE(model)
 
 
 TASK = LooselyCoupledNavigation

@@ -94,8 +94,8 @@ class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
 
     parameters: ManeuveringTargetParameters
 
-    def __init__(self, task: "ManeuveringTarget") -> None:
-        super().__init__(task)
+    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+        super().__init__(task, control)
         self.T = self.parameters.sampling_interval
         self.regular = task.regular
         self.forgetting = math.exp(-1.0 / self.parameters.averaging_measurements)
@@ -328,8 +328,8 @@ class GainBank(_RadarBank):
 class FilterBank(_RadarBank):
     """Controls ``mode``, ``weights`` and ``evidence``: filters of fixed gains that mix on their weights."""
 
-    def __init__(self, task: "ManeuveringTarget") -> None:
-        super().__init__(task)
+    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+        super().__init__(task, control)
         p = self.parameters
         self.count = len(p.gains)
         self.gain_alpha = task.constant(p.gains)[:, None]
@@ -339,7 +339,7 @@ class FilterBank(_RadarBank):
     @property
     def action_space(self) -> gymnasium.Space:
         """One hypothesis, or a number for each."""
-        return bank_action_space(self.task.control, self.count)
+        return bank_action_space(self.control, self.count)
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -448,7 +448,7 @@ class FilterBank(_RadarBank):
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update every filter and put the weights of the action in force."""
         probabilities = bank_probabilities(
-            self.task.control,
+            self.control,
             action,
             state.log_predicted,
             state.log_likelihood,
@@ -500,8 +500,8 @@ class FilterBank(_RadarBank):
 class SteeredFilterBank(FilterBank):
     """Control ``gains``: the paper's IMM, whose filters have the gains that the action asks for."""
 
-    def __init__(self, task: "ManeuveringTarget") -> None:
-        super().__init__(task)
+    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+        super().__init__(task, control)
         self.logit = self.xp.log(self.gain_alpha / (1.0 - self.gain_alpha))
 
     @property

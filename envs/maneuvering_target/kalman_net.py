@@ -99,8 +99,8 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
     parameters: ManeuveringTargetParameters
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (ANSWERS,), numpy.float32)
 
-    def __init__(self, task: "ManeuveringTarget") -> None:
-        super().__init__(task)
+    def __init__(self, task: "ManeuveringTarget", control: str) -> None:
+        super().__init__(task, control)
         # Columns of the identity.
         columns = numpy.eye(4)[:, :, None]
         self.positions, self.velocities = task.constant(columns[:, :2]), task.constant(columns[:, 2:])

@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
 from ...filters import imm
+from ..model import Episode, Model
 from ..rendering import (
     BLACK,
     BLUE,
@@ -23,7 +24,6 @@ from ..rendering import (
     Strip,
     grown,
 )
-from ..task import Episode, Task
 from .banks import AlphaBeta, Filters
 from .task import ManeuveringTarget
 
@@ -61,8 +61,8 @@ class ManeuveringTargetPicture(Picture):
 
     task: ManeuveringTarget
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self.flight = numpy.empty((2, 0))
         self.maneuvers: list[tuple[float, float]] = []
         self.largest_sigma = 1.0
@@ -71,12 +71,12 @@ class ManeuveringTargetPicture(Picture):
 
     def records(self, state: Episode) -> dict[str, float]:
         """Positions in km, innovation, gain or weights, position error with its reported sigma."""
-        task, estimator = self.task, state.filter
+        estimator = state.filter
         true, measured = state.truth.position[:, 0], state.measurement.position[:, 0]
         if not state.measurement.available[0]:
             measured = measured + numpy.nan
-        error = task.error(state)[:2, 0]
-        P = task.covariance(state)[:2, :2, 0]
+        error = self.model.error(state)[:2, 0]
+        P = self.model.covariance(state)[:2, :2, 0]
         values = {
             "true_x": true[0] / 1e3,
             "true_y": true[1] / 1e3,
@@ -125,9 +125,9 @@ class ManeuveringTargetPicture(Picture):
 
     def strips(self) -> Sequence[Strip]:
         """Innovation, what is steered, error."""
-        if self.task.control == "gain":
+        if self.model.control == "gain":
             steered = Strip("position gain alpha", {"alpha": "alpha"}, (0.0, 1.0))
-        elif self.task.control == "gains":
+        elif self.model.control == "gains":
             each = {f"filter {j + 1}": f"alpha.{j}" for j in range(len(self.task.parameters.gains))}
             steered = Strip("position gain alpha", each, (0.0, 1.0))
         else:

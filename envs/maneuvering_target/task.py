@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 
 from ..flights import Flights, flight_of
+from ..model import Model
 from ..parameters import check, declared, frozen
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
@@ -144,11 +145,11 @@ class ManeuveringTarget(Task):
         """Return the time between scans, s; None where some miss the target, or come early."""
         return self.parameters.sampling_interval if self.regular else None
 
-    def picture(self) -> Any:
+    def picture(self, model: Model) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
 
-        return PICTURE(self)
+        return PICTURE(model)
 
     @classmethod
     def _scenario_of_trajectory(cls, trajectory: Trajectory, keywords: Mapping[str, Any]) -> Scenario:

@@ -69,8 +69,8 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
 
     parameters: RadarEsmTrackingParameters
 
-    def __init__(self, task: "RadarEsmTracking") -> None:
-        super().__init__(task)
+    def __init__(self, task: "RadarEsmTracking", control: str) -> None:
+        super().__init__(task, control)
         p, constant = self.parameters, task.constant
         self.forgetting = math.exp(-1.0 / p.averaging_measurements)
         self.gate = class_fusion.bearing_gate(p.radar_bearing_sigma, p.esm_bearing_sigma, p.association_error)
@@ -91,7 +91,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
     @property
     def action_space(self) -> gymnasium.Space:
         """One class, or a number for each."""
-        return bank_action_space(self.task.control, self.task.classes)
+        return bank_action_space(self.control, self.task.classes)
 
     @property
     def blocks(self) -> Sequence[Block]:
@@ -255,7 +255,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Put the weights of the action in force; evidence is added to this scan's weights only."""
         log_predicted, esm = state.log_predicted, self._esm_log_likelihood(state.used, measurement)
-        control, scale = self.task.control, self.parameters.evidence_scale
+        control, scale = self.control, self.parameters.evidence_scale
         probabilities = bank_probabilities(control, action, log_predicted, esm, scale, self.xp)
         believed = imm.mode_posterior(log_predicted, esm) if control == "evidence" else probabilities
         return state._replace(probabilities=probabilities, believed=believed)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy
 from matplotlib.figure import Figure
 
+from ..model import Episode, Model
 from ..rendering import (
     BLACK,
     BLUE,
@@ -20,7 +21,6 @@ from ..rendering import (
     error_strip,
     grown,
 )
-from ..task import Episode, Task
 from .task import RadarEsmTracking
 
 ACCELERATION = (0.105, 0.555, 0.395, 0.345)
@@ -45,8 +45,8 @@ class RadarEsmTrackingPicture(Picture):
 
     task: RadarEsmTracking
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self.change: float | None = None
         self.height = LEAST_HEIGHT
 
@@ -59,7 +59,7 @@ class RadarEsmTrackingPicture(Picture):
         nothing = float("nan")
         return {
             "true": truth.motion[2, 0],
-            "estimate": self.task.mean(state)[2, 0],
+            "estimate": self.model.mean(state)[2, 0],
             **{f"filter.{s}": filters.mean[2, s, 0] for s in range(self.task.classes)},
             **{f"weight.{s}": filters.probabilities[s, 0] for s in range(self.task.classes)},
             "true_class": truth.target_class[0],

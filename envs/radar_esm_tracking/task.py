@@ -11,8 +11,9 @@ import numpy
 
 from ...filters import class_fusion, singer
 from ...filters.ordered_sums import weighted_sum
+from ..model import Episode, Model
 from ..observation import Array
-from ..task import Component, Episode, PaperPolicy, Task
+from ..task import Component, PaperPolicy, Task
 from .banks import ClassBank, one_hot
 from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
@@ -160,21 +161,20 @@ class RadarEsmTracking(Task):
         starts = [numpy.diag([p.range_sigma, p.range_rate_sigma, s]) ** 2 for s in p.acceleration_sigma]
         return models, numpy.stack(starts, axis=-1)
 
-    def picture(self) -> Any:
+    def picture(self, model: Model) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
 
-        return PICTURE(self)
+        return PICTURE(model)
 
-    def records(self, episode: Episode) -> dict[str, Array]:
-        """Add the reported variances, and the weight of the true class where there are weights."""
-        kept, covariance = super().records(episode), self.covariance(episode)
-        for i, component in enumerate(self.components):
-            kept[f"variance_{component.name}"] = covariance[i, i]
+    def records(self, model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
+        """Report the variances, and the weight of the true class where there are weights."""
+        covariance = model.covariance(episode)
+        own = {f"variance_{c.name}": covariance[i, i] for i, c in enumerate(self.components)}
         if "mode_probability" in kept and self.recording is None:
             is_true = one_hot(episode.truth.target_class, self.classes, self.xp)
-            kept["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
-        return kept
+            own["true_class_probability"] = weighted_sum(is_true, kept["mode_probability"])
+        return own
 
 
 TASK = RadarEsmTracking

@@ -89,7 +89,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
     @property
     def action_space(self) -> gymnasium.Space:
         """One hypothesis, or a number for each."""
-        return bank_action_space(self.task.control, len(HYPOTHESES))
+        return bank_action_space(self.control, len(HYPOTHESES))
 
     @property
     def actions(self) -> Sequence[str]:
@@ -274,7 +274,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Weigh the hypotheses by the action (step 7)."""
-        xp, control, dtype = self.xp, self.task.control, state.log_likelihood.dtype
+        xp, control, dtype = self.xp, self.control, state.log_likelihood.dtype
         probabilities = bank_probabilities(
             control,
             action,

@@ -7,6 +7,7 @@ import numpy
 from matplotlib.figure import Figure
 
 from ...filters import gnss_ins
+from ..model import Episode, Model
 from ..rendering import (
     BLACK,
     BLUE,
@@ -18,7 +19,6 @@ from ..rendering import (
     Strip,
     grown,
 )
-from ..task import Episode, Task
 from .parameters import HYPOTHESES, LINE, REST, SINGER
 from .task import TightlyCoupledNavigation
 
@@ -46,8 +46,8 @@ class TightlyCoupledNavigationPicture(Picture):
 
     task: TightlyCoupledNavigation
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self.motions: list[list[tuple[float, float]]] = [[] for _ in HYPOTHESES]
         self.faults: list[list[tuple[float, float]]] = [[] for _ in FAULTS]
 
@@ -56,8 +56,8 @@ class TightlyCoupledNavigationPicture(Picture):
     def records(self, state: Episode) -> dict[str, float]:
         """Positions in m, accelerations, weights, factors, innovations, errors."""
         task, bank, S, lane = self.task, state.filter, self.task.satellites, 0
-        error = task.error(state)[:, lane]
-        P = numpy.diagonal(task.covariance(state)[:, :, lane])
+        error = self.model.error(state)[:, lane]
+        P = numpy.diagonal(self.model.covariance(state)[:, :, lane])
         truth, estimate = state.truth.state[:, lane], bank.mean[:, lane]
         innovation = bank.range_innovation[:, lane] / task.sensor_sigma[task.tracked, 0]
         innovation = numpy.where(state.measurement.available[task.tracked, lane] > 0.0, innovation, 0.0)
@@ -79,7 +79,7 @@ class TightlyCoupledNavigationPicture(Picture):
             "rate_innovation": float(numpy.abs(innovation[S:]).max()),
         }
         values |= {f"weight.{i}": bank.probabilities[i, lane] for i in range(len(HYPOTHESES))}
-        if task.control in NOISE_CONTROLS:
+        if self.model.control in NOISE_CONTROLS:
             values |= {f"gain.{i}": action[lane] for i, action in enumerate(bank.last_action)}
         return {name: float(value) for name, value in values.items()}
 
@@ -113,8 +113,8 @@ class TightlyCoupledNavigationPicture(Picture):
         hypotheses = (name.replace("-", " ").replace("singer", "Singer") for name in HYPOTHESES)
         weights = {name: f"weight.{i}" for i, name in enumerate(hypotheses)}
         steered = [Strip("weights of the hypotheses", weights, (-0.04, 1.04), steps=True)]
-        if self.task.control in NOISE_CONTROLS:
-            steering: Any = self.task.bank
+        if self.model.control in NOISE_CONTROLS:
+            steering: Any = self.model.filter
             names = [name.removeprefix("accelerometers_").replace("_", " ") for name in steering.actions]
             groups = len(self.task.sensors)
             for title, part in (("action", range(groups)), ("readings", range(groups, len(names)))):

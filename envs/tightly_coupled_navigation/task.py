@@ -21,6 +21,7 @@ from typing import Any
 import numpy
 
 from ...filters import gnss_ins, satellites
+from ..model import Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
 from .banks import HypothesisBank, NoiseBank, RobustBank
@@ -201,11 +202,11 @@ class TightlyCoupledNavigation(Task):
             return None
         return gnss_ins.advance(mean, self.axis[:, :, SINGER], self.common.T, self.common.decay)
 
-    def picture(self) -> Any:
+    def picture(self, model: Model) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
 
-        return PICTURE(self)
+        return PICTURE(model)
 
 
 TASK = TightlyCoupledNavigation

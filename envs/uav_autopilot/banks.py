@@ -59,8 +59,8 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
     no_action: tuple[float, ...]
     """What is shown as the last action before the first."""
 
-    def __init__(self, task: "UavAutopilot") -> None:
-        super().__init__(task)
+    def __init__(self, task: "UavAutopilot", control: str) -> None:
+        super().__init__(task, control)
         constant, design, n, m = task.constant, task.design, len(task.components), len(task.sensors)
         model, pack = design.model, packed_covariance.pack
         self.F, self.B = constant(model.F), constant(model.B)
@@ -305,8 +305,8 @@ class GainBank(_AutopilotFilter):
 class NoiseBank(_AutopilotFilter):
     """Control ``noise``: the action scales the process noise and the noise of every sensor."""
 
-    def __init__(self, task: "UavAutopilot") -> None:
-        super().__init__(task)
+    def __init__(self, task: "UavAutopilot", control: str) -> None:
+        super().__init__(task, control)
         self.no_action = (0.0,) * (1 + len(task.sensors))
         self.nominal_variances = task.constant(task.sensor_variances)[:, None]
 
@@ -339,8 +339,8 @@ class ModeBank(_AutopilotFilter):
     shown_action = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
     no_action = (1.0, 0.0, 0.0, 0.0)
 
-    def __init__(self, task: "UavAutopilot") -> None:
-        super().__init__(task)
+    def __init__(self, task: "UavAutopilot", control: str) -> None:
+        super().__init__(task, control)
         # Of raw readings it is the covariance of their nominal noise; a coordinate without a sensor, taken as
         # zero, has the stationary variance of the nominal loop.
         d = task.design

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Sequence
 
+from ..model import Episode, Model
 from ..rendering import Picture, Strip, error_strip
-from ..task import Episode, Task
 from .banks import MODES, Filter
 from .task import UavAutopilot
 
@@ -20,8 +20,8 @@ class UavAutopilotPicture(Picture):
 
     task: UavAutopilot
 
-    def __init__(self, task: Task) -> None:
-        super().__init__(task)
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
         self.shown = (
             self.task.measured.index(self.task.output) if self.task.output in self.task.measured else 0
         )
@@ -36,14 +36,14 @@ class UavAutopilotPicture(Picture):
             "command": truth.command[0],
             "output": truth.state[task.output, 0],
             "estimate": estimator.estimate[task.output, 0],
-            "control": task.filter.feedback(estimator, state.measurement)[0],
+            "control": self.model.filter.feedback(estimator, state.measurement)[0],
             # A line breaks off where there is no reading.
             "innovation": estimator.innovation[self.shown, 0] if answered else math.nan,
             "mean_nis": estimator.mean_nis[0],
             "level": truth.level[0],
             "log10_scale": math.log10(estimator.scale[0]),
         }
-        if task.control == "mode":
+        if self.model.control == "mode":
             values["mode"] = float(estimator.action[:, 0].argmax())
         return values | {f"sensor_level.{s}": truth.sensor_level[k, 0] for k, s in enumerate(task.sensors)}
 
@@ -54,7 +54,7 @@ class UavAutopilotPicture(Picture):
         name, unit = CONTROL[task.parameters.plant]
         disturbance = "gusts" if task.parameters.plant == "U" else "control"
         levels = {disturbance: "level", **{s: f"sensor_level.{s}" for s in task.sensors}}
-        if task.control == "gain":
+        if self.model.control == "gain":
             reach = task.parameters.gain_decades
             steered = Strip(
                 "action: log10 of the factor on the process noise",

@@ -19,8 +19,9 @@ far from one. Reading: the noise printed in (10) has mean zero and is unknown, s
 
 from typing import Any
 
+from ..model import Episode, Model
 from ..observation import Array
-from ..task import Episode, PaperPolicy, Task
+from ..task import PaperPolicy, Task
 from .banks import GainBank, ModeBank, NoiseBank
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
@@ -150,11 +151,11 @@ class UavAutopilot(Task):
         """Return what was left to the plant too, s."""
         return float(self.parameters.value("sampling_interval"))
 
-    def picture(self) -> Any:
+    def picture(self, model: Model) -> Any:
         """Return what draws an episode; imported here, because it brings matplotlib."""
         from .picture import PICTURE
 
-        return PICTURE(self)
+        return PICTURE(model)
 
     def autopilot(self, estimate: Array, command: Array) -> Array:
         """Control that follows from estimate ``(n, N)`` and command ``(N,)``, ``u = N r - L x(k|k)``, ``(N,)``."""
@@ -168,12 +169,9 @@ class UavAutopilot(Task):
         """Measured coordinates of ``(n, N)``, ``(m, N)``."""
         return self.xp.stack([state[i] for i in self.measured])
 
-    def records(self, episode: Episode) -> dict[str, Array]:
-        """What is fed back is recorded too: the control that follows from the estimate."""
-        return {
-            **super().records(episode),
-            "control_signal": self.filter.feedback(episode.filter, episode.measurement),
-        }
+    def records(self, model: Model, episode: Episode, kept: dict[str, Array]) -> dict[str, Array]:
+        """Report what is fed back: the control that follows from the estimate."""
+        return {"control_signal": model.filter.feedback(episode.filter, episode.measurement)}
 
 
 TASK = UavAutopilot

@@ -186,7 +186,7 @@ def evaluate_policies(
         strict=strict,
         keywords=keywords,
     )
-    task = make_task(problem.id, control, data, **keywords)
+    task = make_task(problem.task, data, **keywords)
     with Workers(jobs, cluster) as workers:
         outcome = run(problem, task, experiment, names, outputs, workers, trust)
     write(problem, outcome, outputs, learned)
@@ -215,9 +215,7 @@ def record_scenario(
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
     writable_file(out)
     with progress_bar() as bar:
-        line = bar.add_task(
-            "recording", total=episodes * make_task(cls.id, None, scenario, **keywords).horizon
-        )
+        line = bar.add_task("recording", total=episodes * make_task(cls, scenario, **keywords).horizon)
         recording = record(
             cls.id,
             scenario,
@@ -278,7 +276,7 @@ def write_offline(
     keywords = parse_settings(settings or [])
     policies = policy or default_policies(cls.id, control)
     known = parameter_names(cls)
-    task = make_task(cls.id, None, scenario, **{n: value for n, value in keywords.items() if n in known})
+    task = make_task(cls, scenario, **{n: value for n, value in keywords.items() if n in known})
     with progress_bar() as bar:
         total = len(policies) * episodes * (task.horizon // task.decision_interval)
         line = bar.add_task("recording", total=total)

@@ -6,7 +6,7 @@ from ..agents.named_policies import shipped_agents
 from ..baselines.problem import Problem
 from ..compiler.library import fastest
 from ..compiler.native import processor
-from ..envs.backend import task_on
+from ..envs.backend import make_model
 from ..envs.catalogue import parameter_names
 
 
@@ -22,7 +22,7 @@ def environment_lines(problem: Problem) -> Iterator[str]:
     yield f"  {(cls.__doc__ or '').strip().partition(chr(10))[0]}"
     if cls.paper_source:
         yield f"  paper:       {cls.paper_source}"
-    task = task_on("auto", cls.id)
+    model = make_model(cls, backend="auto")
     rows = {
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
@@ -34,7 +34,7 @@ def environment_lines(problem: Problem) -> Iterator[str]:
     for title, names in rows.items():
         if names:
             yield f"  {title + ':':<12} {', '.join(names)}"
-    yield f"  {'backend:':<12} {task.backend}{_library(task.backend)}"
+    yield f"  {'backend:':<12} {model.backend}{_library(model.backend)}"
     for title, table in (("references", known.references), ("bounds", known.bounds)):
         if table:
             yield f"  {title}:"

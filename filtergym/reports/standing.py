@@ -14,7 +14,7 @@ from rich.table import Table
 from ..agents import training_run
 from ..agents.named_policies import learned_policy
 from ..agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
-from ..envs.task import Episode, Task
+from ..envs.model import Episode, Model
 from ..evaluation.bootstrap import Bootstrap, Estimate
 from ..evaluation.competitors import RandomPolicy
 from ..filters.gaussian import log_density
@@ -27,9 +27,9 @@ FINALISTS = 3
 """Of those, how many meet all episodes."""
 
 
-def _cost_and_nees(task: Task, episode: Episode) -> dict[str, numpy.ndarray]:
-    nees = log_density(task.error(episode), task.covariance(episode))[1]
-    return {"cost": task.cost(episode), "anees": nees / len(task.components)}
+def _cost_and_nees(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+    nees = log_density(model.error(episode), model.covariance(episode))[1]
+    return {"cost": model.cost(episode), "anees": nees / len(model.task.components)}
 
 
 class Standing(NamedTuple):
@@ -81,7 +81,7 @@ class Opponents:
         names = [n for n, maker in makers.items() if n != self.paper and maker is not RandomPolicy]
         if not names:
             return None
-        horizon = run.make_task().horizon
+        horizon = run.make_model().task.horizon
         each = len(names) * len(self.episodes.weights) * horizon * known.measurement_seconds
         few = max(FEWEST_SCREENED, int(SCREENING_SECONDS / each))
         screened = {n: self.episodes.means(makers[n], episodes=few)["cost"].mean() for n in names}

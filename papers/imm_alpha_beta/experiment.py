@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from ...envs.backend import make_model
 from ...envs.catalogue import make_task
 from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
@@ -102,10 +103,11 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
         scenario: name of a scenario.
         **keywords: parameters of the task.
     """
-    task: Any = make_task(ManeuveringTarget.id, "gain", scenario, **keywords)
+    model = make_model(ManeuveringTarget, "gain", scenario, **keywords)
+    task: Any = model.task
     starts: list[Initial] = []
     lanes = start_lanes(
-        task, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
+        model, episode_seeds("test", seed, episodes), lambda episode: starts.append(episode.measurement)
     )
     kept = []
     for _ in range(lanes.decisions_per_episode):
@@ -159,7 +161,7 @@ class Results(NamedTuple):
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
     """Run all experiments; ``STEPS`` units of work."""
-    parameters: Any = make_task(ManeuveringTarget.id, "gain", "paper").parameters
+    parameters: Any = make_task(ManeuveringTarget, "paper").parameters
     flight, scans, (low, high) = maneuver_flight(parameters), parameters.horizon, parameters.gains
 
     def exactly(alpha: numpy.ndarray) -> numpy.ndarray:

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...baselines.problem import problem_of
-from ...envs.catalogue import make_task
+from ...envs.backend import make_model
 from ...envs.loosely_coupled_navigation.task import LooselyCoupledNavigation
-from ...envs.task import Episode
+from ...envs.model import Episode, Model
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
 from ...filters import kalman_bucy
@@ -114,14 +114,14 @@ def first_order(runs: int) -> FirstOrder:
 def example_run(name: str) -> dict[str, numpy.ndarray]:
     """Fly one episode with the drift ``DRIFT``: reference, INS, measurement and estimate, m, ``(500,)``."""
     maker = problem_of(LooselyCoupledNavigation.id).competitor(name)
-    task: Any = make_task(LooselyCoupledNavigation.id, maker.control, "paper", fixed_drift=DRIFT)
+    model = make_model(LooselyCoupledNavigation, maker.control, "paper", fixed_drift=DRIFT)
 
-    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
+    def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
         said = episode.measurement
-        shown = (episode.truth.reference, said.ins, said.fix, task.mean(episode))
+        shown = (episode.truth.reference, said.ins, said.fix, model.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
 
-    series = recorded(task, maker(task), episode_seeds("test", SEED, 1), fields)
+    series = recorded(model, maker(model), episode_seeds("test", SEED, 1), fields)
     return {field: values[0] for field, values in series.items()}
 
 

@@ -8,8 +8,8 @@ import numpy
 from ...baselines.tightly_coupled_navigation.metrics import lasting, switches
 from ...baselines.tightly_coupled_navigation.policies import chain
 from ...baselines.tightly_coupled_navigation.references import KnownMode
-from ...envs.catalogue import make_task
-from ...envs.task import Episode, Task
+from ...envs.backend import make_model
+from ...envs.model import Episode, Model
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ...envs.tightly_coupled_navigation.task import TightlyCoupledNavigation
 from ...evaluation.competitors import Policy
@@ -124,9 +124,12 @@ class _SideBySide(Policy):
 
     control = "weights"
 
-    def __init__(self, task: Task, lanes: Sequence[int | None]) -> None:
-        super().__init__(task)
-        self.log_likelihood, self.log_predicted = task.reader("log_likelihood"), task.reader("log_predicted")
+    def __init__(self, model: Model, lanes: Sequence[int | None]) -> None:
+        super().__init__(model)
+        self.log_likelihood, self.log_predicted = (
+            model.reader("log_likelihood"),
+            model.reader("log_predicted"),
+        )
         self.fixed = numpy.array([lane is not None for lane in lanes])
         self.weights = numpy.array([numpy.eye(len(HYPOTHESES))[lane or 0] for lane in lanes])
 
@@ -147,11 +150,12 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         filters: names of ``FILTERS``, or "known mode", which runs alone, and how many runs each has.
         **keywords: parameters of the task.
     """
-    task: Any = make_task(TightlyCoupledNavigation.id, "weights", scenario, **keywords)
+    model = make_model(TightlyCoupledNavigation, "weights", scenario, **keywords)
+    task: Any = model.task
     seeds = [seed for count in filters.values() for seed in episode_seeds("test", SEED, count)]
 
-    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
-        squares, records, P = task.error(episode) ** 2, task.records(episode), task.covariance(episode)
+    def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+        squares, records, P = model.error(episode) ** 2, model.records(episode), model.covariance(episode)
         if isinstance(episode.filter, Estimated):
             # The reference believes the truth; nothing but apertures takes a rate away here.
             available = episode.measurement.available
@@ -167,8 +171,8 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
         }
 
     lanes = [FILTERS.get(name) for name, count in filters.items() for _ in range(count)]
-    actor = KnownMode(task) if "known mode" in filters else _SideBySide(task, lanes)
-    run = Run(**recorded(task, actor, seeds, fields))
+    actor = KnownMode(task) if "known mode" in filters else _SideBySide(model, lanes)
+    run = Run(**recorded(model, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
         name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)

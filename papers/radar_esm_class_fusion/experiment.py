@@ -51,7 +51,7 @@ STEPS = 3 * len(CLASSES) + 2 + 2 + 2 * len(VARIANTS)
 
 def parameters(variant: str = "as in the main experiment") -> RadarEsmTrackingParameters:
     """Parameters of scenario ``paper`` in a variant."""
-    return make_task(RadarEsmTracking.id, scenario="paper", **VARIANTS[variant]).parameters
+    return make_task(RadarEsmTracking, "paper", **VARIANTS[variant]).parameters
 
 
 def exact_mean_squares(p: RadarEsmTrackingParameters, target: int, channel: int) -> numpy.ndarray:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...baselines.uav_autopilot.policies import BASELINES
-from ...envs.catalogue import make_task
-from ...envs.task import Episode
+from ...envs.backend import make_model
+from ...envs.model import Episode, Model
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
@@ -73,29 +73,32 @@ class Signals:
 def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) -> Signals:
     """Run one loop of ``LOOPS`` on test episodes."""
     control = "mode" if loop == "raw-sensors" else "gain"
-    task: Any = make_task("UavAutopilot", control, scenario, horizon=HORIZON, **keywords)
+    model = make_model(UavAutopilot, control, scenario, horizon=HORIZON, **keywords)
+    task: Any = model.task
     shown = task.measured.index(task.output)
 
-    def fields(task: Any, episode: Episode) -> dict[str, numpy.ndarray]:
-        error, said = task.error(episode), task.records(episode)
-        covariance = numpy.moveaxis(task.covariance(episode), -1, 0)
+    def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+        error, said = model.error(episode), model.records(episode)
+        covariance = numpy.moveaxis(model.covariance(episode), -1, 0)
         whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
         without_filter = numpy.full_like(said["output"], numpy.nan)
         innovation = said.get("innovation", without_filter)
         return {
             "output": said["output"],
             "control": said["control_signal"],
-            "cost": task.cost(episode) * task.cost_unit,
+            "cost": model.cost(episode) * task.cost_unit,
             "observation": episode.measurement.reading[shown],
-            "estimate": task.mean(episode)[task.output],
+            "estimate": model.mean(episode)[task.output],
             "innovation": innovation * math.sqrt(innovation_variance(task)),
             "nees": (whitened * error.T).sum(axis=1) / len(error),
             "nis": said["nis"] / said["nis_degrees"] if "nis" in said else without_filter,
             "truth": episode.truth.state,
         }
 
-    actor = {**BASELINES.policies, **BASELINES.references}[loop](task)
-    series = recorded(task, actor, episode_seeds("test", 0, episodes), fields)
+    actor = {**BASELINES.policies, **BASELINES.references}[loop](
+        model if loop in BASELINES.policies else task
+    )
+    series = recorded(model, actor, episode_seeds("test", 0, episodes), fields)
     truth, plant_input = series.pop("truth"), series["control"].copy()
     if task.parameters.plant == "P":
         # What drives the plant to the next measurement; the last one has no next.

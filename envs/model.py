@@ -1,0 +1,206 @@
+"""What runs: a task with a filter in the loop.
+
+The engine, the Gymnasium classes and every evaluation step a :class:`Model`. Its methods are the clock of the task, see
+:mod:`.task`; on NumPy and torch they are the functions of world and filter one after another, and
+:class:`~.compiled.CompiledModel` runs the same ones as code of the processor.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy
+
+from .draws import Draws
+from .filter import Filter, Input
+from .observation import Array, Blocks, Field, Reader
+from .task import Task, named_arrays
+
+
+class Episode(NamedTuple):
+    """N episodes at one moment: all that the engine keeps between steps."""
+
+    truth: Any
+    """What is; the world's NamedTuple."""
+    measurement: Any
+    """What the sensors say; between ``begin`` and the first measurement the initial estimate."""
+    filter: Any
+    """State of the filter."""
+
+
+class Model:
+    """A task with a filter in the loop, for N independent episodes.
+
+    Args:
+        task: the estimation problem; compiled models share it with those that are not.
+        control: what the action steers; the filter is its bank, until :meth:`with_filter` puts another in its place.
+
+    Attributes:
+        filter: what estimates.
+        fields: what an agent is shown, component by component.
+        action_space: what the action may be.
+    """
+
+    filter: Any
+    fields: tuple[Field, ...]
+    action_space: gymnasium.Space
+
+    def __init__(self, task: Task, control: str) -> None:
+        self.task = task
+        self.control = control
+        self._take_filter({**task.banks, **task.trained_banks}[control](task, control))
+
+    def _take_filter(self, filter: Filter) -> None:
+        self.filter = filter
+        self._blocks = Blocks(filter.blocks, filter.quantities, self.task.xp)
+        self.fields = self._blocks.fields
+        self.action_space = filter.action_space
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Model":
+        """Share the model: nothing in it changes."""
+        return self
+
+    def __reduce__(self) -> Any:
+        """Pickle what it is made of."""
+        return type(self), (self.task, self.control)
+
+    @property
+    def backend(self) -> str:
+        """What computes its steps: "numpy", "torch", or "compiled"."""
+        return "torch" if "torch" in self.task.xp.__name__ else "numpy"
+
+    def columns(self, names: Sequence[str]) -> list[int]:
+        """Positions of named fields in the observation.
+
+        Raises:
+            ValueError: for a name that is no field.
+        """
+        return self._blocks.columns(names)
+
+    def reader(self, name: str) -> Reader:
+        """Return what reads a block or quantity of the observation by its name, uncompressed.
+
+        Raises:
+            ValueError: for a name that is neither.
+        """
+        return self._blocks.reader(name)
+
+    def under(self, control: str) -> "Model":
+        """Return the same problem with another control."""
+        return type(self)(self.task, control)
+
+    def on_numpy(self) -> "Model":
+        """Return the same problem on NumPy arrays, not compiled."""
+        return Model(self.task if self.task.xp is numpy else self.task.on(numpy), self.control)
+
+    def with_filter(self, make: Callable[["Model"], Filter]) -> "Model":
+        """Return the same problem with another filter in place of the bank.
+
+        Args:
+            make: makes the filter for a model; not made anew for each call, since what is compiled is kept by it.
+        """
+        other = copy.copy(self)
+        other._take_filter(make(self))
+        return other
+
+    def run(self, function: Callable[..., Any], *parts: Any) -> Any:
+        """Call ``function(model, *parts)`` on this model's backend.
+
+        Args:
+            function: of this module or another, not made anew for each call: it may be compiled, once.
+            *parts: nested tuples of arrays ``(..., N)``.
+
+        Returns:
+            Nested tuples or dictionaries of arrays ``(..., N)``.
+        """
+        return function(self, *parts)
+
+    def picture(self) -> Any:
+        """Return the :class:`~.rendering.Picture` made for an episode of this task; None for the general one."""
+        return self.task.picture(self) if self.task.recording is None else None
+
+    def truth_for_filter(self, truth: Any) -> Any:
+        """Truth as the filter is given it: None unless it ``knows`` something."""
+        return truth if self.filter.knows else None
+
+    # --- what the engine calls
+
+    def begin(self, uniforms: Array, normals: Array) -> Episode:
+        """Episode at the start of the track.
+
+        Args:
+            uniforms: ``(noise.uniforms, N)``, of the task.
+            normals: ``(noise.initial_normals, N)``.
+        """
+        truth, initial = self.task.world.begin(Draws(uniforms, self.task.xp), normals)
+        return Episode(truth, initial, self.filter.begin(Input(initial, self.truth_for_filter(truth))))
+
+    def measure(self, episode: Episode, noise: Array) -> Episode:
+        """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
+        feedback = self.filter.feedback(episode.filter, episode.measurement)
+        truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
+        return Episode(truth, measurement, self.filter.predict(episode.filter, measurement))
+
+    def observe(self, episode: Episode) -> Array:
+        """Step 3: what the agent is shown, ``(len(fields), N)``."""
+        if not self.fields:  # nothing steers the filter
+            N = next(named_arrays(episode.measurement))[1].shape[-1]
+            return self.task.xp.zeros((0, N), dtype=self.task.xp.float64, device=self.task.device)
+        return self._blocks.observe(episode.filter, episode.measurement)
+
+    def act(self, episode: Episode, action: Array) -> Episode:
+        """Step 4: the filter takes the measurement in, a bank with the action."""
+        given = Input(episode.measurement, self.truth_for_filter(episode.truth), action)
+        return episode._replace(filter=self.filter.update(episode.filter, given))
+
+    def mean(self, episode: Episode) -> Array:
+        """Estimate, ``(len(components), N)``, in the units of ``components``."""
+        return self.filter.mean(episode.filter)
+
+    def context(self, episode: Episode) -> dict[str, Array]:
+        """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
+        context = self.task.world.context(episode.truth)
+        return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
+
+    def cost(self, episode: Episode) -> Array:
+        """Step 5: what the estimate costs, uncapped, ``(N,)``."""
+        return self.task.world.cost(episode.truth, self.filter.mean(episode.filter))
+
+    def charge(self, episode: Episode) -> Array:
+        """Part of the cost that the reward counts, ``(N,)``; see :meth:`World.charge`."""
+        return self.task.world.charge(episode.truth, self.filter.mean(episode.filter))
+
+    def error(self, episode: Episode) -> Array:
+        """Estimate minus truth, ``(len(components), N)``, in the units of ``components``."""
+        return self.filter.mean(episode.filter) - self.task.world.state(episode.truth)
+
+    def covariance(self, episode: Episode) -> Array:
+        """Covariance that the estimator reports for its error, ``(C, C, N)``."""
+        return self.filter.covariance(episode.filter)
+
+    def track(self, episode: Episode) -> dict[str, Array]:
+        """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
+        ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
+        """
+        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        return {**self._estimated(episode), **said}
+
+    def drawn(self, episode: Episode) -> dict[str, Array]:
+        """What a picture of a track shows: as :meth:`track`, but of the measurement what is ``seen`` of the components
+        ``(C, N)``, where anything is; NaN where it says nothing.
+        """
+        seen = self.task.world.seen(episode.measurement)
+        return {**self._estimated(episode), **({} if seen is None else {"seen": seen})}
+
+    def _estimated(self, episode: Episode) -> dict[str, Array]:
+        true = {"truth": self.task.world.state(episode.truth)} if self.task.has_truth else {}
+        return {**true, "estimate": self.mean(episode), "covariance": self.covariance(episode)}
+
+    def records(self, episode: Episode) -> dict[str, Array]:
+        """What else an evaluation keeps of each measurement."""
+        kept = {
+            **self.filter.records(episode.filter, episode.measurement),
+            **self.task.world.records(episode.truth),
+        }
+        return {**kept, **self.task.records(self, episode, kept)}
