@@ -16,6 +16,8 @@ from ...filters import coordinated_turn, imm, kalman, unscented
 from ...filters.ordered_sums import weighted_sum
 from ...filters.small_matrices import outer
 
+DEGREE = math.pi / 180.0
+
 
 class KalmanModel:
     """The constant-velocity model in x and y."""
@@ -96,7 +98,9 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
         # All modes are left equally often in the long run, so they are met in proportion to how long they last.
         lasting = [1.0 / (1.0 - probability) for probability in stay]
-        self.probabilities = task.constant([scans / sum(lasting) for scans in lasting])
+        self.probabilities = task.constant([[scans / sum(lasting)] for scans in lasting])
+        if self.probabilities.ndim == 3:
+            self.probabilities = self.probabilities[:, 0]
 
     def augmented(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Give an estimate of position and velocity the state in which the filters are mixed."""
@@ -117,7 +121,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         return KalmanBank(
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
-            self.probabilities[:, None] + 0.0 * mean[:1],
+            self.probabilities + 0.0 * mean[:1],
         )
 
     def update(
@@ -154,7 +158,7 @@ class TurnModel(KalmanModel):
     def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
         super().__init__(task)
         self.variance = acceleration**2
-        self.change = math.radians(turn_rate_change) / task.parameters.sampling_interval
+        self.change = DEGREE * turn_rate_change / task.parameters.sampling_interval
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
@@ -193,7 +197,7 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     ) -> None:
         super().__init__(task, accelerations[:2], stay)
         self.turn = TurnModel(task, accelerations[2], turn_rate_change)
-        self.turn_variance = math.radians(turn_rate_start) ** 2
+        self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
     def augmented(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Add the turn rate of straight flight."""
@@ -231,7 +235,7 @@ class UnscentedTurn(TurnModel):
         turn_rate_start: float = 2.0,
     ) -> None:
         super().__init__(task, acceleration, turn_rate_change)
-        self.turn_variance = math.radians(turn_rate_start) ** 2
+        self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial, N: int) -> Initial:
         """Start where everyone starts, with a turn rate about zero."""
