@@ -78,7 +78,9 @@ def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up
     initial_arrays = {
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
-    measurements = [_filled(like, {name: values[k] for name, values in arrays.items()}) for k in range(longest)]
+    measurements = [
+        _filled(like, {name: values[k] for name, values in arrays.items()}) for k in range(longest)
+    ]
     return Windows(_filled(template, initial_arrays), measurements, counts)
 
 
@@ -91,7 +93,9 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
     first = span.first - warm_up
     available = recording.measurements.get("available")
     # A track starts from what was measured: the window begins later where its first measurements are missing.
-    while available is not None and first > 0 and not (available[span.episode, first : first + 2] > 0.0).all():
+    while (
+        available is not None and first > 0 and not (available[span.episode, first : first + 2] > 0.0).all()
+    ):
         first -= 1
     if first == 0:
         return own, 0
@@ -99,7 +103,10 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
     rows = slice(first, first + 3)
     try:
         begun = log_format.start(
-            {name: values[span.episode : span.episode + 1, rows] for name, values in recording.measurements.items()},
+            {
+                name: values[span.episode : span.episode + 1, rows]
+                for name, values in recording.measurements.items()
+            },
             recording.seconds[span.episode : span.episode + 1, rows],
             task.parameters,
         )
@@ -186,7 +193,9 @@ class WindowLikelihood:
             step: of every parameter; its rounding error is 1e-12 of the log-likelihood over the step.
         """
         moves = step * numpy.eye(len(values))
-        found = self(numpy.concatenate([values[:, None], values[:, None] + moves, values[:, None] - moves], axis=1))
+        found = self(
+            numpy.concatenate([values[:, None], values[:, None] + moves, values[:, None] - moves], axis=1)
+        )
         count = len(values)
         return float(found[0]), (found[1 : 1 + count] - found[1 + count :]) / (2.0 * step)
 

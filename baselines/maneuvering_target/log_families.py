@@ -17,7 +17,6 @@ from ...envs.observation import Array
 from ...envs.recording import Recording
 from ...evaluation.competitors import Likelihood
 from ...filters import kalman
-from ...filters.small_matrices import outer
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes
 from .estimators import (
@@ -79,9 +78,7 @@ class ConstantAcceleration(KalmanModel):
         none = 0.0 * variance
         rows = [[*([none] * 4), *(variance if i == j else none for j in range(2))] for i in range(2)]
         below = xp.stack([xp.stack(row) for row in rows])
-        return Initial(
-            xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0)
-        )
+        return Initial(xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0))
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """One cycle of the filter."""
@@ -92,7 +89,10 @@ class ConstantAcceleration(KalmanModel):
         gain = [T**3 / 6.0, half, T]
         # States are position x, y, velocity x, y, acceleration x, y.
         F = xp.stack(
-            [xp.stack([kinematic[i // 2][j // 2] if i % 2 == j % 2 else none for j in range(6)]) for i in range(6)]
+            [
+                xp.stack([kinematic[i // 2][j // 2] if i % 2 == j % 2 else none for j in range(6)])
+                for i in range(6)
+            ]
         )
         Q = xp.stack(
             [
@@ -145,14 +145,18 @@ def log_families(recording: Recording) -> dict[str, Tunable]:
     # Degrees a second: from what nobody sees over a hundred scans to a quarter turn within one.
     turn = math.log10(0.05 / T), math.log10(2.0 / T), math.log10(90.0 / T)
     leave = {"log10_leave_quiet": (-2.7, -1.5, -0.3), "log10_leave_noisy": (-2.3, -1.0, -0.3)}
-    ratio = math.log10(2.0), math.log10(8.0), math.log10(300.0)
+    ratio = math.log10(2.0), math.log10(8.0), 3.5
     return {
         "constant-velocity": tunable(ConstantVelocity, log10_acceleration=acceleration),
         "constant-acceleration": tunable(
             ConstantAcceleration, log10_jerk=jerk, log10_acceleration=acceleration
         ),
         "imm-two": tunable(
-            KalmanInteractingMultipleModel, _imm, log10_acceleration_quiet=acceleration, log10_ratio=ratio, **leave
+            KalmanInteractingMultipleModel,
+            _imm,
+            log10_acceleration_quiet=acceleration,
+            log10_ratio=ratio,
+            **leave,
         ),
         "imm-turn": tunable(
             KalmanTurnInteractingMultipleModel,
