@@ -1,10 +1,13 @@
 """Which filter is best for a recording, by how much, and with which parameters.
 
-The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood; one of them is
-chosen on a quarter, the simplest that predicts as well as the best; the last quarter judges it against what is shipped,
-which nobody was fitted to. Intervals are of whole stretches of measurements, since neighbours are not independent.
+The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
+chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
+19, 1974), and fitted to all three quarters. The last quarter judges it against what is shipped, which is not fitted.
+Intervals are of whole stretches of measurements, since neighbours are not independent.
 """
 
+import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -17,10 +20,11 @@ from ..envs.recording import Recording
 from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap, Estimate, ratio
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
+from .fitted_filters import families_of
 from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
 from .problem import Problem
 from .table import Tunable
-from .tuned_values import TunedPolicy
+from .tuned_values import tuned_policy
 
 FEWEST = 40
 """Measurements of a recording from which on it is cut into blocks; of fewer everything is fitted to all of it."""
@@ -44,7 +48,7 @@ class Share(NamedTuple):
 
 
 def share_out(recording: Recording) -> Share:
-    """Cut a recording into what filters are fitted to, chosen on, and judged on: a half and two quarters of its blocks."""
+    """Cut a recording into what filters are fitted to, chosen on and judged on: half of its blocks and two quarters."""
     total = int(recording.rows.sum())
     blocks = min(MOST_BLOCKS, max(8, total // BLOCK_MEASUREMENTS)) // 4 * 4
     warm_up = max(2, min(LONGEST_WARM_UP, total // 20))
@@ -54,7 +58,7 @@ def share_out(recording: Recording) -> Share:
     ends = [total * i // blocks for i in range(blocks + 1)]
     found: list[list[Span]] = [[], [], [], []]
     first_of_episode = numpy.concatenate([[0], numpy.cumsum(recording.rows)])
-    for block, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for block, (begin, end) in enumerate(itertools.pairwise(ends)):
         for episode, offset in enumerate(first_of_episode[:-1]):
             first, last = max(begin, offset), min(end, first_of_episode[episode + 1])
             if block == 0:
@@ -73,7 +77,8 @@ class Competitor(NamedTuple):
     parameters: int
     """How many were."""
     log_likelihood: float
-    """Mean of the measurements that chose, nats; NaN where it says none."""
+    """Mean of the measurements that chose, less one nat in all for each fitted parameter, nats; NaN where it says
+    none."""
     difference: Estimate
     """Judged log-likelihood per measurement less that of the best shipped, nats."""
     prediction: float
@@ -137,7 +142,7 @@ def advise(
     scenario = recording.scenario(cls, keywords)
     task = make_task(cls, None, **{**scenario.parameters, **keywords, "horizon": 1})
     share = share_out(recording)
-    families = {**_families(problem, recording), **(own or {})}
+    families = {**families_of(problem, recording), **(own or {})}
     scaled = cls.log_format.scale_noise if noise and cls.log_format is not None else None
     windows = cut_windows(recording, task, share.fitted, share.warm_up)
     fits: dict[str, Fit] = {}
@@ -148,36 +153,38 @@ def advise(
         tunable = family if scaled is None else with_noise_scale(family, scaled)
         likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, family.in_lanes)
         fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
-    makers = {**shipped, **{name: fitted_competitor(tunables[name], found) for name, found in fits.items()}}
+    makers = {
+        **shipped,
+        **{
+            name: tuned_policy(f"fitted {name}", tunables[name], found.values) for name, found in fits.items()
+        },
+    }
     progress("replaying the recording", 0.6)
     dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
     judged = _Judged(dataset, task, share)
     competitors, best = judged.competitors({name: len(found.values) for name, found in fits.items()})
-    advised = _simplest(competitors, judged)
+    advised = _likeliest(competitors)
     progress("computing intervals", 0.9)
     intervals = {}
     if advised.fitted:
-        intervals = profile_intervals(likelihoods[advised.name], tunables[advised.name], fits[advised.name])
+        name, tunable = advised.name, tunables[advised.name]
+        if share.apart:
+            windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
+            begin = dataclasses.replace(tunable, start=fits[name].values)
+            likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
+            fits[name] = fit(likelihoods[name], begin, seed, starts=1)
+            makers = {name: tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
+            dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
+            again, _ = _Judged(dataset, task, share).competitors({name: advised.parameters})
+            refitted = next(c for c in again if c.name == name)
+            advised = refitted._replace(log_likelihood=advised.log_likelihood)
+        intervals = profile_intervals(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     others = sorted(
         (c for c in competitors if c.name != advised.name),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
     )
     return Advice(recording, share, [advised, *others], best, fits, tunables, intervals)
-
-
-def fitted_competitor(tunable: Tunable, found: Fit) -> TunedPolicy:
-    """Return what makes a fitted estimator."""
-    keywords, make = tunable.apply(found.values)
-    return TunedPolicy(keywords, None, make)
-
-
-def _families(problem: Problem, recording: Recording) -> dict[str, Tunable]:
-    """What is fitted, by name: the environment's families for a log, or else its tunable estimators."""
-    known = problem.baselines
-    if known.log_families is not None:
-        return dict(known.log_families(recording))
-    return {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
 
 
 class _Judged:
@@ -191,7 +198,8 @@ class _Judged:
 
     def __init__(self, dataset: xarray.Dataset, task: Task, share: Share) -> None:
         self.dataset, self.task = dataset, task
-        self.chosen, self.judged = (self._mask(spans) for spans in (share.chosen, share.judged))
+        choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
+        self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
         self.names = [str(name) for name in dataset["policy"].values]
         self.has_truth = bool(dataset.attrs["truth"])
         self.stretches = {id(mask): _stretches(mask) for mask in (self.chosen, self.judged)}
@@ -256,7 +264,7 @@ class _Judged:
                     name,
                     name in fitted,
                     fitted.get(name, 0),
-                    _mean(self.log_likelihood(name), self.chosen),
+                    _mean(self.log_likelihood(name), self.chosen) - fitted.get(name, 0) / self.chosen.sum(),
                     self.difference(name, best, self.judged),
                     math.sqrt(_mean(predictions[name], self.judged)) if predictions else math.nan,
                     math.sqrt(_mean(squares[name], self.judged)) if squares else math.nan,
@@ -354,16 +362,9 @@ def _mean(values: numpy.ndarray, mask: numpy.ndarray) -> float:
     return float(values[there].mean()) if there.any() else math.nan
 
 
-def _simplest(competitors: Sequence[Competitor], judged: _Judged) -> Competitor:
-    """The one with fewest fitted parameters of those that predict as well as the best, where it was chosen."""
+def _likeliest(competitors: Sequence[Competitor]) -> Competitor:
+    """The one of largest log-likelihood; where nobody says any, the one of smallest error."""
     known = [c for c in competitors if not math.isnan(c.log_likelihood)]
     if not known:
         return min(competitors, key=lambda c: (math.isnan(c.error), c.error))
-    best = max(known, key=lambda c: c.log_likelihood)
-    alike = []
-    for one in known:
-        lag = judged.difference(one.name, best.name, judged.chosen)
-        if one is best or (not math.isnan(lag.high) and lag.high >= 0.0):
-            alike.append(one)
-    # A shipped filter has nothing fitted and is taken before others only where it is as good.
-    return min(alike, key=lambda c: (c.parameters, -c.log_likelihood))
+    return max(known, key=lambda c: c.log_likelihood)

@@ -6,6 +6,7 @@ likelihood's: a value lies inside where the likelihood, the other parameters ada
 quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988).
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -22,9 +23,9 @@ DROP = 1.9207
 NOISE_SCALE = "log10_noise_scale"
 """Name of the parameter that multiplies the stated deviations of the measurements, as its decimal logarithm."""
 NOISE_LIMITS = (-1.5, 0.0, 1.5)
-STEPS = 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 6.0, 9.0, 14.0, 25.0
+STEPS = 0.5, 1.0, 1.5, 2.0, 2.5, 3.5, 6.0, 12.0
 """Distances from the maximum at which a profile is computed, in units of the parameter's deviation at the maximum."""
-NEWTON_STEPS = 6
+NEWTON_STEPS = 5
 IDENTIFIABLE = 100.0
 """Largest ratio of the ends of an interval of a size; what is wider says nothing."""
 
@@ -94,7 +95,8 @@ def with_noise_scale(tunable: Tunable, scaled: Callable[[Any, Any], Any]) -> Tun
         return keywords, lambda task: ScaledNoise(make(task), scaled, factor)
 
     limits = {**tunable.limits, NOISE_SCALE: (low, high)}
-    return Tunable(tunable.control, limits, {**tunable.start, NOISE_SCALE: start}, apply)
+    start_values = {**tunable.start, NOISE_SCALE: start}
+    return dataclasses.replace(tunable, limits=limits, start=start_values, apply=apply)
 
 
 def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: int = STARTS) -> Fit:
@@ -171,9 +173,9 @@ def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarra
 def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
     """Profile-likelihood intervals of all parameters, side by side.
 
-    Every parameter is moved away from its best value, in steps to either limit; the others follow by Newton's method with
-    the curvature at the maximum, which only ever raises the likelihood: an interval may be too narrow where the curvature
-    changes much, never too wide by it.
+    Every parameter is moved away from its best value, in steps to either limit; the others follow by Newton's method
+    with the curvature at the maximum, which only ever raises the likelihood: an interval may be too narrow where the
+    curvature changes much, never too wide by it.
 
     Args:
         likelihood: of the tunable's parameters.
@@ -250,9 +252,9 @@ def _climb(
     step, scale = 1e-4, numpy.ones(count)
     for _ in range(NEWTON_STEPS):
         moved = [state + step * numpy.eye(P)[:, [i]] for i in range(P)]
-        back = [state - step * numpy.eye(P)[:, [i]] for i in range(P)]
-        found = likelihood(numpy.concatenate([*moved, *back], axis=1)).reshape(2, P, count)
-        gradient = numpy.nan_to_num((found[0] - found[1]) / (2.0 * step))
+        found = likelihood(numpy.concatenate(moved, axis=1)).reshape(P, count)
+        with numpy.errstate(invalid="ignore"):
+            gradient = numpy.nan_to_num((found - value) / step, posinf=0.0, neginf=0.0)
         direction = numpy.zeros_like(state)
         for i in range(P):
             chosen = numpy.flatnonzero(fixed == i)

@@ -32,12 +32,16 @@ class Tunable:
     """From values to keywords of the task and what makes the policy or estimator for it."""
     in_lanes: bool = True
     """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Of the values, without their logarithm; what is not named is a pure number."""
 
 
 def tunable(
     make: Callable[..., Any],
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]] | None = None,
     /,
+    *,
+    units: Mapping[str, str] | None = None,
     **values: tuple[float, float, float],
 ) -> Tunable:
     """Declare which keywords of a policy or an estimator are tuned.
@@ -46,6 +50,7 @@ def tunable(
         make: its class, or a :class:`Variant`.
         apply: as in :class:`Tunable`; default: every value is a keyword of ``make``. A value whose name begins with
             ``log10_`` is the logarithm of the keyword: its size is not known beforehand.
+        units: of the values, as :class:`Tunable` has it.
         **values: lower limit, value in force without tuning, upper limit.
     """
 
@@ -57,6 +62,7 @@ def tunable(
         {name: (low, high) for name, (low, _, high) in values.items()},
         {name: start for name, (_, start, _) in values.items()},
         apply or keywords,
+        units=units or {},
     )
 
 
@@ -145,8 +151,9 @@ class Baselines:
     full benchmark."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
-    log_families: "Callable[[Recording], Mapping[str, Tunable]] | None" = None
-    """Estimators that are fitted to a recording, with limits that suit it; None: those of ``tunable``."""
+    log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None
+    """Estimators that are fitted to a recording, with limits that suit it (None: any recording); without this function
+    those of ``tunable``."""
     best_constant: str = ""
     """The tunable policy that stands for the best constant action in the room table."""
     metrics: "OwnMetrics | None" = None

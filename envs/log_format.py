@@ -54,7 +54,7 @@ class LogFormat:
     scale_noise: Callable[[Any, Any], Any] | None = None
     """Multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None where none are."""
     predict: Callable[[Any, Any], tuple[Any, Any]] | None = None
-    """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing was
-    received: from the mean ``(C, N)`` after the measurement before, and the ``Measurement``."""
+    """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
+    was received: from the mean ``(C, N)`` after the measurement before, and the ``Measurement``."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""

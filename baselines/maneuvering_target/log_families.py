@@ -129,16 +129,25 @@ def _imm_turn(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
     )
 
 
-def log_families(recording: Recording) -> dict[str, Tunable]:
+UNITS = {
+    **dict.fromkeys(("acceleration", "acceleration_quiet", "least"), "m/s^2"),
+    "jerk": "m/s^3",
+    **dict.fromkeys(("turn_rate", "turn_rate_start", "turn_rate_change"), "degrees/s"),
+}
+"""Of the parameters of all families."""
+
+
+def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     """Return what can be fitted to a log of positions, the simplest first.
 
     Args:
-        recording: of ManeuveringTarget.
+        recording: of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
     """
-    said = recording.measurements
-    there = said["available"] > 0.0
-    T = float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
-    r = float(numpy.sqrt(numpy.median(said["variance"][there])))
+    T = r = 1.0
+    if recording is not None:
+        there = recording.measurements["available"] > 0.0
+        T = float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
+        r = float(numpy.sqrt(numpy.median(recording.measurements["variance"][there])))
     usual = math.log10(r / T**2)
     acceleration = usual - 3.5, usual - 1.5, usual + 1.5
     jerk = usual - math.log10(T) - 4.5, usual - math.log10(T) - 2.0, usual - math.log10(T) + 1.5
@@ -147,13 +156,14 @@ def log_families(recording: Recording) -> dict[str, Tunable]:
     leave = {"log10_leave_quiet": (-2.7, -1.5, -0.3), "log10_leave_noisy": (-2.3, -1.0, -0.3)}
     ratio = math.log10(2.0), math.log10(8.0), 3.5
     return {
-        "constant-velocity": tunable(ConstantVelocity, log10_acceleration=acceleration),
+        "constant-velocity": tunable(ConstantVelocity, units=UNITS, log10_acceleration=acceleration),
         "constant-acceleration": tunable(
-            ConstantAcceleration, log10_jerk=jerk, log10_acceleration=acceleration
+            ConstantAcceleration, units=UNITS, log10_jerk=jerk, log10_acceleration=acceleration
         ),
         "imm-two": tunable(
             KalmanInteractingMultipleModel,
             _imm,
+            units=UNITS,
             log10_acceleration_quiet=acceleration,
             log10_ratio=ratio,
             **leave,
@@ -161,6 +171,7 @@ def log_families(recording: Recording) -> dict[str, Tunable]:
         "imm-turn": tunable(
             KalmanTurnInteractingMultipleModel,
             _imm_turn,
+            units=UNITS,
             log10_acceleration_quiet=acceleration,
             log10_ratio=ratio,
             log10_turn_rate=turn,
@@ -168,15 +179,21 @@ def log_families(recording: Recording) -> dict[str, Tunable]:
         ),
         "unscented-turn": tunable(
             UnscentedTurn,
+            units=UNITS,
             log10_acceleration=acceleration,
-            log10_turn_rate_change=tuple(value - 1.0 for value in turn),
+            log10_turn_rate_change=(turn[0] - 1.0, turn[1] - 1.0, turn[2] - 1.0),
             log10_turn_rate_start=turn,
         ),
         "sage-husa": tunable(
-            SageHusa, log10_acceleration=acceleration, forgetting=(0.3, 0.9, 0.995), log10_least=acceleration
+            SageHusa,
+            units=UNITS,
+            log10_acceleration=acceleration,
+            forgetting=(0.3, 0.9, 0.995),
+            log10_least=acceleration,
         ),
         "variational-bayes": tunable(
             VariationalBayes,
+            units=UNITS,
             log10_acceleration=acceleration,
             forgetting=(0.5, 0.95, 1.0),
             log10_shape=(-0.3, 0.7, 3.0),

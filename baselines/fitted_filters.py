@@ -1,0 +1,90 @@
+"""Files of fitted filters: what was fitted to a recording, to be evaluated on others."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ..evaluation.files import write_text
+from ..evaluation.stored import fits, read_json
+from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
+from .problem import Problem
+from .table import Tunable
+from .tuned_values import TunedPolicy, rounded, tuned_policy
+
+SUFFIX = ".filter.json"
+"""Of the names of such files."""
+
+
+def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
+    """Return the filters of a problem that can be fitted to a recording, by name.
+
+    Args:
+        problem: whose they are.
+        recording: that sets the limits; None: any.
+    """
+    known = problem.baselines
+    if known.log_families is not None:
+        return dict(known.log_families(recording))
+    return {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
+
+
+def write_fitted(
+    path: Path, problem: Problem, name: str, found: Fit, intervals: Mapping[str, Interval], command: str
+) -> None:
+    """Write a fitted filter.
+
+    Args:
+        path: of the file, whose name ends in ``SUFFIX``.
+        problem: of the filter.
+        name: of its family.
+        found: of the fit.
+        intervals: of its parameters.
+        command: that made it.
+    """
+    table = {
+        "environment": problem.id,
+        "filter": name,
+        "values": {key: rounded(value) for key, value in found.values.items()},
+        "intervals": {key: [rounded(each.low), rounded(each.high)] for key, each in intervals.items()},
+        "measurements": found.count,
+        "command": command,
+    }
+    write_text(path, json.dumps(table, indent=1) + "\n")
+
+
+def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
+    """Return what makes a fitted filter.
+
+    Args:
+        path: of a file of :func:`write_fitted`.
+        problem: in which it is to run.
+
+    Raises:
+        ValueError: if the file cannot be read, or is of another environment or no filter of it.
+    """
+    try:
+        table = read_json(path)
+    except FileNotFoundError:
+        raise ValueError(f"there is no file {path}") from None
+    known = {"environment": str, "filter": str, "values": dict[str, float]}
+    if not isinstance(table, dict) or not all(fits(table.get(key), kind) for key, kind in known.items()):
+        raise ValueError(f"{path} is no fitted filter: filtergym advise writes one")
+    if table["environment"] != problem.id:
+        raise ValueError(f"{path} is fitted to {table['environment']}, not to {problem.id}")
+    families = families_of(problem)
+    if table["filter"] not in families:
+        raise ValueError(f"{path}: {problem.id} has no filter {table['filter']!r} that can be fitted")
+    tunable = families[table["filter"]]
+    values = table["values"]
+    if NOISE_SCALE in values:
+        log_format = problem.task.log_format
+        if log_format is None or log_format.scale_noise is None:
+            raise ValueError(f"{path}: measurements of {problem.id} state no deviations that could be scaled")
+        tunable = with_noise_scale(tunable, log_format.scale_noise)
+    if values.keys() != tunable.limits.keys():
+        raise ValueError(
+            f"{path} must give {table['filter']!r} a number for each of {', '.join(tunable.limits)}, got "
+            f"{', '.join(values)}"
+        )
+    return tuned_policy(f"{problem.id} fitted {table['filter']}", tunable, values)

@@ -1,0 +1,90 @@
+"""The command that advises which filter to take for a log."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..agents.named_policies import shipped_agents
+from ..baselines.advice import advise
+from ..baselines.fitted_filters import SUFFIX, write_fitted
+from ..baselines.problem import problem_of
+from ..envs.catalogue import check_names, read_recording
+from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.files import writable_file
+from ..names import find_competitor
+from ..reports.advice import advice_lines, advice_table
+from .terminal import command_line, console, pair, parse_settings, progress_bar
+
+NOT_COMPARED = ("random",)
+"""Who does not stand beside filters for a log."""
+
+
+def advise_on_log(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            help="What sensors really said, NetCDF or tables (CSV): a file, a folder, or a pattern in quotes."
+        ),
+    ],
+    environment: Annotated[
+        str, typer.Option(help="Environment whose measurements they are; NetCDF names its own.")
+    ] = "filtergym/ManeuveringTarget-v0",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+    ] = None,
+    noise: Annotated[bool, typer.Option(help="Fit the scale of the measurement noise, too.")] = True,
+    seed: Annotated[int, typer.Option(help="Of the starts of the fits.")] = 0,
+    speeds: Annotated[
+        str, typer.Option(help="Speeds that are possible, m/s, from the lowest to the highest.")
+    ] = "0.01,1000",
+) -> None:
+    """Fit every family of filters to a log, and say which one to take, with which numbers.
+
+    Example: filtergym advise log.csv --out mine.filter.json
+    """
+    keywords = parse_settings(settings or [])
+    if out is not None:
+        if not out.name.endswith(SUFFIX):
+            raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
+        writable_file(out)
+    found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
+    problem = problem_of(found.environment)
+    check_names(problem.task, keywords)
+    learned = list(shipped_agents(problem.id))
+    names = [*problem.baselines.policies, *problem.baselines.estimators, *problem.tuned, *learned]
+    shipped = {name: find_competitor(problem, name) for name in names if name not in NOT_COMPARED}
+    shipped = {name: maker for name, maker in shipped.items() if kind_of(maker) in RANKED}
+    with progress_bar() as bar:
+        line = bar.add_task("advising", total=1.0)
+        advice = advise(
+            problem,
+            found,
+            shipped,
+            noise=noise,
+            seed=seed,
+            progress=lambda what, share: bar.update(line, description=what, completed=share),
+            **keywords,
+        )
+    for note in found.notes:
+        console.print(note, highlight=False, soft_wrap=True)
+    console.print(advice_table(advice, learned))
+    for sentence in advice_lines(advice, learned):
+        console.print(sentence, highlight=False, soft_wrap=True)
+    advised = advice.advised
+    if out is not None and not advised.fitted:
+        console.print(
+            f"{out} is not written: {advised.name} is shipped, --policy {advised.name} runs it",
+            soft_wrap=True,
+        )
+    elif out is not None:
+        write_fitted(out, problem, advised.name, advice.fits[advised.name], advice.intervals, command_line())
+        console.print(
+            f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
+        )
