@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..filters.geodesy import east_north
-from .flight_cleaning import COUNTED, Cleaning, cleaned
+from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
 from .flight_tables import (
     FLIGHT_SUFFIXES,
     FOOT,
@@ -390,7 +390,7 @@ def _flights_of(
         _check_degrees(limits.site, rows)
     rows["ground"] = is_true(columns["ground"]) if "ground" in columns else False
     good: list[Trajectory] = []
-    counts = dict.fromkeys(COUNTED, 0)
+    counts = dict.fromkeys(CLEANING_COUNTS, 0)
     bad: list[Source] = []
     groups = _by_flight(rows, columns.get("flight"))
     for flight, own in groups.items():
@@ -398,7 +398,7 @@ def _flights_of(
         try:
             if not plane and limits.site:
                 own = _around(limits.site, own)
-            pieces, found = cleaned(name, own, limits)
+            pieces, found = clean_flight(name, own, limits)
         except ValueError as error:
             if len(groups) == 1:
                 raise
@@ -411,7 +411,7 @@ def _flights_of(
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
     said = [
         f"{_count_of(count, *words)}{tail(limits)}"
-        for (words, tail), count in zip(COUNTED.values(), counts.values(), strict=True)
+        for (words, tail), count in zip(CLEANING_COUNTS.values(), counts.values(), strict=True)
         if count
     ]
     if len(groups) > 1 and said:

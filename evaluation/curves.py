@@ -20,7 +20,7 @@ from .metrics import (
     consistency_degrees,
     consistency_metrics,
     mean_over_time,
-    reported_components,
+    components_and_groups,
     squared_errors,
 )
 from .statistics import ALL, Key, Statistic, reduce_run
@@ -30,7 +30,7 @@ SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
 BAND_RESAMPLES = 200
 """Of the bootstrap of curves: their bands need fewer than intervals of numbers."""
-DISTRIBUTED = 2**21
+DISTRIBUTION_LIMIT = 2**21
 """Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
 PERCENTILES = (10.0, 90.0)
 """Of actions and gains over episodes."""
@@ -102,7 +102,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
     """Return the groups of components, where there are any, else the first three components."""
-    return list(groups_of(dataset)) or list(reported_components(dataset))[:3]
+    return list(groups_of(dataset)) or list(components_and_groups(dataset))[:3]
 
 
 def curve_statistics(
@@ -116,7 +116,7 @@ def curve_statistics(
         resamples: of the bands.
     """
     times = run.sizes["time"]
-    distributed = max(block_of(times), DISTRIBUTED // times)
+    distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in select_quantities(run)], axis=-1)
@@ -169,7 +169,7 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
         dataset: the evaluation, of whose variables none is needed.
         episodes: of which the curves are.
     """
-    units, shown = reported_components(dataset), select_quantities(dataset)
+    units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
         "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
         "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),

@@ -13,7 +13,7 @@ import numpy
 import xarray
 
 from .dataset import windows_of
-from .looks import GREY, joined, looks, merged, styles, told_apart
+from .looks import GREY, join_names, looks, group_equal_lines, styles, distinguish_lines
 from .print_layout import (
     direct_labels,
     figure_with_axes,
@@ -22,8 +22,8 @@ from .print_layout import (
     positive,
     room_for_labels,
     sensible_limits,
-    titled,
-    wrapped,
+    add_title,
+    wrap_label,
 )
 
 
@@ -108,7 +108,7 @@ def _over_time(
     values = {
         name: numpy.concatenate([panel.values.sel(policy=name).values for panel in panels]) for name in there
     }
-    told, others = told_apart(look, values)
+    told, others = distinguish_lines(look, values)
     beside = room_for_labels(told.values(), columns)
     figure, axes = figure_with_axes(len(panels), columns)
     x = _abscissa(curves)
@@ -123,10 +123,12 @@ def _over_time(
         shown = {
             name: line for name in told if not numpy.isnan(line := panel.values.sel(policy=name).values).all()
         }
-        here = merged(shown, shown)  # some quantity may be the same for those whose other ones differ
+        here = group_equal_lines(
+            shown, shown
+        )  # some quantity may be the same for those whose other ones differ
         for name, same in here.items():
             line = shown[name]
-            label = told[name] if len(same) == 1 else joined(same, most=1 if columns == 1 else 2)
+            label = told[name] if len(same) == 1 else join_names(same, most=1 if columns == 1 else 2)
             axis.plot(x, line, label=label, **look[name])
             last = int(numpy.flatnonzero(numpy.isfinite(line))[-1])
             ends[label] = (x[last], line[last], look[name]["color"])
@@ -147,7 +149,7 @@ def _over_time(
         # One word needs no legend of its own.
         title += "; grey: others"
         handles = []
-    return titled(figure, title, handles)
+    return add_title(figure, title, handles)
 
 
 def _draw_bands(
@@ -204,7 +206,7 @@ def draw_error_over_time(
     look = looks(curves) if look is None else look
     panels = [
         Panel(
-            wrapped(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
+            wrap_label(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
             *(curves[f"rmse{ending}"].sel(quantity=name) for ending in ("", "_low", "_high")),
         )
         for name, unit in zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True)
@@ -266,7 +268,7 @@ def draw_error_distribution(
     exceeded, shares = curves["error_exceeded"], curves["share"].values
     there = [n for n in curves["policy"].values.tolist() if not numpy.isnan(exceeded.sel(policy=n)).all()]
     values = {name: exceeded.sel(policy=name).values for name in there}
-    told, others = told_apart(look, values)
+    told, others = distinguish_lines(look, values)
     figure, axes = figure_with_axes(curves.sizes["quantity"], columns)
     units = dict(zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True))
     supported = shares[~numpy.isnan(exceeded.values).all(axis=(0, 1))]
@@ -295,7 +297,7 @@ def draw_error_distribution(
     handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()]
     if others:
         handles.append(Line2D([], [], color=GREY, linewidth=0.6, label="others"))
-    return titled(figure, f"{_title(curves)}, distribution of errors", handles)
+    return add_title(figure, f"{_title(curves)}, distribution of errors", handles)
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
@@ -307,7 +309,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
         if not numpy.isnan(values).all()
         and (numpy.nanmax(values, axis=-1) - numpy.nanmin(values, axis=-1)).max() > 0.02
     }
-    return merged(found, found)
+    return group_equal_lines(found, found)
 
 
 @in_print
@@ -345,13 +347,13 @@ def draw_mode_probabilities(
                 ends[named[mode]] = (x[present[-1]], line[present[-1]], style["color"])
         axis.set_ylim(-0.02, 1.02)
         _bound_abscissa(axis, x)
-        axis.set_ylabel("\n".join(["probability", *textwrap.wrap(joined(same), 24)]))
+        axis.set_ylabel("\n".join(["probability", *textwrap.wrap(join_names(same), 24)]))
         axis.grid(alpha=0.25, lw=0.4)
         if beside:
             direct_labels(figure, axis, ends, len(groups))
     _name_abscissa(curves, axes)
     title = f"{_title(curves)}, mode probabilities, 95 % bands"
-    return titled(figure, title, [] if beside else None)
+    return add_title(figure, title, [] if beside else None)
 
 
 @in_print

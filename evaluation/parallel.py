@@ -31,9 +31,9 @@ from .threads import one_thread
 
 RETRIES = 10
 """How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
-GUESSED = 16
+CLUSTER_PROCESSES = 16
 """Processes that a cluster elsewhere is thought to have, where work is cut for it."""
-UNSERVED: dict[str, Any] = {
+NO_HTTP_ROUTES: dict[str, Any] = {
     f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker", "nanny")
 }
 """Dask's web servers tell whoever asks of the work, and have no authentication: nothing is served."""
@@ -170,7 +170,7 @@ class Workers:
         if self.alone:
             return 1
         if self.cluster is not None and "://" in self.cluster:
-            return GUESSED
+            return CLUSTER_PROCESSES
         return self._cores
 
     @property
@@ -288,7 +288,7 @@ class Workers:
             where: Any = self.cluster
             try:
                 if begin:
-                    with dask.config.set(UNSERVED):
+                    with dask.config.set(NO_HTTP_ROUTES):
                         where = LocalCluster(
                             n_workers=self._cores,
                             threads_per_worker=1,

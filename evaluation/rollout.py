@@ -10,7 +10,7 @@ from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Kind, check_competitor, kind_of, made
+from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .dataset import FAULTS
 from .filters import put_in_loop
 from .stepping import SteppingPolicy
@@ -66,7 +66,7 @@ def rollout(
                 yield found, action
         return
     lanes = start_lanes(model, seeds)
-    policy = SteppingPolicy(model, check_competitor(name, made(competitor, model), kind))
+    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), kind))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         action, memory = policy.predict(lanes.observe(), memory)

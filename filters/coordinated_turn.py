@@ -40,7 +40,7 @@ def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
     return xp.where(small, series, (cosine - ratio) / xp.where(small, 1.0, angle))
 
 
-def turned(state: Array, T: float | Array) -> Array:
+def propagate(state: Array, T: float | Array) -> Array:
     """State after an interval at constant turn rate.
 
     Args:
@@ -105,10 +105,10 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
         Q: covariance of the process noise, ``(5, 5, 1)`` or ``(5, 5, N)``.
     """
     F = jacobian(mean, T)
-    return turned(mean, T), product(product(F, covariance), transpose(F)) + Q
+    return propagate(mean, T), product(product(F, covariance), transpose(F)) + Q
 
 
-def augmented(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
+def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
     """Estimate of position and velocity with an independent turn rate of mean zero as fifth state.
 
     Args:

@@ -14,7 +14,7 @@ import pymap3d
 import pytest
 import xarray
 from filtergym.envs import flight_tables
-from filtergym.envs.flight_cleaning import smoothed
+from filtergym.envs.flight_cleaning import fit_parabolas
 from filtergym.envs.flights import read_flights
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import flight_records
@@ -246,22 +246,22 @@ def test_smoothing_is_a_parabola_around_each_position(tmp_path):
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.5, 2.0, 60))
     parabola = np.stack([1e4 + 90.0 * time + 0.8 * time**2, 2e4 - 70.0 * time], axis=1)
-    position, velocity = smoothed(time, parabola, 10.0)
+    position, velocity = fit_parabolas(time, parabola, 10.0)
     np.testing.assert_allclose(position, parabola, rtol=0, atol=1e-8)
     np.testing.assert_allclose(
         velocity, np.stack([90.0 + 1.6 * time, -70.0 + 0.0 * time], axis=1), rtol=0, atol=1e-8
     )
     noisy = parabola + rng.normal(0.0, 30.0, parabola.shape)
-    position, velocity = smoothed(time, noisy, 7.0)
+    position, velocity = fit_parabolas(time, noisy, 7.0)
     for i in (0, 1, 30, 59):
         near = np.abs(time - time[i]) <= 7.0
         naive = np.polynomial.polynomial.polyfit(time[near] - time[i], noisy[near], 2)
         np.testing.assert_allclose(position[i], naive[0], rtol=1e-9)
         np.testing.assert_allclose(velocity[i], naive[1], rtol=1e-6, atol=1e-6)
-    few = smoothed(time[::10], parabola[::10], 1.0)[0]
+    few = fit_parabolas(time[::10], parabola[::10], 1.0)[0]
     np.testing.assert_allclose(few, parabola[::10], rtol=0, atol=1e-6)
     (found,) = read_flights(flight_file(tmp_path / "a.csv"), smoothing=20.0).trajectories
-    np.testing.assert_array_equal(found.velocity, smoothed(FIVE, weave(FIVE), 20.0)[1])
+    np.testing.assert_array_equal(found.velocity, fit_parabolas(FIVE, weave(FIVE), 20.0)[1])
 
 
 def test_the_line_about_a_file(tmp_path):

@@ -72,8 +72,8 @@ def turns():
 
 
 def forget(id):
-    registration.ADDED.pop(id, None)
-    baselines.ADDED.pop(id, None)
+    registration.USER_TASKS.pop(id, None)
+    baselines.USER_BASELINES.pop(id, None)
     gymnasium.registry.pop(id, None)
 
 

@@ -52,9 +52,14 @@ NAMES = {
     "known-turn": "Kalman filter told the turn's scans",
     "known-input-bound": "Cramer-Rao bound, acceleration known",
 }
-COMPARED = ("imm", "adaptive", "adaptive-rearm")
+COMPARED_POLICIES = ("imm", "adaptive", "adaptive-rearm")
 COMPONENTS = (("position", "m"), ("velocity", "m/s"))
-STEPS = len(NAMES) + (len(BOX_PAIRS) + 2) * len(COMPARED) + len(VARIANTS) + len(LIKELIHOODS) * len(LOW_GAINS)
+STEPS = (
+    len(NAMES)
+    + (len(BOX_PAIRS) + 2) * len(COMPARED_POLICIES)
+    + len(VARIANTS)
+    + len(LIKELIHOODS) * len(LOW_GAINS)
+)
 
 
 def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
@@ -168,7 +173,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         return numpy.stack(mean_square_errors(flight, alpha), axis=-1)[None]
 
     def rivals(**keywords: Any) -> dict[str, Any]:
-        return {name: later(squares_of, name, episodes, **keywords) for name in COMPARED}
+        return {name: later(squares_of, name, episodes, **keywords) for name in COMPARED_POLICIES}
 
     schedule = best_schedule(flight)
     exact = {f"fixed gain {a:g}": exactly(numpy.full(scans, a)) for a in (low, high, 0.65)}

@@ -41,7 +41,7 @@ NAMES = {
     "matched": "augmented, told the noise levels (reference)",
 }
 DRIFTING = ("plain-white", "plain-reduced", "best-constant", "augmented")
-DRAWN = ("plain-white", "plain-reduced", "augmented")
+EXAMPLE_POLICIES = ("plain-white", "plain-reduced", "augmented")
 DRIFT = 1.0
 """Constant rate error of the example run and of the attenuation experiment, m/s."""
 LONG = 2000
@@ -138,7 +138,7 @@ def exact_plain(intensity: float, riccati: bool) -> float:
     Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
     R, settled = (
         p.receiver_variance,
-        ins_gnss.settled_gain(intensity * p.sampling_interval, p.receiver_variance),
+        ins_gnss.steady_state_gain(intensity * p.sampling_interval, p.receiver_variance),
     )
     variance, squares = 0.0, []
     for _ in range(p.horizon):
@@ -267,4 +267,4 @@ def _drift(name: str, count: int) -> numpy.ndarray:
 
 
 def _example_runs() -> dict[str, dict[str, numpy.ndarray]]:
-    return {name: example_run(name) for name in DRAWN}
+    return {name: example_run(name) for name in EXAMPLE_POLICIES}

@@ -18,7 +18,7 @@ from ..reproduction import Progress, gathered, later
 
 EPISODES = 600
 HORIZON = 600
-SETTLED = slice(200, HORIZON)
+STEADY_WINDOW = slice(200, HORIZON)
 """Measurements after the burn-in."""
 AFTER_STEP = slice(300, HORIZON)
 STEP_TIME = 200
@@ -56,13 +56,13 @@ class Signals:
     plant_input: numpy.ndarray
     """Control plus white noise, plant P; control, plant U."""
 
-    def text(self, name: str, digits: int = 4, times: slice = SETTLED) -> str:
+    def text(self, name: str, digits: int = 4, times: slice = STEADY_WINDOW) -> str:
         """Mean of a signal over runs and time."""
         return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
 
     def variance(self, name: str) -> float:
         """Mean square of a node about the output, settled."""
-        return float(numpy.mean((getattr(self, name) - self.output)[:, SETTLED] ** 2))
+        return float(numpy.mean((getattr(self, name) - self.output)[:, STEADY_WINDOW] ** 2))
 
     @property
     def decibel(self) -> float:
