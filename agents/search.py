@@ -250,21 +250,24 @@ def _costs(
         place = run_folder(folder, trial.number, seed)
         shutil.rmtree(place, ignore_errors=True)
         run = open_run(place, search.run(seed, chosen), resume=False)
-        lowest, told = math.inf, -1
+        lowest, last_share = math.inf, -1
         behind = False
 
-        def validated(entry: Validated) -> bool:
-            nonlocal lowest, told, behind
+        def report_validation(entry: Validated) -> bool:
+            nonlocal lowest, last_share, behind
             lowest = min(lowest, entry["cost"])
             # Rollouts differ in length, so trials are compared at the same share of their steps.
             share = min(VALIDATIONS, entry["steps"] * VALIDATIONS // search.steps)
-            if share > told:
-                told = share
+            if share > last_share:
+                last_share = share
                 trial.report(_mean([*costs, lowest]), len(costs) * (VALIDATIONS + 1) + share)
                 behind = entry["steps"] < search.steps and trial.should_prune()
             return behind
 
-        train(run, Session(place, validate_every=max(1, search.steps // VALIDATIONS), validated=validated))
+        train(
+            run,
+            Session(place, validate_every=max(1, search.steps // VALIDATIONS), validated=report_validation),
+        )
         # Nobody resumes it, and replay buffers are large.
         shutil.rmtree(place / "checkpoint", ignore_errors=True)
         if behind:

@@ -217,7 +217,7 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
-def padded_width(count: int) -> int:
+def round_up_lanes(count: int) -> int:
     """Lanes that so many take: the next multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
@@ -280,7 +280,7 @@ class Function:
         count = max(array.shape[-1] for array in given)
         if any(array.shape[-1] not in (1, count) for array in given):
             raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
-        width = padded_width(count)
+        width = round_up_lanes(count)
         outputs = special.call([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []
         for output, same, leaf in zip(outputs, special.same, special.outputs, strict=True):

@@ -527,7 +527,7 @@ class Stepper:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
         return _copy_numbers(self._report_template, self._reported, self._report_kinds)
 
-    def observation(self) -> numpy.ndarray:
+    def observation_by_field(self) -> numpy.ndarray:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
 

@@ -833,7 +833,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return lambda state: pictures.keep(state, actions, shown)
 
     def render(self) -> tuple[numpy.ndarray, ...] | None:
-        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.DRAWN`).
+        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.MAX_PICTURES`).
 
         Returns:
             A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes

@@ -54,7 +54,7 @@ def clean_flight(
         limits: what it may look like.
 
     Returns:
-        The pieces, and how much of what ``COUNTED`` names there was.
+        The pieces, and how much of what ``CLEANING_COUNTS`` names there was.
 
     Raises:
         ValueError: if it cannot be a flight, with the likely cause.

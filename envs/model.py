@@ -183,12 +183,12 @@ class Model:
         """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
         ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
         """
-        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
-        return {**self._truth_and_estimate(episode), **said}
+        measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        return {**self._truth_and_estimate(episode), **measured}
 
     def picture_track(self, episode: Episode) -> dict[str, Array]:
-        """What a picture of a track shows: as :meth:`track`, but of the measurement what is ``seen`` of the components
-        ``(C, N)``, where anything is; NaN where it says nothing.
+        """Arrays that a picture of a track shows: as :meth:`track`, but of the measurement only ``seen``, the readings
+        of the components ``(C, N)``, if the world has any; NaN where a component was not measured.
         """
         seen = self.task.world.component_readings(episode.measurement)
         return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}

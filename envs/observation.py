@@ -45,7 +45,7 @@ def symlog(value: Array, xp: ModuleType) -> Array:
 
 
 def symexp(value: Array, xp: ModuleType) -> Array:
-    """Inverse of :func:`signed_logarithm`."""
+    """Inverse of :func:`symlog`."""
     return xp.sign(value) * xp.expm1(xp.abs(value))
 
 

@@ -26,7 +26,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..compiler.functions import map_arrays, padded_width
+from ..compiler.functions import map_arrays, round_up_lanes
 from .backend import host_array
 from .lanes import Lanes
 from .model import Model
@@ -555,7 +555,7 @@ class EpisodePictures:
 
 def _alone(state: Any, lane: int) -> Any:
     """Episode in one lane as a picture takes it: on the host, padded with itself."""
-    return map_arrays(lambda values: host_array(values)[..., [lane] * padded_width(1)], state)
+    return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:

@@ -86,14 +86,16 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         return replaced
 
     def component_readings(self, measurement: Measurement) -> Array | None:
-        """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
+        """Readings of the task's components, ``(C, N)`` in their units, for pictures.
 
         NaN where they say nothing; None, as here, where what is measured is no component at all.
         """
         return None
 
     def component_deviations(self, measurement: Measurement) -> Array | None:
-        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
+        """Standard deviations that are stated for the errors of :meth:`component_readings`, in the same form; None
+        where that is None.
+        """
         return None
 
     def error_cost(self, error: Array) -> Array:

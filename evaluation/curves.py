@@ -17,10 +17,10 @@ from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
     chi_square_band,
+    components_and_groups,
     consistency_degrees,
     consistency_metrics,
     mean_over_time,
-    components_and_groups,
     squared_errors,
 )
 from .statistics import ALL, Key, Statistic, reduce_run
@@ -68,11 +68,11 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           gains that a bank records, likewise;
         * ``mean_cost`` (policy): over episodes.
 
-        Errors exceeded, actions and gains are those of the first ``DISTRIBUTED`` measurements, or of the first 256
-        episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every quantity
-        (the groups of components where there are any, else the first three components), ``elapsed`` (s) of every
-        measurement, where they come regularly, and windows as the dataset has them. Attributes environment, scenario,
-        split, seed, episodes, paper, reference, cost, truth and recorded.
+        Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
+        256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every
+        quantity (the groups of components where there are any, else the first three components), ``elapsed`` (s) of
+        every measurement, where they come regularly, and windows as the dataset has them. Attributes environment,
+        scenario, split, seed, episodes, paper, reference, cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
     declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)

@@ -169,8 +169,8 @@ def evaluate(
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
         tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
-        drawn_episodes: of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate``
-            and so on over policy, drawn_episode and time; not beside ``tracks``.
+        drawn_episodes: of how many of the first episodes to keep what :meth:`.Model.picture_track` returns, as
+            ``drawn_estimate`` and so on over policy, drawn_episode and time; not beside ``tracks``.
         paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
         reference: name of the competitor whose score is 1; kept likewise.
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.

@@ -77,8 +77,8 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
 
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Take its answer as it is."""
-        mean, covariance, memory, *told = self.own.update(given.measurement, given.truth, state.memory)
-        likelihood = Likelihood.of(*told).fill_unknown() if told else state.likelihood
+        mean, covariance, memory, *reported = self.own.update(given.measurement, given.truth, state.memory)
+        likelihood = Likelihood.of(*reported).fill_unknown() if reported else state.likelihood
         return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
 
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
@@ -106,7 +106,7 @@ class EstimatorFilter(ReferenceFilter):
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Check its answer, and keep the last valid one."""
         received = self.task.world.mask_missing(given.measurement)
-        mean, covariance, memory, *told = self.own.update(received, state.memory)
+        mean, covariance, memory, *reported = self.own.update(received, state.memory)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
         lost = fault > 0.0
@@ -114,7 +114,7 @@ class EstimatorFilter(ReferenceFilter):
             self._held(lost, state.mean, mean),
             self._held(lost, state.covariance, covariance),
             memory,
-            Likelihood.of(*told).fill_unknown() if told else state.likelihood,
+            Likelihood.of(*reported).fill_unknown() if reported else state.likelihood,
             fault,
             missed,
         )
@@ -332,17 +332,17 @@ class _CheckedInPython(_InPython):
                     "update must return mean, covariance and memory, and may return the log-likelihood, not "
                     f"{type(answer).__name__}{count}"
                 )
-            mean, covariance, self.memory, *told = answer
-            likelihood = [Likelihood.of(*told)] if told else []
+            mean, covariance, self.memory, *reported = answer
+            likelihood = [Likelihood.of(*reported)] if reported else []
         C = len(self.task.components)
         # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
         covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         checked = [
             Likelihood(
-                *(v if v is None else self._numbers(n, v, (width,)) for n, v in said._asdict().items())
+                *(v if v is None else self._numbers(n, v, (width,)) for n, v in stated._asdict().items())
             )
-            for said in likelihood
+            for stated in likelihood
         ]
         return (mean, covariance, None, *checked)
 

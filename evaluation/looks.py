@@ -99,7 +99,7 @@ def looks(
 
     Args:
         curves: of an evaluation.
-        highlight: as of :func:`highlighted`.
+        highlight: as of :func:`choose_highlights`.
         learned: likewise; their lines are thicker.
     """
     chosen = choose_highlights(curves, highlight, learned)
@@ -153,8 +153,8 @@ def distinguish_lines(
     groups = group_equal_lines(
         [*(n for n in chosen if n in values), *(n for n in values if n not in chosen)], values
     )
-    told = {first: join_names(same) for first, same in groups.items() if first in chosen}
-    return told, [first for first in groups if first not in chosen]
+    labels = {first: join_names(same) for first, same in groups.items() if first in chosen}
+    return labels, [first for first in groups if first not in chosen]
 
 
 def join_names(names: Sequence[str], most: int = 2) -> str:

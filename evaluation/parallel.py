@@ -222,13 +222,13 @@ class Workers:
         packed = cloudpickle.dumps(function)
         calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
-        told: set[tuple[str, type[Warning]]] = set()
+        shown_warnings: set[tuple[str, type[Warning]]] = set()
         # Processes that begin do not search the working directory for libraries; :func:`_done` tells them the paths.
         with _environment(PYTHONSAFEPATH="1"):
             for outcome in spread(calls):
                 for text, category in outcome.warnings:
-                    if (text, category) not in told:
-                        told.add((text, category))
+                    if (text, category) not in shown_warnings:
+                        shown_warnings.add((text, category))
                         warnings.warn(text, category, stacklevel=2)
                 if outcome.error is not None:
                     raise outcome.error from Elsewhere(outcome.traceback)
@@ -351,8 +351,8 @@ class Workers:
                 try:
                     yield from ray.get(ready)
                 except ray.exceptions.RayError as error:
-                    said = str(error).strip().splitlines()[0]
-                    raise ValueError(f"the cluster has lost a piece of work for good: {said}") from error
+                    reason = str(error).strip().splitlines()[0]
+                    raise ValueError(f"the cluster has lost a piece of work for good: {reason}") from error
 
     def _begin_ray(self, ray: Any) -> None:
         quiet = {"log_to_driver": False, "logging_level": "error"}

@@ -19,15 +19,17 @@ Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
 
 
-def start_lanes(model: Model, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+def start_lanes(
+    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
     Args:
         model: task with a bank.
         seeds: of the episodes.
-        begun: called with the episodes at the start of the track.
+        on_start: called with the episodes at the start of the track.
     """
-    lanes = Lanes(model, len(seeds), begun=begun)
+    lanes = Lanes(model, len(seeds), on_start=on_start)
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()

@@ -64,7 +64,7 @@ def propagate(state: Array, T: float | Array) -> Array:
 
 
 def jacobian(state: Array, T: float | Array) -> Array:
-    """Derivative of :func:`turned` with respect to the state, ``(5, 5, ...)``; arguments as there."""
+    """Derivative of :func:`propagate` with respect to the state, ``(5, 5, ...)``; arguments as there."""
     xp = namespace(state)
     vx, vy, omega = state[2], state[3], state[4]
     angle = T * omega

@@ -105,7 +105,7 @@ def process_noise_factor(correction: Array, updated: Array, carried: Array, unit
     """Sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
 
     Its mean is the true factor where the filter believes the right one. Without a measurement it is the factor
-    that the filter believes. Single samples are often negative: average them with :func:`faded`, hold the average
+    that the filter believes. Single samples are often negative: average them with :func:`fading_mean`, hold the average
     above a least one.
 
     Args:

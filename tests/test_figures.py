@@ -14,9 +14,9 @@ from filtergym.evaluation.looks import (
     MOST_HIGHLIGHTED,
     by_cost,
     choose_highlights,
+    group_equal_lines,
     join_names,
     looks,
-    group_equal_lines,
 )
 from filtergym.evaluation.print_layout import WIDTHS, save, sensible_limits
 from matplotlib.colors import to_hex

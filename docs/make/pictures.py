@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 from filtergym.evaluation.looks import styles
-from filtergym.evaluation.print_layout import figure_with_axes, in_print, add_title
+from filtergym.evaluation.print_layout import add_title, figure_with_axes, in_print
 
 
 @in_print

@@ -23,7 +23,7 @@ from filtergym.evaluation.code import files_digest
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
 from filtergym.evaluation.evaluate import check_sendable
-from filtergym.evaluation.metrics import mean_over_time, components_and_groups, score, squared_errors
+from filtergym.evaluation.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.parallel import Workers, check_workers
 from filtergym.evaluation.statistics import ALL, Statistic
 from filtergym.evaluation.store import Store, Work

@@ -349,13 +349,13 @@ class FilterBank(_RadarBank):
         xp = self.xp
         each = tuple(str(j + 1) for j in range(self.count))
 
-        def normalised(i: int) -> Any:
+        def innovation_in_sigmas(i: int) -> Any:
             return lambda f, _: f.innovation[i] / xp.sqrt(f.innovation_covariance[i, i])
 
         over_sigma = "the filter's innovation over its predicted sigma"
         return (
-            Block("innovation_x", normalised(0), over_sigma, each, SIGNED_LOG),
-            Block("innovation_y", normalised(1), over_sigma, each, SIGNED_LOG),
+            Block("innovation_x", innovation_in_sigmas(0), over_sigma, each, SIGNED_LOG),
+            Block("innovation_y", innovation_in_sigmas(1), over_sigma, each, SIGNED_LOG),
             Block(
                 "log_squared_innovation",
                 lambda f, _: f.log_squared,

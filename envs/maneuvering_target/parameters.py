@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..parameters import TaskParameters, parameter, check_length, square_matrix
+from ..parameters import TaskParameters, check_length, parameter, square_matrix
 
 
 @dataclass(frozen=True)

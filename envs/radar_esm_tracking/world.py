@@ -7,7 +7,7 @@ import numpy
 
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, draw_between, category
+from ..draws import Draws, category, draw_between
 from ..faults import Outliers
 from ..observation import Array
 from ..world import World

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..parameters import Limits, TaskParameters, check, parameter, check_length
+from ..parameters import Limits, TaskParameters, check, check_length, parameter
 from ..task import Component
 
 COORDINATES: Mapping[str, tuple[Component, ...]] = {

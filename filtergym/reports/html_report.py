@@ -239,7 +239,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
     found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
     order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
 
-    def values_in_words(metric: str, component: str, names: Sequence[str]) -> str:
+    def in_words(metric: str, component: str, names: Sequence[str]) -> str:
         parts = []
         for name in names:
             record = found.get((name, metric, component))
@@ -265,13 +265,13 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "title": "Error over time",
                 "text": "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second "
                 "one all again.",
-                "alternative": f"RMSE of {component} over the whole run: {values_in_words('rmse', component, order[:6])}.",
+                "alternative": f"RMSE of {component} over the whole run: {in_words('rmse', component, order[:6])}.",
             },
             {
                 "kind": "exceeded",
                 "title": "Distribution of errors",
                 "text": "Share of measurements whose error is larger.",
-                "alternative": f"Largest RMSE at any time: {values_in_words('peak_rmse', component, order[:6])}.",
+                "alternative": f"Largest RMSE at any time: {in_words('peak_rmse', component, order[:6])}.",
             },
         ]
     if result.curves is not None and {"anees", "anis"} & set(result.curves):
@@ -281,7 +281,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "title": "Consistency",
                 "text": "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is "
                 "consistent; the band holds 95 % of a consistent estimator's (chi-square).",
-                "alternative": f"Mean NEES over its dimension: {values_in_words('anees', 'state', order[:6])}.",
+                "alternative": f"Mean NEES over its dimension: {in_words('anees', 'state', order[:6])}.",
             }
         )
     if result.curves is not None and BEHAVIOUR_CURVES & set(result.curves):

@@ -233,7 +233,7 @@ class Results(NamedTuple):
     drift: Mapping[str, numpy.ndarray]
     """Mean error over time with the drift ``DRIFT``, m, ``(1 + resamples, LONG)``."""
     paths: Mapping[str, Mapping[str, numpy.ndarray]]
-    """One run of the policies of ``DRAWN``."""
+    """One run of the policies of ``EXAMPLE_POLICIES``."""
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:

@@ -34,7 +34,9 @@ SECONDS = (2, 5, 10, 20, 30, 60)
 
 
 def recognition_verdict(at_30: Sequence[Measured]) -> Verdict:
-    """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNISED`` in all classes, some, or none."""
+    """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all classes,
+    in some, or in none.
+    """
     return verdict_of(m.low >= RECOGNITION_PROBABILITY for m in at_30)
 
 
