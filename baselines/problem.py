@@ -65,8 +65,8 @@ class Problem:
     @property
     def knows(self) -> dict[str, str]:
         """What its references and bounds are told beyond the measurements, by their names."""
-        told = {**self.baselines.references, **self.baselines.bounds}
-        return {name: maker.knows for name, maker in told.items()}
+        makers = {**self.baselines.references, **self.baselines.bounds}
+        return {name: maker.knows for name, maker in makers.items()}
 
     @property
     def tuned_values(self) -> TunedValues:

@@ -760,10 +760,10 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
         if self.options.context and lanes.any():
             values, present = self._context()
-            told = {}
+            context = {}
             for name, array in values.items():
-                told[name], told[f"_{name}"] = array, self._mask(present[name] & lanes)
-            info["context"], info["_context"] = told, self._mask(lanes)
+                context[name], context[f"_{name}"] = array, self._mask(present[name] & lanes)
+            info["context"], info["_context"] = context, self._mask(lanes)
         return info
 
     def _check_shortening(self, values: Any) -> numpy.ndarray:

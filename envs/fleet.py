@@ -65,13 +65,13 @@ def check_alike(model: Model, other: Model, name: str) -> None:
         other: that is to be flown too.
         name: of its scenario, in errors.
     """
-    said: dict[str, Callable[[Model], Any]] = {
+    properties: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
         "decision_interval": lambda t: t.task.decision_interval,
         "what is estimated": lambda t: t.task.components,
     }
-    for what, of in said.items():
+    for what, of in properties.items():
         if of(model) != of(other):
             raise ValueError(
                 f"scenario {name!r} with these parameters would change {what} of this environment, which stays as it "

@@ -233,9 +233,9 @@ class Likelihood(NamedTuple):
     """Numbers of the measurement that it counts, ``(N,)``; likewise."""
 
     @classmethod
-    def of(cls, told: Any) -> "Likelihood":
+    def of(cls, values: Any) -> "Likelihood":
         """Take a log-likelihood alone for one."""
-        return cls(*told) if isinstance(told, tuple) else cls(told)
+        return cls(*values) if isinstance(values, tuple) else cls(values)
 
     def fill_unknown(self) -> "Likelihood":
         """Put NaN in place of what is not known."""

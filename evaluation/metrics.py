@@ -144,9 +144,9 @@ def record_statistics(
     says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
     if says or not judged:  # there is nothing else of an estimator of one's own then
         shape = (run.sizes["episode"], run.sizes["time"])
-        said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+        log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
         for window, times in slices.items():
-            yield _mean_of_present("log_likelihood", "measurement", window, "nat", said[:, times])
+            yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood[:, times])
     if not is_bound and judged:
         yield from means("cost", "", "1", run["cost"].values)
         charge = run["charge"].values

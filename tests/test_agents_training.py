@@ -561,7 +561,7 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
         estimators={"kalman-imm": known.estimators["kalman-imm"]},
     )
     tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
-    monkeypatch.setattr(Problem, "tuned", tuned)
+    monkeypatch.setattr(Problem, "tuned_policies", tuned)
     run = train(small_run("bptt", 400), tmp_path)
     run.problem = dataclasses.replace(problem_of(ID), baselines=few)
     opponents = standing.Opponents(run)

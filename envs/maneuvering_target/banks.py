@@ -299,11 +299,11 @@ class GainBank(_RadarBank):
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
         usual = (0.5 * T**2 * self.parameters.unmodelled_acceleration) ** 2
         beta = alpha_beta.benedict_bordner_beta(f.alpha)
-        told = usual + xp.clip(f.average_excess, 0.0, None)
+        extra_variance = usual + xp.clip(f.average_excess, 0.0, None)
         # Of one direction; beyond this the sum would be singular to rounding.
         largest = LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
-        told = xp.minimum(told, largest / (1.0 + since / T) ** 4)
-        P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T, since)
+        extra_variance = xp.minimum(extra_variance, largest / (1.0 + since / T) ** 4)
+        P = alpha_beta.left_by_acceleration(f.covariance, extra_variance, f.alpha, beta, T, since)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(

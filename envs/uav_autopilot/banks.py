@@ -298,8 +298,8 @@ class GainBank(_AutopilotFilter):
         Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
         with the paper's covariance.
         """
-        told = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
-        return super().covariance(state) * told
+        factor = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
+        return super().covariance(state) * factor
 
 
 class NoiseBank(_AutopilotFilter):

@@ -210,20 +210,20 @@ def run_benchmark(
         )
         everyone = evaluation_requests(cell.problem, experiment, cell.policies)
         asked += [(one, i) for one in everyone]
-    told = 0
+    finished_cells = 0
 
     def settle(i: int) -> None:
         """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
-        nonlocal told
+        nonlocal finished_cells
         cell = wanted[i]
         if len(found[i]) == len(cell.policies):
             everyone = [found[i].pop(name) for name in cell.policies]
             records, curves, head = combine_summaries(everyone)
             drawn(cell, curves)
             results[i] = result_of(cell.problem, head, records, curves, pretrained_agents(cell.environment))
-        while told < len(results) and (due := results[told]) is not None:
+        while finished_cells < len(results) and (due := results[finished_cells]) is not None:
             finished(due)
-            told += 1
+            finished_cells += 1
 
     workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end

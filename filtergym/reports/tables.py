@@ -200,9 +200,11 @@ def _of_competitors(
         if kind not in RANKED and kind != section:
             table.add_section()
             section = kind
-        told = steered if kind == "policy" else f"({kind})"
+        control_column = steered if kind == "policy" else f"({kind})"
         shown = "\n".join(textwrap.wrap(name, NARROW if compact else WIDE))
-        table.add_row(shown, *([told] if control else []), *(column(name) for column in columns.values()))
+        table.add_row(
+            shown, *([control_column] if control else []), *(column(name) for column in columns.values())
+        )
     return table
 
 

@@ -117,8 +117,10 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
     kept = []
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(numpy.zeros((episodes, 1))):
-            said, truth = episode.measurement, task.world.state(episode.truth)
-            kept.append([values[:, :episodes] for values in (said.position, said.variance, truth)])
+            measurement, truth = episode.measurement, task.world.state(episode.truth)
+            kept.append(
+                [values[:, :episodes] for values in (measurement.position, measurement.variance, truth)]
+            )
     (initial,) = starts
     start_variance = numpy.stack([initial.covariance[i, i, :episodes] for i in range(2)])
     measurement, variance, truth = (numpy.stack(values) for values in zip(*kept, strict=True))

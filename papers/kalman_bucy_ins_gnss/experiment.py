@@ -117,8 +117,8 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
     model = make_model(LooselyCoupledNavigation, maker.control, "paper", fixed_drift=DRIFT)
 
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
-        said = episode.measurement
-        shown = (episode.truth.reference, said.ins, said.fix, model.mean(episode))
+        measurement = episode.measurement
+        shown = (episode.truth.reference, measurement.ins, measured.fix, model.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
 
     series = recorded(model, maker(model), episode_seeds("test", SEED, 1), fields)
