@@ -118,7 +118,7 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
 
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
         measurement = episode.measurement
-        shown = (episode.truth.reference, measurement.ins, measured.fix, model.mean(episode))
+        shown = (episode.truth.reference, measurement.ins, measurement.fix, model.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
 
     series = recorded(model, maker(model), episode_seeds("test", SEED, 1), fields)
