@@ -13,7 +13,7 @@ from ..envs.catalogue import nearest, task_class
 from ..evaluation.competitors import RANKED, RandomPolicy, kind_of
 from .table import Baselines
 
-ADDED: dict[str, Baselines] = {}
+USER_BASELINES: dict[str, Baselines] = {}
 """Baselines of users' environments: Gymnasium id -> table."""
 
 
@@ -43,7 +43,7 @@ def baselines_of(id: str) -> Baselines:
     package = package_of(id)
     if package is not None:
         return package.BASELINES
-    return ADDED.get(id) or Baselines(id, {"random": RandomPolicy})
+    return USER_BASELINES.get(id) or Baselines(id, {"random": RandomPolicy})
 
 
 def add_baselines(table: Baselines) -> None:
@@ -76,4 +76,4 @@ def add_baselines(table: Baselines) -> None:
                 )
             if kind not in RANKED and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
-    ADDED[cls.id] = table
+    USER_BASELINES[cls.id] = table

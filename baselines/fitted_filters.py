@@ -10,7 +10,7 @@ from ..evaluation.stored import fits, read_json
 from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
 from .problem import Problem
 from .table import Tunable
-from .tuned_values import TunedPolicy, rounded, tuned_policy
+from .tuned_values import TunedPolicy, round_value, tuned_policy
 
 SUFFIX = ".filter.json"
 """Of the names of such files."""
@@ -45,9 +45,11 @@ def write_fitted(
     table = {
         "environment": problem.id,
         "filter": name,
-        "values": {key: rounded(value) for key, value in found.values.items()},
-        "intervals": {key: [rounded(each.low), rounded(each.high)] for key, each in intervals.items()},
-        "measurements": found.count,
+        "values": {key: round_value(value) for key, value in found.values.items()},
+        "intervals": {
+            key: [round_value(each.low), round_value(each.high)] for key, each in intervals.items()
+        },
+        "measurements": found.measurements,
         "command": command,
     }
     write_text(path, json.dumps(table, indent=1) + "\n")

@@ -8,7 +8,7 @@ quantile below its maximum (Venzon and Moolgavkar, Applied Statistics 37, 1988).
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -47,8 +47,8 @@ class Fit(NamedTuple):
     """Of the parameters, as they are searched."""
     log_likelihood: float
     """Of all measurements that counted, nats."""
-    count: int
-    """Measurements that counted."""
+    measurements: int
+    """That counted."""
     spread: float
     """Nats between the best and the worst of the starts' ends."""
     at_limit: tuple[str, ...]
@@ -149,25 +149,24 @@ def fit(likelihood: WindowLikelihood, tunable: Tunable, seed: int = 0, starts: i
 
 def _hessian(likelihood: WindowLikelihood, at: numpy.ndarray, step: numpy.ndarray) -> numpy.ndarray:
     """Second derivatives of the log-likelihood by central differences, ``(P, P)``."""
-    P = len(at)
-    moves = numpy.diag(step)
-    points = [at]
-    for i in range(P):
-        for j in range(i, P):
-            points += [
-                at + moves[i] + moves[j],
-                at + moves[i] - moves[j],
-                at - moves[i] + moves[j],
-                at - moves[i] - moves[j],
-            ]
-    found = iter(likelihood(numpy.stack(points, axis=1)))
-    next(found)
+    P, moves = len(at), numpy.diag(step)
+    pairs = [(i, j) for i in range(P) for j in range(i, P)]
+    signs = ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+    points = [at + a * moves[i] + b * moves[j] for i, j in pairs for a, b in signs]
+    found = likelihood(numpy.stack(points, axis=1)).reshape(len(pairs), 4)
     H = numpy.zeros((P, P))
-    for i in range(P):
-        for j in range(i, P):
-            a, b, c, d = (next(found) for _ in range(4))
-            H[i, j] = H[j, i] = (a - b - c + d) / (4.0 * step[i] * step[j])
+    for (i, j), values in zip(pairs, found, strict=True):
+        H[i, j] = H[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * step[i] * step[j])
     return H
+
+
+class _Place(NamedTuple):
+    """Where a point of a profile lies."""
+
+    parameter: int
+    sign: float
+    distance: float
+    """From the best value of that parameter."""
 
 
 def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
@@ -183,71 +182,88 @@ def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit
         found: of :func:`fit`.
     """
     names = list(tunable.limits)
-    low, high = numpy.array(list(tunable.limits.values())).T
+    limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in names])
-    P = len(names)
-    step = numpy.minimum(0.02, 0.01 * (high - low))
-    inside = numpy.clip(best, low + 2.0 * step, high - 2.0 * step)
-    H = _hessian(likelihood, inside, step)
-    # What is no maximum along some direction is taken for a flat one.
-    eigenvalues, vectors = numpy.linalg.eigh(-H)
-    floor = 4.0 / (high - low).max() ** 2
-    information = (vectors * numpy.clip(eigenvalues, floor, None)) @ vectors.T
-    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(information)))
-    points, fixed, places = [], [], []
-    for i in range(P):
-        for sign, limit in ((-1.0, low[i]), (1.0, high[i])):
-            room = sign * (limit - best[i])
-            distances = [d for d in numpy.array(STEPS) * deviation[i] if d < room]
-            for distance in [*distances, room]:
-                point = best.copy()
-                others = [j for j in range(P) if j != i]
-                if others:
-                    follow = numpy.linalg.solve(
-                        information[numpy.ix_(others, others)], information[others, i]
-                    )
-                    point[others] = best[others] - follow * sign * distance
-                point[i] = best[i] + sign * distance
-                points.append(numpy.clip(point, low, high))
-                fixed.append(i)
-                places.append((i, sign, distance))
-    state, fixed_at = numpy.stack(points, axis=1), numpy.array(fixed)
-    value = likelihood(state)
-    if P > 1:
-        state, value = _climb(likelihood, state, value, fixed_at, information, low, high)
+    information = _information(likelihood, best, limits)
+    points, places = _profile_points(best, information, limits)
+    held = numpy.array([place.parameter for place in places])
+    value = likelihood(points)
+    if len(names) > 1:
+        value = _climb(likelihood, points, value, held, information, limits)
+    # The maximum may turn out to be none: then the drop is counted from the highest point.
+    drops = max(found.log_likelihood, float(value.max())) - value
     intervals = {}
     for i, name in enumerate(names):
-        ends, opened = [], []
-        for sign in (-1.0, 1.0):
-            mine = [k for k, place in enumerate(places) if place[0] == i and place[1] == sign]
-            # The maximum may turn out to be no maximum: then where the profile is highest counts.
-            drops = numpy.array([0.0, *(max(found.log_likelihood, value.max()) - value[k] for k in mine)])
-            distances = numpy.array([0.0, *(places[k][2] for k in mine)])
-            beyond = numpy.flatnonzero(drops > DROP)
-            if not len(beyond):
-                ends.append(best[i] + sign * distances[-1])
-                opened.append(True)
-                continue
-            k = int(beyond[0])
-            # A drop grows with the square of the distance: interpolated in its root.
-            a, b = math.sqrt(max(drops[k - 1], 0.0)), math.sqrt(drops[k])
-            share = (math.sqrt(DROP) - a) / (b - a) if b > a else 0.0
-            ends.append(best[i] + sign * (distances[k - 1] + share * (distances[k] - distances[k - 1])))
-            opened.append(False)
-        intervals[name] = Interval(float(ends[0]), float(ends[1]), opened[0], opened[1])
+        ends = [_profile_end(places, drops, i, sign) for sign in (-1.0, 1.0)]
+        (low, open_low), (high, open_high) = ends
+        intervals[name] = Interval(float(best[i] - low), float(best[i] + high), open_low, open_high)
     return intervals
+
+
+def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
+    """Curvature of the likelihood at its maximum; a direction without one is taken for a flat one."""
+    low, high = limits
+    step = numpy.minimum(0.02, 0.01 * (high - low))
+    H = _hessian(likelihood, numpy.clip(best, low + 2.0 * step, high - 2.0 * step), step)
+    eigenvalues, vectors = numpy.linalg.eigh(-H)
+    floor = 4.0 / (high - low).max() ** 2
+    information: numpy.ndarray = (vectors * numpy.clip(eigenvalues, floor, None)) @ vectors.T
+    return information
+
+
+def _profile_points(
+    best: numpy.ndarray, information: numpy.ndarray, limits: numpy.ndarray
+) -> tuple[numpy.ndarray, list[_Place]]:
+    """Points ``(P, n)`` on both sides of every parameter, the others where a quadratic likelihood has its ridge."""
+    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(information)))
+    points, places = [], []
+    for i in range(len(best)):
+        others = numpy.delete(numpy.arange(len(best)), i)
+        follow = numpy.linalg.solve(information[numpy.ix_(others, others)], information[others, i])
+        for sign, limit in zip((-1.0, 1.0), limits[:, i], strict=True):
+            room = sign * (limit - best[i])
+            for distance in [*(d for d in numpy.array(STEPS) * deviation[i] if d < room), room]:
+                point = best.copy()
+                point[i] += sign * distance
+                point[others] -= follow * sign * distance
+                points.append(numpy.clip(point, *limits))
+                places.append(_Place(i, sign, float(distance)))
+    return numpy.stack(points, axis=1), places
+
+
+def _profile_end(
+    places: Sequence[_Place], drops: numpy.ndarray, parameter: int, sign: float
+) -> tuple[float, bool]:
+    """Distance at which the likelihood has fallen far enough, and whether it has not done so at the limit."""
+    mine = [k for k, place in enumerate(places) if (place.parameter, place.sign) == (parameter, sign)]
+    distances = [0.0, *(places[k].distance for k in mine)]
+    # A drop grows with the square of the distance: it is interpolated in its root.
+    roots = [0.0, *numpy.sqrt(numpy.clip(drops[mine], 0.0, None)).tolist()]
+    for k in range(1, len(roots)):
+        if roots[k] > math.sqrt(DROP):
+            share = (math.sqrt(DROP) - roots[k - 1]) / (roots[k] - roots[k - 1])
+            return distances[k - 1] + share * (distances[k] - distances[k - 1]), False
+    return distances[-1], True
 
 
 def _climb(
     likelihood: WindowLikelihood,
     state: numpy.ndarray,
     value: numpy.ndarray,
-    fixed: numpy.ndarray,
+    held: numpy.ndarray,
     information: numpy.ndarray,
-    low: numpy.ndarray,
-    high: numpy.ndarray,
-) -> tuple[numpy.ndarray, numpy.ndarray]:
-    """Raise the likelihood of many points, each with one of its parameters held."""
+    limits: numpy.ndarray,
+) -> numpy.ndarray:
+    """Raise the likelihood of many points, each with one of its parameters held; return it.
+
+    Args:
+        likelihood: that is raised.
+        state: points, ``(P, n)``.
+        value: their log-likelihood, ``(n,)``.
+        held: number of the parameter that each point holds, ``(n,)``.
+        information: curvature at the maximum, ``(P, P)``.
+        limits: of the parameters, ``(2, P)``.
+    """
     P, count = state.shape
     step, scale = 1e-4, numpy.ones(count)
     for _ in range(NEWTON_STEPS):
@@ -257,15 +273,13 @@ def _climb(
             gradient = numpy.nan_to_num((found - value) / step, posinf=0.0, neginf=0.0)
         direction = numpy.zeros_like(state)
         for i in range(P):
-            chosen = numpy.flatnonzero(fixed == i)
-            others = [j for j in range(P) if j != i]
-            if len(chosen):
-                direction[numpy.ix_(others, chosen)] = numpy.linalg.solve(
-                    information[numpy.ix_(others, others)], gradient[numpy.ix_(others, chosen)]
-                )
-        trial = numpy.clip(state + scale * direction, low[:, None], high[:, None])
+            others, mine = numpy.delete(numpy.arange(P), i), numpy.flatnonzero(held == i)
+            direction[numpy.ix_(others, mine)] = numpy.linalg.solve(
+                information[numpy.ix_(others, others)], gradient[numpy.ix_(others, mine)]
+            )
+        trial = numpy.clip(state + scale * direction, limits[0][:, None], limits[1][:, None])
         risen = likelihood(trial)
         better = risen > value
         state, value = numpy.where(better, trial, state), numpy.where(better, risen, value)
         scale = numpy.where(better, numpy.minimum(1.0, 2.0 * scale), 0.25 * scale)
-    return state, value
+    return value

@@ -65,8 +65,8 @@ class Problem:
     @property
     def knows(self) -> dict[str, str]:
         """What its references and bounds are told beyond the measurements, by their names."""
-        told = {**self.baselines.references, **self.baselines.bounds}
-        return {name: maker.knows for name, maker in told.items()}
+        makers = {**self.baselines.references, **self.baselines.bounds}
+        return {name: maker.knows for name, maker in makers.items()}
 
     @property
     def tuned_values(self) -> TunedValues:
@@ -75,14 +75,14 @@ class Problem:
         return TunedValues(self.id, self.baselines.tunable, [table_path(self.id), *shipped])
 
     @property
-    def tuned(self) -> list[str]:
+    def tuned_policies(self) -> list[str]:
         """Names of policies with tuned values."""
         return self.tuned_values.names()
 
     @property
     def names(self) -> list[str]:
         """Names of its policies, estimators, references and bounds, and of policies that were tuned."""
-        return [*self.baselines.names, *self.tuned]
+        return [*self.baselines.names, *self.tuned_policies]
 
     def competitor(self, name: str) -> Any:
         """Return what makes one of its own policies or estimators, tuned or not, references or bounds.

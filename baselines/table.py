@@ -40,8 +40,6 @@ def tunable(
     make: Callable[..., Any],
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]] | None = None,
     /,
-    *,
-    units: Mapping[str, str] | None = None,
     **values: tuple[float, float, float],
 ) -> Tunable:
     """Declare which keywords of a policy or an estimator are tuned.
@@ -50,7 +48,6 @@ def tunable(
         make: its class, or a :class:`Variant`.
         apply: as in :class:`Tunable`; default: every value is a keyword of ``make``. A value whose name begins with
             ``log10_`` is the logarithm of the keyword: its size is not known beforehand.
-        units: of the values, as :class:`Tunable` has it.
         **values: lower limit, value in force without tuning, upper limit.
     """
 
@@ -62,7 +59,6 @@ def tunable(
         {name: (low, high) for name, (low, _, high) in values.items()},
         {name: start for name, (_, start, _) in values.items()},
         apply or keywords,
-        units=units or {},
     )
 
 

@@ -41,7 +41,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import numpy
 from filtergym.agents.learned_policy import PRETRAINED
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Session, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
@@ -49,7 +49,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
-from filtergym.evaluation.curves import DISTRIBUTED
+from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.evaluate import Experiment
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
@@ -313,7 +313,7 @@ def _competitor(id: str, name: str, trained: Path | None, two_sizes: bool) -> Un
 
 def classical(id: str) -> list[str]:
     """Competitors of the full benchmark without the agents that are shipped."""
-    return [name for name in benchmark_policies(problem_of(id), True) if name not in shipped_agents(id)]
+    return [name for name in benchmark_policies(problem_of(id), True) if name not in pretrained_agents(id)]
 
 
 # --- the plan
@@ -370,7 +370,7 @@ def makespan(items: Sequence[Item], cores: int, start: float) -> float:
 
 def distributed(episodes: int, T: int) -> int:
     """Episodes whose distribution is told."""
-    return min(episodes, max(block_of(T), DISTRIBUTED // T))
+    return min(episodes, max(block_of(T), DISTRIBUTION_LIMIT // T))
 
 
 def sent_bytes(u: Units, pieces: int, episodes: int, T: int) -> float:

@@ -9,7 +9,7 @@ from PIL import Image
 from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
 from ..envs.parameters import check_integer
-from .competitors import kind_of, made
+from .competitors import kind_of, make_competitor
 from .evaluate import control_of
 from .files import whole_file
 from .stepping import SteppingPolicy
@@ -44,7 +44,7 @@ def episode_frames(
     world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
-    actor = SteppingPolicy(world.model, made(policy, world.model))
+    actor = SteppingPolicy(world.model, make_competitor(policy, world.model))
     observation, _ = world.reset(seed=seed)
     frames, memory, finished = [Image.fromarray(_frame(world))], actor.begin([seed]), False
     taken = 0

@@ -13,7 +13,7 @@ import numpy
 import xarray
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, importable_name, nearest, opened, task_class
+from ..envs.catalogue import find_scenario, importable_name, nearest, read_files, task_class
 from ..envs.compiled import Report
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
@@ -30,7 +30,7 @@ from .threads import one_thread
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
-DRAWN = "drawn_"
+DRAWN_PREFIX = "drawn_"
 """Begins the names of what is kept of the first episodes only."""
 
 
@@ -114,7 +114,10 @@ def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
     kept = (
         _measurement_report(model, episode) if model.task.has_truth else _expectation_report(model, episode)
     )
-    return {**kept, **{f"{DRAWN}{name}": values for name, values in model.drawn(episode).items()}}
+    return {
+        **kept,
+        **{f"{DRAWN_PREFIX}{name}": values for name, values in model.picture_track(episode).items()},
+    }
 
 
 def _limits(model: Model, episode: Episode) -> dict[str, Any]:
@@ -166,8 +169,8 @@ def evaluate(
         control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
         tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
-        drawn_episodes: of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate``
-            and so on over policy, drawn_episode and time; not beside ``tracks``.
+        drawn_episodes: of how many of the first episodes to keep what :meth:`.Model.picture_track` returns, as
+            ``drawn_estimate`` and so on over policy, drawn_episode and time; not beside ``tracks``.
         paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
         reference: name of the competitor whose score is 1; kept likewise.
         backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
@@ -306,7 +309,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
         piece.name,
         piece.first,
         actions=True,
-        only={DRAWN: drawn},
+        only={DRAWN_PREFIX: drawn},
         strict=experiment.strict,
     )
     return found
@@ -385,7 +388,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     experiment = replace(
         experiment,
         environment=importable_name(cls),
-        scenario=opened(cls, experiment.scenario),
+        scenario=read_files(cls, experiment.scenario),
         drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
     )
     if experiment.tracks and experiment.drawn_episodes:
@@ -413,7 +416,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         [c.name for c in first.task.components], first.task.groups
     )  # refused now, not when all is done
     if chosen.recording is not None:
-        _check_known_truth(kinds, chosen.name)
+        _check_truth_available(kinds, chosen.name)
         episodes = len(first.task.flights)  # nothing is random: each once
     flown, lengths = None, None
     if first.task.flights:
@@ -445,7 +448,7 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
             ) from error
 
 
-def _check_known_truth(kinds: Mapping[str, Kind], name: str) -> None:
+def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
     """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
         if kind not in RANKED:
@@ -486,7 +489,7 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
     if count < 0:
         return []
-    key = key.removeprefix(DRAWN)
+    key = key.removeprefix(DRAWN_PREFIX)
     if key == "covariance":
         return ["component", "other_component"]
     if key in ("error", "mean_square", "truth", "estimate", "seen"):
@@ -559,7 +562,7 @@ def _dataset(
         for i, name in enumerate(names):
             if key in per_policy[name]:
                 stacked[i] = per_policy[name].pop(key)  # so that little is held twice
-        dims = ["policy", "drawn_episode" if key.startswith(DRAWN) else "episode", "time"]
+        dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)
     dataset = xarray.Dataset(

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler import namespace
-from ..compiler.functions import Function, mapped
+from ..compiler.functions import Function, map_arrays
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from ..envs.compiled import AVAILABLE, warn_of
@@ -124,7 +124,7 @@ def _lengthened(values: numpy.ndarray, length: int) -> numpy.ndarray:
 def _filled(like: Any, arrays: Mapping[str, numpy.ndarray]) -> Any:
     """A NamedTuple with arrays by name in place of its own, in their types."""
     names = iter([name for name, _ in named_arrays(like)])
-    return mapped(lambda old: arrays[next(names)].astype(old.dtype), like)
+    return map_arrays(lambda old: arrays[next(names)].astype(old.dtype), like)
 
 
 def _update(
@@ -132,7 +132,7 @@ def _update(
 ) -> tuple[Any, Array]:
     """Memory after a measurement, and its log-likelihood; parameters ``(P, N)``."""
     own = apply({name: values[i] for i, name in enumerate(names)})[1](task)
-    _, _, memory, *likelihood = own.update(task.world.received(measurement), memory)
+    _, _, memory, *likelihood = own.update(task.world.mask_missing(measurement), memory)
     return memory, Likelihood.of(*likelihood).log_likelihood
 
 
@@ -227,7 +227,7 @@ class WindowLikelihood:
                 warn_of(type(own).__name__, error)
                 self._compiled, memory = None, own.start(initial, lanes)
         for k, measurement in enumerate(measurements):
-            _, _, memory, *likelihood = own.update(self.task.world.received(measurement), memory)
+            _, _, memory, *likelihood = own.update(self.task.world.mask_missing(measurement), memory)
             found[k] = Likelihood.of(*likelihood).log_likelihood if likelihood else numpy.nan
         return found
 
@@ -236,7 +236,7 @@ class WindowLikelihood:
         if count not in self._tiles:
 
             def tile(part: Any) -> Any:
-                return mapped(lambda array: numpy.tile(array, count), part)
+                return map_arrays(lambda array: numpy.tile(array, count), part)
 
             self._tiles = {count: (tile(self.windows.initial), [tile(m) for m in self.windows.measurements])}
         return self._tiles[count]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, import_task, make_task, opened
+from ..envs.catalogue import find_scenario, import_task, make_task, read_files
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
@@ -66,7 +66,7 @@ def record(
     """
     cls = import_task(env)
     seeds = episode_seeds(split, seed, episodes)
-    chosen = find_scenario(cls, opened(cls, scenario), keywords)
+    chosen = find_scenario(cls, read_files(cls, scenario), keywords)
     plain = make_task(cls, chosen, **keywords)
     if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
@@ -128,7 +128,7 @@ def _record(
     def first(values: numpy.ndarray) -> numpy.ndarray:
         return numpy.moveaxis(values[..., :count], -1, 0).copy()
 
-    def begun(episode: Episode) -> None:
+    def keep_start(episode: Episode) -> None:
         initial.update({name: first(values) for name, values in named_arrays(episode.measurement)})
 
     def keep(episode: Episode) -> None:
@@ -136,7 +136,7 @@ def _record(
             series.setdefault(name, []).append(first(values))
         series.setdefault("truth", []).append(first(model.task.world.state(episode.truth)))
 
-    lanes, nothing = start_lanes(model, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
+    lanes, nothing = start_lanes(model, seeds, keep_start), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(nothing):
             keep(episode)

@@ -10,7 +10,7 @@ from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Kind, check_competitor, kind_of, made
+from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .dataset import FAULTS
 from .filters import put_in_loop
 from .stepping import SteppingPolicy
@@ -19,15 +19,17 @@ Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
 
 
-def start_lanes(model: Model, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+def start_lanes(
+    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
     Args:
         model: task with a bank.
         seeds: of the episodes.
-        begun: called with the episodes at the start of the track.
+        on_start: called with the episodes at the start of the track.
     """
-    lanes = Lanes(model, len(seeds), begun=begun)
+    lanes = Lanes(model, len(seeds), on_start=on_start)
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
@@ -66,7 +68,7 @@ def rollout(
                 yield found, action
         return
     lanes = start_lanes(model, seeds)
-    policy = SteppingPolicy(model, check_competitor(name, made(competitor, model), kind))
+    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), kind))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         action, memory = policy.predict(lanes.observe(), memory)

@@ -13,7 +13,7 @@ import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
-from .evaluate import DRAWN, Experiment, check_sendable, plan_of, run_piece
+from .evaluate import DRAWN_PREFIX, Experiment, check_sendable, plan_of, run_piece
 from .metrics import Contender, Record, contender_of, record_statistics, records_of
 from .own_metrics import OwnMetrics
 from .parallel import Workers
@@ -145,7 +145,7 @@ def reduce_episodes(
 
 def _head(run: xarray.Dataset) -> xarray.Dataset:
     """Return an evaluation without what was kept of every episode; of the first, its seed."""
-    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN)]
+    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
     return run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
 
 

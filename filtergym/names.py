@@ -7,15 +7,15 @@ from typing import Any
 import gymnasium
 import xarray
 
-from .agents.gate import gated
-from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
+from .agents.gate import add_gate
+from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
 from .baselines.fitted_filters import SUFFIX, read_fitted
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
-from .envs.catalogue import imported, make_task, nearest
+from .envs.catalogue import import_user_module, make_task, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
-from .evaluation.competitors import check_competitor, kind_of, made
+from .evaluation.competitors import check_competitor, kind_of, make_competitor
 from .evaluation.evaluate import Experiment, check_observation, control_of
 from .evaluation.metrics import Record
 from .evaluation.recording import record as record
@@ -49,7 +49,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
     if isinstance(name, Path) and name.name.endswith(SUFFIX):
         return read_fitted(name, problem)
     if isinstance(name, Path):
-        found = learned_policy(problem.task, str(name.absolute()), trust)
+        found = find_learned_policy(problem.task, str(name.absolute()), trust)
         if found is None:
             raise ValueError(
                 f"cannot load policy {str(name)!r}: it is neither a .safetensors, a .zip, nor a folder"
@@ -59,18 +59,18 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return read_fitted(Path(name), problem)
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return gated(inner, find_competitor(problem, inner, trust))
-    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned):
+        return add_gate(inner, find_competitor(problem, inner, trust))
+    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned_policies):
         return problem.competitor(name)
-    learned = learned_policy(problem.task, name, trust)
+    learned = find_learned_policy(problem.task, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
         return problem.competitor(name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise nearest("policy", name, [*problem.names, *shipped_agents(problem.id)])
-    holder = imported(module, f"cannot load policy {name!r}")
+        raise nearest("policy", name, [*problem.names, *pretrained_agents(problem.id)])
+    holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
     return check_competitor(name, getattr(holder, attribute))
@@ -81,7 +81,7 @@ def is_learned(problem: Problem, name: str) -> bool:
     inner = name.removeprefix(GATED)
     if inner in problem.names or inner.endswith(SUFFIX):
         return False
-    return inner in shipped_agents(problem.id) or ":" not in inner
+    return inner in pretrained_agents(problem.id) or ":" not in inner
 
 
 def evaluate(
@@ -157,7 +157,7 @@ def competitors_of(
 
 def _is_competitor(problem: Problem, name: str) -> bool:
     """Whether a name is that of a competitor of the environment."""
-    return name in problem.names or name in shipped_agents(problem.id)
+    return name in problem.names or name in pretrained_agents(problem.id)
 
 
 def evaluation_requests(
@@ -236,7 +236,9 @@ def make_policy(
                     "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
                 )
     check_observation(model, maker, name)
-    return SteppingPolicy(model, check_competitor(name, made(maker, model), kind), scenario, keywords)
+    return SteppingPolicy(
+        model, check_competitor(name, make_competitor(maker, model), kind), scenario, keywords
+    )
 
 
 def _model_of(env: Any) -> Any:
@@ -256,7 +258,7 @@ def _model_of(env: Any) -> Any:
             "this environment shows what no policy may know: make it without observation='asymmetric', or show "
             "a policy of your own observation['observation']"
         )
-    if inner.fleet.mixed:
+    if inner.fleet.mixes_scenarios:
         raise ValueError(
             "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
         )

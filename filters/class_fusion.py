@@ -274,7 +274,7 @@ def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
     return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
 
 
-def fixed_type_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
+def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
     """Log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
 
     (8) multiplies pi(rho | s) at every decision, which is Bayes' rule only if the type is drawn anew each

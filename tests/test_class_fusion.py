@@ -215,7 +215,7 @@ def test_fixed_type_posterior_sums_over_the_types(seed):
     confusion, composition = rng.dirichlet([1.0] * 4, 4), rng.dirichlet([1.0] * 4, 3)
     decisions = rng.integers(0, 4, (6, 8))
     counts = numpy.stack([(decisions == j).sum(axis=0) for j in range(4)]).astype(float)
-    result = class_fusion.fixed_type_log_likelihood(counts, numpy.log(confusion), numpy.log(composition))
+    result = class_fusion.constant_class_log_likelihood(counts, numpy.log(confusion), numpy.log(composition))
     for n, s in itertools.product(range(8), range(3)):
         likelihood = sum(composition[s, j] * math.prod(confusion[j, decisions[:, n]]) for j in range(4))
         assert result[s, n] == pytest.approx(math.log(likelihood), rel=1e-12)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
@@ -75,7 +75,7 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
 def test_summaries_tell_what_the_evaluation_does(env):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env)
-    kinds = ([known.score_paper], known.estimators, known.references, known.bounds, shipped_agents(env))
+    kinds = ([known.score_paper], known.estimators, known.references, known.bounds, pretrained_agents(env))
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
@@ -90,8 +90,8 @@ def test_summaries_tell_what_the_evaluation_does(env):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(problem_of(env), evaluation, records, curves, shipped_agents(env))
-    whole = benchmark.result_of(problem_of(env), dataset, records, expected, shipped_agents(env))
+    result = benchmark.result_of(problem_of(env), evaluation, records, curves, pretrained_agents(env))
+    whole = benchmark.result_of(problem_of(env), dataset, records, expected, pretrained_agents(env))
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
@@ -140,7 +140,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
 
 
 def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTED", 3000)
+    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTION_LIMIT", 3000)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
     names = ["imm"]
     curves = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=100))
@@ -254,7 +254,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
-    monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
+    monkeypatch.setitem(registration.USER_TASKS, ENV, task_class(ENV))
     assert work.work_of(asked) is None
 
 

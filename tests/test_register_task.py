@@ -72,8 +72,8 @@ def turns():
 
 
 def forget(id):
-    registration.ADDED.pop(id, None)
-    baselines.ADDED.pop(id, None)
+    registration.USER_TASKS.pop(id, None)
+    baselines.USER_BASELINES.pop(id, None)
     gymnasium.registry.pop(id, None)
 
 
@@ -94,7 +94,7 @@ def test_gymnasium_makes_and_renders_it(package):
     vector = gymnasium.make_vec(ID, num_envs=3, control="gain", horizon=5)
     np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
     assert "mine/Turns-v0" in catalogue()
-    assert "mine/Turns-v0" not in filtergym.envs.catalogue._shipped_tasks()
+    assert "mine/Turns-v0" not in filtergym.envs.catalogue._builtin_tasks()
 
 
 def test_a_spawned_process_finds_it(package):

@@ -155,9 +155,9 @@ def test_history_is_what_info_reports():
 
 def test_manoeuvres_are_marked_where_they_are_flown():
     env = played(0, scenario="paper")
-    assert env.picture.picture.shaded() == [(49.5, 55.5)]
+    assert env.picture.picture.shading() == [(49.5, 55.5)]
     straight = played(0, scenario="paper", acceleration=(0.0, 0.0))
-    assert straight.picture.picture.shaded() == []
+    assert straight.picture.picture.shading() == []
 
 
 def test_ellipse_axes_of_a_turned_covariance():

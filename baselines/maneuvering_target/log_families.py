@@ -4,6 +4,7 @@ Limits follow from the log: an acceleration of ``r / T^2`` moves a target by the
 interval T. What is far below is a straight line to the sensor, what is far above follows every measurement.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -48,7 +49,7 @@ class ConstantVelocity(KalmanModel):
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """One cycle of the filter."""
         F, Q = self.motion(measurement.interval)
-        result = self.updated(kalman.predict(*memory, F, self.variance * Q), measurement)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
         state = Initial(result.mean, result.covariance)
         return *state, state, self.likelihood(measurement, *result[2:])
 
@@ -100,7 +101,7 @@ class ConstantAcceleration(KalmanModel):
                 for i in range(6)
             ]
         )
-        result = self.updated(kalman.predict(*memory, F, self.variance * Q), measurement)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
         state = Initial(result.mean, result.covariance)
         return (
             result.mean[:4],
@@ -155,15 +156,14 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
     turn = math.log10(0.05 / T), math.log10(2.0 / T), math.log10(90.0 / T)
     leave = {"log10_leave_quiet": (-2.7, -1.5, -0.3), "log10_leave_noisy": (-2.3, -1.0, -0.3)}
     ratio = math.log10(2.0), math.log10(8.0), 3.5
-    return {
-        "constant-velocity": tunable(ConstantVelocity, units=UNITS, log10_acceleration=acceleration),
+    families = {
+        "constant-velocity": tunable(ConstantVelocity, log10_acceleration=acceleration),
         "constant-acceleration": tunable(
-            ConstantAcceleration, units=UNITS, log10_jerk=jerk, log10_acceleration=acceleration
+            ConstantAcceleration, log10_jerk=jerk, log10_acceleration=acceleration
         ),
         "imm-two": tunable(
             KalmanInteractingMultipleModel,
             _imm,
-            units=UNITS,
             log10_acceleration_quiet=acceleration,
             log10_ratio=ratio,
             **leave,
@@ -171,7 +171,6 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
         "imm-turn": tunable(
             KalmanTurnInteractingMultipleModel,
             _imm_turn,
-            units=UNITS,
             log10_acceleration_quiet=acceleration,
             log10_ratio=ratio,
             log10_turn_rate=turn,
@@ -179,23 +178,21 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
         ),
         "unscented-turn": tunable(
             UnscentedTurn,
-            units=UNITS,
             log10_acceleration=acceleration,
             log10_turn_rate_change=(turn[0] - 1.0, turn[1] - 1.0, turn[2] - 1.0),
             log10_turn_rate_start=turn,
         ),
         "sage-husa": tunable(
             SageHusa,
-            units=UNITS,
             log10_acceleration=acceleration,
             forgetting=(0.3, 0.9, 0.995),
             log10_least=acceleration,
         ),
         "variational-bayes": tunable(
             VariationalBayes,
-            units=UNITS,
             log10_acceleration=acceleration,
             forgetting=(0.5, 0.95, 1.0),
             log10_shape=(-0.3, 0.7, 3.0),
         ),
     }
+    return {name: dataclasses.replace(family, units=UNITS) for name, family in families.items()}

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise
 from ..baselines.fitted_filters import SUFFIX, write_fitted
 from ..baselines.problem import problem_of
@@ -57,8 +57,8 @@ def advise_on_log(
     found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
-    learned = list(shipped_agents(problem.id))
-    names = [*problem.baselines.policies, *problem.baselines.estimators, *problem.tuned, *learned]
+    learned = list(pretrained_agents(problem.id))
+    names = [*problem.baselines.policies, *problem.baselines.estimators, *problem.tuned_policies, *learned]
     shipped = {name: find_competitor(problem, name) for name in names if name not in NOT_COMPARED}
     shipped = {name: maker for name, maker in shipped.items() if kind_of(maker) in RANKED}
     with progress_bar() as bar:

@@ -20,7 +20,7 @@ from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store
 from ..reports import standing
-from ..reports.tables import tuned_table
+from ..reports.tables import tuning_table
 from .terminal import (
     Backend,
     Cluster,
@@ -71,7 +71,7 @@ def tune_policy(
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
-    console.print(tuned_table(outcome, tunable[policy].start))
+    console.print(tuning_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
 
 
@@ -123,7 +123,7 @@ def _one_by_one(
             line = bar.add_task(f"training {run.algorithm}", total=run.steps)
             trainer(run, _session_with(session, bar, line))
         _print_done(folder, run)
-        if not run.finished:
+        if not run.is_complete:
             break
     return {folder: training.run for folder, training in waiting.items()}
 
@@ -268,14 +268,14 @@ def train(
             folder = out.with_name(f"{out.name}-{number}")
             begun = training_run.holds_run(folder)
             run = training_run.open_run(folder, make_run(number), begun)
-            if begun and not run.finished and algo not in THROUGH_THE_FILTER:
+            if begun and not run.is_complete and algo not in THROUGH_THE_FILTER:
                 training_run.check_trust(
                     f"{folder} goes on from a checkpoint that is loaded with pickle", trust
                 )
             runs[folder] = run, begun
     waiting = {}
     for folder, (run, begun) in runs.items():
-        if begun and run.finished:
+        if begun and run.is_complete:
             console.print(f"{folder} is finished: {run.steps_done:,} steps")
         else:
             waiting[folder] = _Training(run, Session(folder.absolute(), begun, validate_every, trust))
@@ -287,7 +287,7 @@ def train(
         )
     for folder, run in done.items():
         runs[folder] = run, True
-    if not all(run.finished for run, _ in runs.values()):
+    if not all(run.is_complete for run, _ in runs.values()):
         return  # somebody wished to stop
     if compare:
         _print_standing({folder: run for folder, (run, _) in runs.items()}, trust)

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 import xarray
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
 from ..envs.catalogue import (
     catalogue,
@@ -346,7 +346,7 @@ def benchmark(
 
         def drawn(cell: Cell, curves: xarray.Dataset) -> None:
             figures = (
-                evaluation_figures(curves, columns, learned=shipped_agents(cell.environment))
+                evaluation_figures(curves, columns, learned=pretrained_agents(cell.environment))
                 if formats
                 else ()
             )

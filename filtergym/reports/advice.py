@@ -1,7 +1,7 @@
 """An advice in words and as a table: which filter, which numbers, and why."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from rich.table import Table
 
@@ -49,8 +49,8 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
         )
     table.caption = (
         "log-likelihood: nats per measurement where filters were chosen, less one nat in all for each fitted "
-        "parameter; vs: on the measurements that judge.\nmean NIS: 1 where innovations are as large as predicted; correlation: of "
-        "successive prediction errors, 0 where they are white."
+        "parameter; vs: on the measurements that judge.\nmean NIS: 1 where innovations are as large as predicted; "
+        "correlation: of successive prediction errors, 0 where they are white."
     )
     return table
 
@@ -124,10 +124,10 @@ def _size(name: str, value: float) -> float:
     return 10.0**value if name.startswith("log10_") else value
 
 
-def _parameter(name: str, value: float, interval: Interval | None, units: dict[str, str] | None) -> str:
+def _parameter(name: str, value: float, interval: Interval | None, units: Mapping[str, str]) -> str:
     """A fitted parameter with its interval, and whether it can be known."""
     plain = name.removeprefix("log10_")
-    unit = f" {(units or {})[plain]}" if plain in (units or {}) else ""
+    unit = f" {units[plain]}" if plain in units else ""
     text = f"{plain.replace('_', ' ')} {_size(name, value):.3g}"
     if interval is None:
         return text + unit
@@ -161,11 +161,11 @@ def _warnings(advice: Advice) -> Iterator[str]:
     """What makes the advice less than it looks."""
     one, count = advice.advised, int(advice.recording.rows.sum())
     if count < FEW:
-        yield f"{count} measurements are few: of fewer than {FEW} the parameters are known badly, and so is who is best."
+        yield f"{count} measurements are few: below {FEW} the parameters are known badly, and so is who is best."
     correlation = one.correlation
     if not math.isnan(correlation.low) and not correlation.low <= 0.0 <= correlation.high:
         yield (
-            f"Successive prediction errors are correlated ({correlation.value:+.2f}): the errors of the measurements are "
+            f"Successive prediction errors are correlated ({correlation.value:+.2f}): the errors of measurements are "
             "not white, or the motion is none of the models'. The likelihood then misleads."
         )
     wide = [

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import xarray
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import catalogue
 from ..evaluation.dataset import groups_of, notes_of
@@ -26,7 +26,7 @@ from .results import (
     components_to_draw,
     select_competitors,
     settings_of,
-    thinned,
+    thin_curves,
     track_of,
     write_results,
 )
@@ -83,8 +83,8 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         horizon: measurements of an episode.
     """
     known = problem.baselines
-    tuned = problem.tuned if full or horizon <= LONG else []
-    learned = shipped_agents(problem.id)
+    tuned = problem.tuned_policies if full or horizon <= LONG else []
+    learned = pretrained_agents(problem.id)
     if full:
         everything = (*known.policies, *known.estimators, *tuned, *learned, *known.references, *known.bounds)
     else:
@@ -151,7 +151,7 @@ def result_of(
         {name: knows[name] for name in names if name in knows},
         notes_of(dataset),
         records,
-        thinned(curves.sel(policy=shown)),
+        thin_curves(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
     )
 
@@ -210,20 +210,20 @@ def run_benchmark(
         )
         everyone = evaluation_requests(cell.problem, experiment, cell.policies)
         asked += [(one, i) for one in everyone]
-    told = 0
+    finished_cells = 0
 
     def settle(i: int) -> None:
         """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
-        nonlocal told
+        nonlocal finished_cells
         cell = wanted[i]
         if len(found[i]) == len(cell.policies):
             everyone = [found[i].pop(name) for name in cell.policies]
             records, curves, head = combine_summaries(everyone)
             drawn(cell, curves)
-            results[i] = result_of(cell.problem, head, records, curves, shipped_agents(cell.environment))
-        while told < len(results) and (due := results[told]) is not None:
+            results[i] = result_of(cell.problem, head, records, curves, pretrained_agents(cell.environment))
+        while finished_cells < len(results) and (due := results[finished_cells]) is not None:
             finished(due)
-            told += 1
+            finished_cells += 1
 
     workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end

@@ -4,7 +4,7 @@ import hashlib
 import json
 
 from ..agents.learned_policy import pretrained_path
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import short_name
 from ..evaluation.evaluate import Experiment
@@ -40,8 +40,8 @@ def meaning_of(problem: Problem, name: str) -> str | None:
     """
     if problem.name != problem.id:
         return None
-    if name in problem.tuned:
+    if name in problem.tuned_policies:
         return json.dumps(problem.tuned_values.values(name.removesuffix("-tuned"))[0])
-    if name in shipped_agents(problem.id):
+    if name in pretrained_agents(problem.id):
         return hashlib.sha256(pretrained_path(problem.id, name).read_bytes()).hexdigest()
     return name if name in problem.baselines.names else None
