@@ -100,12 +100,14 @@ class Advice(NamedTuple):
     share: Share
     competitors: list[Competitor]
     """The advised one first, then by their log-likelihood."""
+    fitted: Competitor
+    """The one of the fitted ones that would be advised."""
     best_shipped: str
     """Of smallest judged error, or prediction error where there is no truth."""
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
     intervals: dict[str, Interval]
-    """Of the advised one's parameters; empty where it is shipped."""
+    """Of the parameters of ``fitted``."""
 
     @property
     def advised(self) -> Competitor:
@@ -163,28 +165,29 @@ def advise(
     dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
     judged = _Judged(dataset, task, share)
     competitors, best = judged.competitors({name: len(found.values) for name, found in fits.items()})
-    advised = _likeliest(competitors)
     progress("computing intervals", 0.9)
-    intervals = {}
-    if advised.fitted:
-        name, tunable = advised.name, tunables[advised.name]
-        if share.apart:
-            windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
-            begin = dataclasses.replace(tunable, start=fits[name].values)
-            likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
-            fits[name] = fit(likelihoods[name], begin, seed, starts=1)
-            makers = {name: tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
-            dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-            again, _ = _Judged(dataset, task, share).competitors({name: advised.parameters})
-            refitted = next(c for c in again if c.name == name)
-            advised = refitted._replace(log_likelihood=advised.log_likelihood)
-        intervals = profile_intervals(likelihoods[name], tunable, fits[name])
+    chosen = _likeliest([c for c in competitors if c.fitted])
+    name, tunable = chosen.name, tunables[chosen.name]
+    if share.apart:  # to all that does not judge
+        windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
+        begin = dataclasses.replace(tunable, start=fits[name].values)
+        likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
+        fits[name] = fit(likelihoods[name], begin, seed, starts=1)
+        makers = {name: tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
+        dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
+        again, _ = _Judged(dataset, task, share).competitors({name: chosen.parameters})
+        refitted = next(c for c in again if c.name == name)
+        refitted = refitted._replace(log_likelihood=chosen.log_likelihood)
+        competitors = [refitted if c.name == name else c for c in competitors]
+        chosen = refitted
+    intervals = profile_intervals(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
+    advised = _likeliest(competitors)
     others = sorted(
-        (c for c in competitors if c.name != advised.name),
+        (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
     )
-    return Advice(recording, share, [advised, *others], best, fits, tunables, intervals)
+    return Advice(recording, share, [advised, *others], chosen, best, fits, tunables, intervals)
 
 
 class _Judged:

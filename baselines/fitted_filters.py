@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from ..evaluation.files import write_text
 from ..evaluation.stored import fits, read_json
 from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
 from .problem import Problem
-from .table import Tunable
+from .table import Tunable, tunable
 from .tuned_values import TunedPolicy, round_value, tuned_policy
 
 SUFFIX = ".filter.json"
@@ -27,6 +28,32 @@ def families_of(problem: Problem, recording: Any = None) -> dict[str, Tunable]:
     if known.log_families is not None:
         return dict(known.log_families(recording))
     return {name: tunable for name, tunable in known.tunable.items() if tunable.control is None}
+
+
+def own_family(name: str, cls: Any) -> Tunable:
+    """Return what can be fitted in an estimator of a user's own.
+
+    Args:
+        name: of it, in errors.
+        cls: its class, with an attribute ``parameters``: by the name of each keyword lower limit, value in force and
+            upper limit. What is named ``log10_...`` is the logarithm of the keyword. Where ``lane_parameters`` is true,
+            values may be arrays ``(N,)``, and candidates run side by side.
+
+    Raises:
+        ValueError: if it has none, or values that are no limits.
+    """
+    declared = getattr(cls, "parameters", None)
+    if not (isinstance(cls, type) and isinstance(declared, Mapping) and declared):
+        raise ValueError(
+            f"{name!r} has nothing to fit: give its class an attribute parameters, such as "
+            "{'acceleration': (0.01, 1.0, 10.0)}: lower limit, value in force, upper limit"
+        )
+    for key, limits in declared.items():
+        if not (isinstance(limits, tuple) and len(limits) == 3 and limits[0] <= limits[1] <= limits[2]):
+            raise ValueError(
+                f"{name!r}: {key} needs lower limit, value in force and upper limit, in this order, got {limits!r}"
+            )
+    return replace(tunable(cls, **declared), in_lanes=bool(getattr(cls, "lane_parameters", False)))
 
 
 def write_fitted(
@@ -77,16 +104,16 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
     families = families_of(problem)
     if table["filter"] not in families:
         raise ValueError(f"{path}: {problem.id} has no filter {table['filter']!r} that can be fitted")
-    tunable = families[table["filter"]]
+    family = families[table["filter"]]
     values = table["values"]
     if NOISE_SCALE in values:
         log_format = problem.task.log_format
         if log_format is None or log_format.scale_noise is None:
             raise ValueError(f"{path}: measurements of {problem.id} state no deviations that could be scaled")
-        tunable = with_noise_scale(tunable, log_format.scale_noise)
-    if values.keys() != tunable.limits.keys():
+        family = with_noise_scale(family, log_format.scale_noise)
+    if values.keys() != family.limits.keys():
         raise ValueError(
-            f"{path} must give {table['filter']!r} a number for each of {', '.join(tunable.limits)}, got "
+            f"{path} must give {table['filter']!r} a number for each of {', '.join(family.limits)}, got "
             f"{', '.join(values)}"
         )
-    return tuned_policy(f"{problem.id} fitted {table['filter']}", tunable, values)
+    return tuned_policy(f"{problem.id} fitted {table['filter']}", family, values)

@@ -7,17 +7,14 @@ import typer
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise
-from ..baselines.fitted_filters import SUFFIX, write_fitted
+from ..baselines.fitted_filters import SUFFIX, own_family, write_fitted
 from ..baselines.problem import problem_of
 from ..envs.catalogue import check_names, read_recording
-from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.files import writable_file
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table
+from .evaluation import find_names
 from .terminal import command_line, console, pair, parse_settings, progress_bar
-
-NOT_COMPARED = ("random",)
-"""Who does not stand beside filters for a log."""
 
 
 def advise_on_log(
@@ -34,6 +31,12 @@ def advise_on_log(
         Path | None,
         typer.Option(
             help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
+        ),
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Estimator of your own, module:Class, whose attribute parameters gives limits; repeat for several."
         ),
     ] = None,
     settings: Annotated[
@@ -58,15 +61,15 @@ def advise_on_log(
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
     learned = list(pretrained_agents(problem.id))
-    names = [*problem.baselines.policies, *problem.baselines.estimators, *problem.tuned_policies, *learned]
-    shipped = {name: find_competitor(problem, name) for name in names if name not in NOT_COMPARED}
-    shipped = {name: maker for name, maker in shipped.items() if kind_of(maker) in RANKED}
+    shipped = {name: find_competitor(problem, name) for name in find_names(problem, found, None)}
+    own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)
         advice = advise(
             problem,
             found,
             shipped,
+            own,
             noise=noise,
             seed=seed,
             progress=lambda what, share: bar.update(line, description=what, completed=share),
@@ -77,14 +80,9 @@ def advise_on_log(
     console.print(advice_table(advice, learned))
     for sentence in advice_lines(advice, learned):
         console.print(sentence, highlight=False, soft_wrap=True)
-    advised = advice.advised
-    if out is not None and not advised.fitted:
+    if out is not None:
+        name = advice.fitted.name
+        write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
         console.print(
-            f"{out} is not written: {advised.name} is shipped, --policy {advised.name} runs it",
-            soft_wrap=True,
-        )
-    elif out is not None:
-        write_fitted(out, problem, advised.name, advice.fits[advised.name], advice.intervals, command_line())
-        console.print(
-            f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
+            f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
         )

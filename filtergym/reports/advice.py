@@ -78,12 +78,14 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
         advice: of :func:`~..baselines.advice.advise`.
         learned: names of shipped agents.
     """
-    one = advice.advised
+    one = advice.fitted
     yield _verdict(advice)
-    if one.fitted:
-        tunable, found = advice.tunables[one.name], advice.fits[one.name]
-        for name, value in found.values.items():
-            yield f"  {_parameter(name, value, advice.intervals.get(name), tunable.units)}"
+    if one is not advice.advised:
+        lag = advice.advised.log_likelihood - one.log_likelihood
+        yield f"Of what was fitted {one.name} comes closest, {lag:.3f} nats per measurement behind, with"
+    tunable, found = advice.tunables[one.name], advice.fits[one.name]
+    for name, value in found.values.items():
+        yield f"  {_parameter(name, value, advice.intervals.get(name), tunable.units)}"
     yield from _noise(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
@@ -143,8 +145,8 @@ def _parameter(name: str, value: float, interval: Interval | None, units: Mappin
 
 def _noise(advice: Advice) -> Iterator[str]:
     """What the scale of the noise says, and what it does not."""
-    one = advice.advised
-    if one.fitted and NOISE_SCALE in advice.fits[one.name].values:
+    one = advice.fitted
+    if NOISE_SCALE in advice.fits[one.name].values:
         scale = 10.0 ** advice.fits[one.name].values[NOISE_SCALE]
         yield (
             f"The measurements' errors are {scale:.2f} times as large as stated, if they are white: errors that last "
