@@ -11,7 +11,7 @@ from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
-from .envs.catalogue import imported, make_task, nearest
+from .envs.catalogue import imported, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
@@ -109,11 +109,11 @@ def evaluate(
         progress: called with the number of measurements done, now and then.
         trust: load models' zips, which can execute code.
         **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes``, ``strict``
-            and ``workers``, see :func:`.evaluation.evaluate.evaluate`.
+            of :class:`.evaluation.evaluate.Experiment`, and ``workers`` of :func:`.evaluation.evaluate.run_experiment`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
-        :func:`.evaluation.evaluate.evaluate`.
+        :func:`.evaluation.evaluate.run_experiment`.
 
     Raises:
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
@@ -121,7 +121,7 @@ def evaluate(
     """
     problem = import_problem(env)
     objects = competitors_of(problem, competitors, trust)
-    return problem.evaluate(objects, scenario, episodes, seed, split, control, progress, **keywords)
+    return problem.evaluate(objects, scenario, episodes, seed, split, control, progress=progress, **keywords)
 
 
 def competitors_of(
@@ -173,9 +173,8 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
-    task = make_task(problem.task, experiment.scenario, **experiment.keywords)
-    own = problem.baselines.metrics
-    return [EvaluationRequest(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
+    own, horizon = problem.baselines.metrics, experiment.make_task().horizon
+    return [EvaluationRequest(experiment, name, maker, own, horizon) for name, maker in makers.items()]
 
 
 def make_policy(

@@ -402,5 +402,5 @@ def animate(
             out / f"{problem.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
         )
         maker = find_competitor(problem, name, trust)
-        write_animation(episode_frames(problem.id, name, maker, scenario, seed, every), path)
+        write_animation(episode_frames(problem.task, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

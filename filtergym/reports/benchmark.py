@@ -230,7 +230,7 @@ def run_benchmark(
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
-    work = [work_of(one) for one, _ in asked]
+    work = [work_of(wanted[i].problem, one) for one, i in asked]
     for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
         one, i = asked[k]
         found[i][one.name] = summary
