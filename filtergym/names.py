@@ -11,13 +11,14 @@ from .agents.gate import gated
 from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
-from .envs.catalogue import imported, nearest
+from .envs.catalogue import import_task, imported, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
+from .envs.recording import Recording
 from .evaluation import metrics
 from .evaluation.competitors import check_competitor, kind_of, made
 from .evaluation.evaluate import Experiment, check_observation, control_of
 from .evaluation.metrics import Record
-from .evaluation.recording import record as record
+from .evaluation.recording import record_experiment
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
 from .evaluation.summary import EvaluationRequest
@@ -122,6 +123,41 @@ def evaluate(
     problem = import_problem(env)
     objects = competitors_of(problem, competitors, trust)
     return problem.evaluate(objects, scenario, episodes, seed, split, control, progress=progress, **keywords)
+
+
+def record(
+    env: str,
+    scenario: Any = None,
+    episodes: int = 10,
+    seed: int = 0,
+    split: str = "test",
+    progress: Progress | None = None,
+    *,
+    backend: str = "auto",
+    **keywords: Any,
+) -> Recording:
+    """Record what the sensors say in episodes of the simulation, and the truth.
+
+    They are the episodes that an evaluation of the same scenario, seed and split flies. Replayed on the same backend,
+    observations, estimates and costs are the same, bit for bit.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        scenario: name of a scenario, a trajectory, or flights; default: the environment's training distribution.
+        episodes: how many.
+        seed: number of the experiment.
+        split: "test" (default), "validation" or "train".
+        progress: called with the number of measurements done, now and then.
+        backend: what computes the steps, "auto", "compiled" or "numpy".
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
+    """
+    task = import_task(env)
+    return record_experiment(
+        Experiment(task, scenario, episodes, seed, split, backend=backend, keywords=keywords), progress
+    )
 
 
 def competitors_of(

@@ -20,7 +20,7 @@ from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
-from ..evaluation.recording import record
+from ..evaluation.recording import record_experiment
 from ..names import find_competitor, is_learned
 from ..offline import default_policies, write_datasets
 from ..reports.benchmark import Cell, all_records, run_benchmark
@@ -208,24 +208,15 @@ def record_scenario(
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
-    cls = task_class(environment)
-    keywords = parse_settings(settings or [])
-    check_names(cls, keywords)
+    problem, keywords = problem_of(environment), parse_settings(settings or [])
+    check_names(problem.task, keywords)
     if out.suffix != ".nc":
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
     writable_file(out)
+    experiment = problem.experiment(scenario, episodes, seed, split, backend=backend, keywords=keywords)
     with progress_bar() as bar:
-        line = bar.add_task("recording", total=episodes * make_task(cls, scenario, **keywords).horizon)
-        recording = record(
-            cls.id,
-            scenario,
-            episodes,
-            seed,
-            split,
-            progress=lambda done: bar.update(line, advance=done),
-            backend=backend,
-            **keywords,
-        )
+        line = bar.add_task("recording", total=episodes * experiment.make_task().horizon)
+        recording = record_experiment(experiment, lambda done: bar.update(line, advance=done))
     with whole_file(out) as waiting:
         recording.write(waiting)
     console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
