@@ -22,9 +22,9 @@ from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .competitors import RANKED, Kind, kind_of
-from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
+from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers, check_workers
-from .rollout import Progress, run_competitor
+from .rollout import Progress, Series, rollout
 from .seeds import episode_seeds
 from .threads import one_thread
 
@@ -271,25 +271,61 @@ class Piece(NamedTuple):
         return len(self.seeds) * self.horizon
 
 
+LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
+"""What few estimators and references say: how likely a measurement was."""
+
+
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``."""
-    experiment = piece.experiment
+    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``.
+
+    Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
+    """
+    experiment, kind, count = piece.experiment, piece.kind, len(piece.seeds)
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     drawn = experiment.drawn_episodes - piece.first
-    found: dict[str, numpy.ndarray] = run_competitor(
-        model,
-        piece.maker,
-        piece.kind,
-        piece.seeds,
-        _limits if piece.kind == "bound" else _report(model, experiment.tracks, drawn > 0),
-        tick,
-        piece.name,
-        piece.first,
-        actions=True,
-        only={DRAWN: drawn},
-        strict=experiment.strict,
-    )
-    return found
+    report = _limits if kind == "bound" else _report(model, experiment.tracks, drawn > 0)
+    boxed = kind == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
+    series = Series(count, {DRAWN: drawn})
+    steps = rollout(model, piece.maker, piece.seeds, report, kind=kind, name=piece.name)
+    for step, (found, action) in enumerate(steps, 1):
+        if kind == "policy":
+            _check_reserved(model, found)
+        if experiment.strict and "lost" in found:
+            _refuse_losses(piece, found["lost"][:count], step)
+        series.add(found)
+        if boxed:
+            series.add({"action": _applied(model.action_space, action, count)})
+        tick(count)
+    arrays = series.arrays()
+    if kind in ("estimator", "reference"):
+        for name in LIKELIHOOD:
+            if name in arrays and numpy.isnan(arrays[name]).all():
+                del arrays[name]
+    return arrays
+
+
+def _applied(box: Any, action: Any, count: int) -> numpy.ndarray:
+    """Return the actions that are applied, within the limits of their box, ``(A, count)``."""
+    bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
+    return bounded.reshape(count, -1).T
+
+
+def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
+    """Raise ValueError if a task records something under a name that the evaluation of a policy needs."""
+    for taken in {"action", "lost"} & found.keys():
+        raise ValueError(
+            f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
+            "which actions were applied or episodes lost: call it something else"
+        )
+
+
+def _refuse_losses(piece: Piece, faults: numpy.ndarray, step: int) -> None:
+    """Raise ValueError if an episode is lost at a measurement."""
+    if faults.any():
+        i = int(numpy.argmax(faults > 0.0))
+        raise ValueError(
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i]) - 1]} in episode {piece.first + i} at measurement {step}"
+        )
 
 
 def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
