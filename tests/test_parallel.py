@@ -156,7 +156,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     )]  # fmt: skip
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
     for folder, workers in (("one", None), ("two", two)):
-        benchmark.run_benchmark(tmp_path / folder, False, 0, workers=workers)
+        benchmark.run_benchmark(tmp_path / folder, benchmark.BenchmarkOptions(), workers=workers)
     assert (tmp_path / "one/results.json").read_bytes() == (tmp_path / "two/results.json").read_bytes()
 
 

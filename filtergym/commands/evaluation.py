@@ -12,7 +12,6 @@ from ..envs.catalogue import read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
-from ..envs.task import Task
 from ..evaluation.competitors import RANKED, kind_of
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
@@ -170,7 +169,6 @@ class Outcome(NamedTuple):
 
 def run(
     problem: Problem,
-    task: Task,
     experiment: Experiment,
     names: Sequence[str],
     outputs: Outputs,
@@ -183,13 +181,13 @@ def run(
 
     Args:
         problem: whose they are.
-        task: with the data.
         experiment: over what they run.
         names: of competitors.
         outputs: what will be written.
         workers: who share the work.
         trust: load models that can execute code.
     """
+    task = experiment.make_task()
     measurements = len(set(names)) * experiment.episodes * task.horizon
     size = measurements * len(task.components) * 8
     refusal = _size_warning(size, size, outputs.netcdf)

@@ -1,7 +1,7 @@
 """Commands that measure: what there is, and how it compares on the same noise."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 import xarray
@@ -21,9 +21,10 @@ from ..evaluation.files import whole_file, whole_files, writable_file, writable_
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record_experiment
+from ..evaluation.rollout import Progress
 from ..names import find_competitor, is_learned
 from ..offline import default_policies, write_datasets
-from ..reports.benchmark import Cell, all_records, run_benchmark
+from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
@@ -186,9 +187,8 @@ def evaluate_policies(
         strict=strict,
         keywords=keywords,
     )
-    task = make_task(problem.task, data, **keywords)
     with Workers(jobs, cluster) as workers:
-        outcome = run(problem, task, experiment, names, outputs, workers, trust)
+        outcome = run(problem, experiment, names, outputs, workers, trust)
     write(problem, outcome, outputs, learned)
 
 
@@ -325,9 +325,10 @@ def benchmark(
     """
     formats = check_formats(format or [])
     check_columns(columns)
+    options = BenchmarkOptions(full, seed, environment or (), split, backend, threads, command_line())
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
-        def started(total: int) -> Any:
+        def started(total: int) -> Progress:
             line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
@@ -336,29 +337,12 @@ def benchmark(
                 print_results(result.records, result.knows)
 
         def drawn(cell: Cell, curves: xarray.Dataset) -> None:
-            figures = (
-                evaluation_figures(curves, columns, learned=shipped_agents(cell.environment))
-                if formats
-                else ()
-            )
-            for name, figure in figures:
+            learned = shipped_agents(cell.environment)
+            for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
-        results = run_benchmark(
-            out,
-            full,
-            seed,
-            environment or (),
-            split,
-            started,
-            finished,
-            drawn,
-            backend=backend,
-            threads=threads,
-            command=command_line(),
-            workers=workers,
-        )
+        results = run_benchmark(out, options, Callbacks(started, finished, drawn), workers)
     tables = [headline_table(results)]
     tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
     with whole_files(out) as waiting:
@@ -366,7 +350,7 @@ def benchmark(
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
     print_verdict(results)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    make_report(results, settings_of(command_line()), out / REPORT)
+    make_report(results, settings_of(options.command), out / REPORT)
 
 
 def animate(
