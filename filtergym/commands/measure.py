@@ -8,13 +8,7 @@ import xarray
 
 from ..agents.named_policies import shipped_agents
 from ..baselines.problem import problem_of
-from ..envs.catalogue import (
-    catalogue,
-    check_names,
-    make_task,
-    parameter_names,
-    task_class,
-)
+from ..envs.catalogue import catalogue, check_names
 from ..envs.recording import Recording
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
@@ -23,7 +17,7 @@ from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.recording import record_experiment
 from ..evaluation.rollout import Progress
 from ..names import find_competitor, is_learned
-from ..offline import default_policies, write_datasets
+from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
@@ -263,28 +257,12 @@ def write_offline(
 
     Example: filtergym offline filtergym/ManeuveringTarget-v0 --policy imm --policy random --episodes 500
     """
-    cls = task_class(environment)
-    keywords = parse_settings(settings or [])
-    policies = policy or default_policies(cls.id, control)
-    known = parameter_names(cls)
-    task = make_task(cls, scenario, **{n: value for n, value in keywords.items() if n in known})
+    problem, keywords = problem_of(environment), parse_settings(settings or [])
+    experiment = problem.experiment(scenario, episodes, seed, split, control, keywords=keywords)
+    plan = plan_datasets(problem, experiment, policy, trust)
     with progress_bar() as bar:
-        total = len(policies) * episodes * (task.horizon // task.decision_interval)
-        line = bar.add_task("recording", total=total)
-        written = write_datasets(
-            cls.id,
-            policies,
-            scenario,
-            control,
-            episodes,
-            seed,
-            split,
-            out,
-            namespace,
-            progress=lambda done: bar.update(line, advance=done),
-            trust=trust,
-            **keywords,
-        )
+        line = bar.add_task("recording", total=plan.decisions)
+        written = plan.write(out, namespace, lambda done: bar.update(line, advance=done))
     console.print(datasets_table(written))
     place = f", with MINARI_DATASETS_PATH={out}" if out is not None else ""
     console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
