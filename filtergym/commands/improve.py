@@ -22,6 +22,7 @@ from .terminal import (
     Cluster,
     Environment,
     Jobs,
+    TrainedControl,
     TrainingScenario,
     Trust,
     complete_policy,
@@ -73,9 +74,7 @@ def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
     algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt or kalman-net.")] = "ppo",
-    control: Annotated[
-        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
-    ] = None,
+    control: TrainedControl = None,
     scenario: TrainingScenario = None,
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
     envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
@@ -181,9 +180,7 @@ def search(
     trials: Annotated[int, typer.Option(help="In all, those before an interruption included.")] = 50,
     steps: Annotated[int, typer.Option(help="Environment steps of each run.")] = 100_000,
     seeds: Annotated[str, typer.Option(help="Training seeds of every trial, such as 0-2.")] = "0",
-    control: Annotated[
-        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
-    ] = None,
+    control: TrainedControl = None,
     scenario: TrainingScenario = None,
     seed: Annotated[int, typer.Option(help="Of what is drawn to be tried.")] = 0,
     set_: Annotated[

@@ -30,11 +30,13 @@ from .terminal import (
     Backend,
     Cluster,
     Columns,
+    Control,
     Environment,
     Episodes,
     Experiment,
     Formats,
     Jobs,
+    Parameters,
     ScenarioName,
     Split,
     Threads,
@@ -90,13 +92,11 @@ def evaluate_policies(
         ),
     ] = None,
     scenario: ScenarioName = None,
-    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    control: Control = None,
     episodes: Episodes = 500,
     seed: Experiment = 0,
     split: Split = "test",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
-    ] = None,
+    settings: Parameters = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for records, a table, the whole result and figures.")
     ] = None,
@@ -193,9 +193,7 @@ def record_scenario(
     episodes: Annotated[int, typer.Option(help="Episodes to record.")] = 10,
     seed: Experiment = 0,
     split: Split = "test",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
-    ] = None,
+    settings: Parameters = None,
     backend: Backend = "auto",
 ) -> None:
     """Record what the sensors say in episodes of the simulation, with the truth.
@@ -227,7 +225,7 @@ def write_offline(
         ),
     ] = None,
     scenario: ScenarioName = None,
-    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    control: Control = None,
     episodes: Annotated[int, typer.Option(help="Episodes in each data set.")] = 1000,
     seed: Experiment = 0,
     split: Annotated[
