@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ from .evaluation.rollout import Progress
 from .evaluation.seeds import episode_seeds
 from .evaluation.stepping import SteppingPolicy
 from .evaluation.transitions import Transitions, transitions_of
-from .names import find_competitor, make_policy
+from .names import find_competitor, find_policy
 
 CHUNK = 256
 """Episodes flown side by side, and held in memory until they are written."""
@@ -214,7 +215,8 @@ def plan_datasets(
         before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust)) else None
         own = before.control if before is not None and control is None else control
         theirs = {} if before is None else before.task_keywords
-        acting.append(make_policy(cls.id, policy, own, scenario, trust=trust, **{**theirs, **parameters}))
+        fitting = replace(experiment, control=own, keywords={**theirs, **parameters})
+        acting.append(find_policy(problem, policy, fitting, trust))
     return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], of_the_face)
 
 
