@@ -80,4 +80,4 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
                 )
             if kind not in RANKED and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
-    ADDED[task.id] = table
+    USER_BASELINES[task.id] = table

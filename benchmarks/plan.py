@@ -49,7 +49,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
-from filtergym.evaluation.curves import DISTRIBUTED
+from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds

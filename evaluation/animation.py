@@ -9,7 +9,7 @@ from PIL import Image
 from ..envs.environment import TaskEnv
 from ..envs.parameters import check_integer
 from ..envs.task import Task
-from .competitors import kind_of, made
+from .competitors import kind_of, make_competitor
 from .evaluate import control_of
 from .files import whole_file
 from .stepping import SteppingPolicy

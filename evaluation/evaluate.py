@@ -13,7 +13,7 @@ import numpy
 import xarray
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, opened, task_class
+from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, read_files, task_class
 from ..envs.compiled import Report
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
@@ -288,7 +288,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     drawn = experiment.drawn_episodes - piece.first
     report = _limits if kind == "bound" else _report(model, experiment.tracks, drawn > 0)
     boxed = kind == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
-    series = Series(count, {DRAWN: drawn})
+    series = Series(count, {DRAWN_PREFIX: drawn})
     steps = rollout(model, piece.maker, piece.seeds, report, kind=kind, name=piece.name)
     for step, (found, action) in enumerate(steps, 1):
         if kind == "policy":
@@ -403,7 +403,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     cls = experiment.task
     experiment = replace(
         experiment,
-        scenario=opened(cls, experiment.scenario),
+        scenario=read_files(cls, experiment.scenario),
         drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
     )
     if experiment.tracks and experiment.drawn_episodes:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, make_task, opened
+from ..envs.catalogue import find_scenario, make_task, read_files
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
@@ -52,7 +52,7 @@ def record_experiment(experiment: Experiment, progress: Progress | None = None) 
     """
     cls, split, seed, episodes = experiment.task, experiment.split, experiment.seed, experiment.episodes
     seeds = episode_seeds(split, seed, episodes)
-    chosen = find_scenario(cls, opened(cls, experiment.scenario), experiment.keywords)
+    chosen = find_scenario(cls, read_files(cls, experiment.scenario), experiment.keywords)
     if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
     plain = make_task(cls, chosen, **experiment.keywords)

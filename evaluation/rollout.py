@@ -9,7 +9,7 @@ from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Kind, check_competitor, kind_of, made
+from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .filters import put_in_loop
 from .stepping import SteppingPolicy
 

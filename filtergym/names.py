@@ -11,7 +11,7 @@ from .agents.gate import add_gate
 from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
-from .envs.catalogue import import_task, imported, nearest
+from .envs.catalogue import import_task, import_user_module, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
 from .envs.model import Model
 from .envs.recording import Recording
@@ -298,7 +298,7 @@ def _stepping(
     name: str, maker: Any, model: Model, scenario: Any, keywords: Mapping[str, Any]
 ) -> SteppingPolicy:
     check_observation(model, maker, name)
-    policy = check_competitor(name, made(maker, model), "policy")
+    policy = check_competitor(name, make_competitor(maker, model), "policy")
     return SteppingPolicy(model, policy, scenario, keywords)
 
 

@@ -16,7 +16,7 @@ from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store
-from ..reports.tables import tuned_table
+from ..reports.tables import tuning_table
 from .terminal import (
     Backend,
     Cluster,
@@ -169,7 +169,7 @@ def train(
         opened = open_runs(problem, options, session, whole_numbers("--seeds", seeds))
     with Workers(jobs, cluster) as workers:
         runs = train_runs(opened, trainer, workers)
-    if compare and all(run.finished for run in runs):  # unless somebody wished to stop
+    if compare and all(run.is_complete for run in runs):  # unless somebody wished to stop
         print_standing(opened, runs)
 
 

@@ -313,7 +313,7 @@ def benchmark(
                 print_results(result.records, result.knows)
 
         def drawn(cell: Cell, curves: xarray.Dataset) -> None:
-            learned = shipped_agents(cell.environment)
+            learned = pretrained_agents(cell.environment)
             for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")

@@ -84,7 +84,7 @@ def open_runs(
         begun = training_run.holds_run(folder)
         asked = training_run.new_run(problem, replace(options, seed=seed))
         run = training_run.open_run(folder, asked, begun)
-        if begun and not run.finished and options.algorithm not in THROUGH_THE_FILTER:
+        if begun and not run.is_complete and options.algorithm not in THROUGH_THE_FILTER:
             training_run.check_trust(
                 f"{folder} goes on from a checkpoint that is loaded with pickle", session.trust
             )
@@ -107,7 +107,7 @@ def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -
     """
     waiting = []
     for training in opened:
-        if training.session.resume and training.run.finished:
+        if training.session.resume and training.run.is_complete:
             console.print(f"{training.folder} is finished: {training.run.steps_done:,} steps")
         else:
             waiting.append(training)
@@ -122,7 +122,7 @@ def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
     """Train in this process, up to a wish to stop; the runs say what has become of them."""
     for training in waiting:
         _train_here(training, trainer)
-        if not training.run.finished:
+        if not training.run.is_complete:
             return
 
 

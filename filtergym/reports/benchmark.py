@@ -221,7 +221,7 @@ class _Results:
         if len(found) == len(cell.policies):
             records, curves, head = combine_summaries([found.pop(name) for name in cell.policies])
             self.callbacks.drawn(cell, curves)
-            learned = shipped_agents(cell.environment)
+            learned = pretrained_agents(cell.environment)
             self._results[i] = result_of(cell.problem, head, records, curves, learned)
         while self._told < len(self._results) and (due := self._results[self._told]) is not None:
             self.callbacks.finished(due)

@@ -4,7 +4,7 @@ import hashlib
 import json
 
 from ..agents.learned_policy import pretrained_path
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem
 from ..envs.catalogue import short_name
 from ..evaluation.evaluate import Experiment
