@@ -10,7 +10,9 @@ import xarray
 
 from ..envs.catalogue import import_task, importable_name, nearest, short_name, task_class
 from ..envs.task import Task
-from ..evaluation.evaluate import Experiment, evaluate
+from ..evaluation.evaluate import OPTIONS, Experiment, run_experiment
+from ..evaluation.parallel import Workers
+from ..evaluation.rollout import Progress
 from .catalogue import baselines_of, package_of
 from .table import Baselines
 from .tuned_values import TunedValues, table_path
@@ -102,24 +104,33 @@ class Problem:
         """Return an experiment on it, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            *arguments: what follows the environment in :class:`.evaluation.evaluate.Experiment`.
+            *arguments: what follows the task in :class:`.evaluation.evaluate.Experiment`.
             **fields: likewise.
         """
         known = self.baselines
-        experiment = Experiment(self.name, *arguments, **fields)
+        experiment = Experiment(self.task, *arguments, **fields)
         return replace(experiment, paper=known.score_paper, reference=known.score_reference)
 
-    def evaluate(self, competitors: Mapping[str, Any], *arguments: Any, **keywords: Any) -> xarray.Dataset:
+    def evaluate(
+        self,
+        competitors: Mapping[str, Any],
+        *arguments: Any,
+        progress: Progress | None = None,
+        workers: Workers | None = None,
+        **keywords: Any,
+    ) -> xarray.Dataset:
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            competitors: by their names, as of :func:`.evaluation.evaluate.evaluate`.
-            *arguments: what follows them there.
-            **keywords: likewise.
+            competitors: by their names, as of :func:`.evaluation.evaluate.run_experiment`.
+            *arguments: of :meth:`experiment`.
+            progress: as of :func:`.evaluation.evaluate.run_experiment`.
+            workers: likewise.
+            **keywords: of :meth:`experiment` what :data:`.evaluation.evaluate.OPTIONS` names; parameters of the task.
         """
-        known = self.baselines
-        keywords |= {"paper": known.score_paper, "reference": known.score_reference}
-        return evaluate(self.name, competitors, *arguments, **keywords)
+        options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
+        experiment = self.experiment(*arguments, **options, keywords=keywords)
+        return run_experiment(experiment, competitors, progress, workers)
 
 
 def problem_of(id: str) -> Problem:

@@ -50,7 +50,6 @@ from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
-from filtergym.evaluation.evaluate import Experiment
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
@@ -491,7 +490,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(EvaluationRequest(Experiment("", episodes=episodes), "", None).pieces())
+        pieces = len(EvaluationRequest(problem_of(id).experiment(episodes=episodes), "", None).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(

@@ -329,17 +329,16 @@ def read_recording(
     several = list(path) if isinstance(path, list | tuple) else [path]
     if not several:
         raise ValueError("name at least one file of recordings, got none")
-    if environment is not None:
-        environment = import_task(environment).id
-        check_names(task_class(environment), keywords)
+    cls = None if environment is None else import_task(environment)
+    if cls is not None:
+        check_names(cls, keywords)
     files = [file for one in several for file in files_of(one)]
     found: list[Recording] = []
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(
-                _read_recording(file, found[0].environment if found else environment, speeds, keywords)
-            )
+            found.append(_read_recording(file, cls, speeds, keywords))
+            cls = cls or task_class(found[0].environment)
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
             if len(files) == 1:
@@ -355,7 +354,7 @@ def read_recording(
 
 
 def _read_recording(
-    file: Path, environment: str | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
+    file: Path, cls: type[Task] | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
 ) -> Recording:
     """Read one file."""
     if not file.is_file():
@@ -363,14 +362,14 @@ def _read_recording(
     if file.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     if names_environment(file):
-        recording = read_netcdf(file, task_class, environment, keywords)
-    elif environment is None:
+        recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
+    elif cls is None:
         raise ValueError(
             "it does not say of which environment it is: give its id, as the argument environment or before --recording"
         )
     else:
-        recording = read_columns(file, task_class(environment), keywords)
-    task = make_task(task_class(recording.environment), recording)
+        recording = read_columns(file, cls, keywords)
+    task = make_task(cls or task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))
 

@@ -83,21 +83,13 @@ def test_identity_is_a_bank_of_kalman_filters(seed):
         z = numpy.stack([1e3 + 3000 * rng.standard_normal(N), 20 * rng.standard_normal(N)])
         step = class_fusion.advance(Q, general, general_covariance, z, MODELS, numpy.eye(3))
         general, general_covariance, Q = step.mean, step.covariance, numpy.exp(step.log_predicted)
-        column = numpy.full(N, k)
-        update = class_fusion.update_channels(
-            mean,
-            z,
-            MODELS.Phi,
-            MODELS.H,
-            channels.gain[..., column],
-            channels.whitening[..., column],
-            channels.log_normaliser[..., column],
-        )
+        scan = class_fusion.Channels(*(part[..., numpy.full(N, k)] for part in channels))
+        update = class_fusion.update_channels(mean, z, MODELS, scan)
         mean = update.mean
         P = imm.mode_posterior(imm.log_probabilities(P), update.log_likelihood)
         # The issue of both ways of computing one thing: relative 1e-12 (ranges of kilometres).
         assert general == pytest.approx(mean, rel=1e-12, abs=1e-9)
-        assert general_covariance == pytest.approx(channels.covariance[..., column], rel=1e-11)
+        assert general_covariance == pytest.approx(scan.covariance, rel=1e-11)
         assert pytest.approx(P, abs=1e-12) == Q
         assert step.log_likelihood == pytest.approx(update.log_likelihood, rel=1e-12)
         assert step.innovation == pytest.approx(update.innovation, rel=1e-11, abs=1e-11)

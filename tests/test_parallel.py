@@ -156,7 +156,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     )]  # fmt: skip
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
     for folder, workers in (("one", None), ("two", two)):
-        benchmark.run_benchmark(tmp_path / folder, False, 0, workers=workers)
+        benchmark.run_benchmark(tmp_path / folder, benchmark.BenchmarkOptions(), workers=workers)
     assert (tmp_path / "one/results.json").read_bytes() == (tmp_path / "two/results.json").read_bytes()
 
 
@@ -193,15 +193,15 @@ def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, mo
     store = Store(tmp_path / "unfinished")
 
     def read(other):
-        return store.read(work.work_of(other), Summary)
+        return store.read(work.work_of(problem_of(ENV), other), Summary)
 
-    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(asked)])
+    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)])
     assert read(asked).contender.measures == found.contender.measures
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
         assert read(asked._replace(experiment=replace(asked.experiment, **changed))) is None
     monkeypatch.setattr(TunedValues, "values", lambda self, name: ({"gain": 1.0}, ""))
     assert read(asked) is None
-    assert work.work_of(asked._replace(name="mine.py:Mine")) is None
+    assert work.work_of(problem_of(ENV), asked._replace(name="mine.py:Mine")) is None
     store.clear()
     assert not (tmp_path / "unfinished").exists()
 
@@ -231,7 +231,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     store = Store(tmp_path / "unfinished")
-    list(summaries([asked], Workers(), None, store, [work.work_of(asked)]))
+    list(summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
 
@@ -247,15 +247,15 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
     assert (search(), search()) == (1, 1)
     edit(file, " ")
-    assert (store.read(work.work_of(asked), Summary) is not None) is same
+    assert (store.read(work.work_of(problem_of(ENV), asked), Summary) is not None) is same
     assert search() == (1 if same else 2)
 
 
 def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
-    monkeypatch.setitem(registration.USER_TASKS, ENV, task_class(ENV))
-    assert work.work_of(asked) is None
+    monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
+    assert work.work_of(problem_of(ENV), asked) is None
 
 
 def test_an_error_elsewhere_is_the_same_sentence(two):

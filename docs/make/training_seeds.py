@@ -251,7 +251,7 @@ def episode_means(
     workers = check_workers(workers)
     if not workers.alone:
         for _, asked, _ in missing:
-            check_sendable(asked.experiment.environment, {asked.name: asked.maker})
+            check_sendable(asked.experiment.task, {asked.name: asked.maker})
     everyone = [asked for _, asked, _ in missing]
     for i, means in workers.run(_means_of, everyone, [asked.measurements for asked in everyone], progress):
         name, _, work = missing[i]

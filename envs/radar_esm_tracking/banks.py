@@ -199,17 +199,12 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
                 f.believed, f.mean, f.covariance, measurement.radar, models, self.class_transition
             )
         else:
-            channels, column = self.channels, xp.clip(measurement.scan, 0, self.last_scan)
+            scan = xp.clip(measurement.scan, 0, self.last_scan)
+            channels = class_fusion.Channels(*(xp.take(part, scan, axis=-1) for part in self.channels))
             mean, innovation, log_likelihood = class_fusion.update_channels(
-                f.mean,
-                measurement.radar,
-                models.Phi,
-                models.H,
-                xp.take(channels.gain, column, axis=-1),
-                xp.take(channels.whitening, column, axis=-1),
-                xp.take(channels.log_normaliser, column, axis=-1),
+                f.mean, measurement.radar, models, channels
             )
-            covariance = xp.take(channels.covariance, column, axis=-1)
+            covariance = channels.covariance
             log_predicted = imm.log_probabilities(f.believed) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
         used, used_counts, refused_counts = self._count_decisions(

@@ -114,6 +114,13 @@ Trust = Annotated[
         "--trust", help="Load files and modules that can execute code: you made them, or know who did."
     ),
 ]
+Control = Annotated[str | None, typer.Option(help="Demand this control.")]
+TrainedControl = Annotated[
+    str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+]
+Parameters = Annotated[
+    list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+]
 Backend = Annotated[
     str,
     typer.Option(
