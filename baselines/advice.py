@@ -140,20 +140,16 @@ def advise(
     Raises:
         ValueError: if nothing can be fitted, or the recording is too short.
     """
-    cls = problem.task
-    scenario = recording.scenario(cls, keywords)
-    task = make_task(cls, None, **{**scenario.parameters, **keywords, "horizon": 1})
-    share = share_out(recording)
+    task, share = _task(problem, recording, keywords), share_out(recording)
     families = {**families_of(problem, recording), **(own or {})}
-    scaled = cls.log_format.scale_noise if noise and cls.log_format is not None else None
     windows = cut_windows(recording, task, share.fitted, share.warm_up)
     fits: dict[str, Fit] = {}
     tunables: dict[str, Tunable] = {}
     likelihoods: dict[str, WindowLikelihood] = {}
     for i, (name, family) in enumerate(families.items()):
         progress(f"fitting {name}", 0.6 * i / len(families))
-        tunable = family if scaled is None else with_noise_scale(family, scaled)
-        likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, family.in_lanes)
+        tunable = _with_noise(problem, family, noise)
+        likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
         fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
     makers = {
         **shipped,
@@ -188,6 +184,53 @@ def advise(
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
     )
     return Advice(recording, share, [advised, *others], chosen, best, fits, tunables, intervals)
+
+
+def fit_all(
+    problem: Problem,
+    recording: Recording,
+    family: Tunable,
+    noise: bool = True,
+    seed: int = 0,
+    **keywords: Any,
+) -> tuple[Tunable, Fit, dict[str, Interval]]:
+    """Fit one filter to all of a recording; nothing is left to judge it.
+
+    Args:
+        problem: of the recording.
+        recording: with truth or without.
+        family: what is fitted.
+        noise: as of :func:`advise`.
+        seed: of the starts of the fit.
+        **keywords: parameters of the task.
+
+    Returns:
+        The family with the scale of the noise, what was found, and the intervals of the parameters.
+    """
+    task = _task(problem, recording, keywords)
+    share = share_out(recording)
+    spans = [Span(i, min(share.warm_up, int(rows) - 1), int(rows)) for i, rows in enumerate(recording.rows)]
+    if share.apart:  # side by side it takes a fraction of the time
+        spans = [*share.fitted, *share.chosen, *share.judged]
+    tunable = _with_noise(problem, family, noise)
+    windows = cut_windows(recording, task, spans, share.warm_up)
+    likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+    found = fit(likelihood, tunable, seed)
+    return tunable, found, profile_intervals(likelihood, tunable, found)
+
+
+def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
+    """Task with the parameters of a recording, without it."""
+    parameters = recording.scenario(problem.task, keywords).parameters
+    return make_task(problem.task, None, **{**parameters, **keywords, "horizon": 1})
+
+
+def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
+    """Fit the scale of the noise too, where that is wanted and can be."""
+    log_format = problem.task.log_format
+    if not noise or log_format is None or log_format.scale_noise is None:
+        return family
+    return with_noise_scale(family, log_format.scale_noise)
 
 
 class _Judged:

@@ -236,7 +236,7 @@ def test_it_ends_in_sentences(advice):
     text = "\n".join(lines)
     assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
     assert "% less error [" in lines[0]
-    assert f"than the best shipped filter, {advice.best_shipped}" in lines[0]
+    assert f"than the best shipped filter there, {advice.best_shipped}" in lines[0]
     assert "acceleration" in text
     assert "m/s^2" in text
     assert "times as large as stated, if they are white" in text

@@ -6,15 +6,54 @@ from typing import Annotated
 import typer
 
 from ..agents.named_policies import pretrained_agents
-from ..baselines.advice import advise
-from ..baselines.fitted_filters import SUFFIX, own_family, write_fitted
-from ..baselines.problem import problem_of
-from ..envs.catalogue import check_names, read_recording
+from ..baselines.advice import advise, fit_all
+from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
+from ..baselines.problem import Problem, problem_of
+from ..envs.catalogue import check_names, nearest, read_recording, short_name
 from ..evaluation.files import writable_file
 from ..names import find_competitor
-from ..reports.advice import advice_lines, advice_table
+from ..reports.advice import advice_lines, advice_table, parameter_lines
 from .evaluation import find_names
 from .terminal import command_line, console, pair, parse_settings, progress_bar
+
+
+OWN = "The class is your own: put these values into it. A file that names a module would run its code."
+
+
+def fit_to_recording(
+    problem: Problem, name: str, recording: str, speeds: tuple[float, float], folder: Path, seed: int
+) -> None:
+    """Fit one filter to all of a recording, say its parameters, and write them.
+
+    Args:
+        problem: of the recording.
+        name: of what can be fitted, or ``module:Class``.
+        recording: files of it.
+        speeds: that are possible, m/s.
+        folder: for the file.
+        seed: of the starts of the fit.
+    """
+    found = read_recording(recording, problem.id, speeds=speeds)
+    families = families_of(problem, found)
+    if ":" not in name and name not in families:
+        raise nearest("filter that can be fitted to a recording", name, families)
+    family = families[name] if name in families else own_family(name, find_competitor(problem, name))
+    out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
+    if name in families:
+        writable_file(out)
+    tunable, fitted, intervals = fit_all(problem, found, family, seed=seed)
+    likelihood = fitted.log_likelihood / fitted.measurements
+    console.print(
+        f"{name}, fitted to {fitted.measurements:,} measurements, {likelihood:.3f} nats per measurement:",
+        highlight=False,
+    )
+    for line in parameter_lines(tunable, fitted, intervals):
+        console.print(f"  {line}", highlight=False, soft_wrap=True)
+    if name not in families:
+        console.print(OWN)
+        return
+    write_fitted(out, problem, name, fitted, intervals, command_line())
+    console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
 
 
 def advise_on_log(
@@ -80,7 +119,9 @@ def advise_on_log(
     console.print(advice_table(advice, learned))
     for sentence in advice_lines(advice, learned):
         console.print(sentence, highlight=False, soft_wrap=True)
-    if out is not None:
+    if out is not None and advice.fitted.name in own:
+        console.print(OWN)
+    elif out is not None:
         name = advice.fitted.name
         write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
         console.print(

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from rich.table import Table
 
 from ..baselines.advice import Advice, Competitor
-from ..baselines.fitting import IDENTIFIABLE, NOISE_SCALE, Interval
+from ..baselines.fitting import IDENTIFIABLE, NOISE_SCALE, Fit, Interval
+from ..baselines.table import Tunable
 from ..evaluation.bootstrap import Estimate
 
 MOST_ROWS = 12
@@ -83,12 +84,23 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     if one is not advice.advised:
         lag = advice.advised.log_likelihood - one.log_likelihood
         yield f"Of what was fitted {one.name} comes closest, {lag:.3f} nats per measurement behind, with"
-    tunable, found = advice.tunables[one.name], advice.fits[one.name]
-    for name, value in found.values.items():
-        yield f"  {_parameter(name, value, advice.intervals.get(name), tunable.units)}"
+    for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
+        yield f"  {line}"
     yield from _noise(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
+
+
+def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interval]) -> Iterator[str]:
+    """Say what was fitted, parameter by parameter, with units and intervals.
+
+    Args:
+        tunable: what was fitted.
+        found: the values.
+        intervals: of the parameters.
+    """
+    for name, value in found.values.items():
+        yield _parameter(name, value, intervals.get(name), tunable.units)
 
 
 def _verdict(advice: Advice) -> str:
@@ -116,7 +128,7 @@ def _verdict(advice: Advice) -> str:
             else (relative.low, relative.high)
         )
         sure = f" [{low:.1f}, {high:.1f}]"
-    text = f"Take {name}: {amount}{sure} than the best shipped filter, {best}, {where}."
+    text = f"Take {name}: {amount}{sure} than the best shipped filter there, {best}, {where}."
     if not math.isnan(relative.low) and relative.low <= 0.0 <= relative.high:
         text += f" The difference may be chance: {best} is good enough."
     return text
@@ -176,7 +188,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
         if interval.open_low and interval.open_high
     ]
     if wide:
-        yield f"Nothing in this recording says how large {' and '.join(wide)} is: it lacks the motion that would."
+        yield f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would."
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:

@@ -249,7 +249,7 @@ def recording_table(records: Sequence[Any]) -> Table:
         table.add_row(*row)
     table.caption = (
         "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
-        "predicted, nats; the higher the better.\nmean NIS: normalised innovation squared over its dimension; in the "
+        "predicted, nats; the higher the better, if errors are white.\nmean NIS: normalised innovation squared over its dimension; in the "
         "band if the innovations are as large as predicted; - : it reports none."
     )
     table.caption_justify = "left"
