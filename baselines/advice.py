@@ -158,7 +158,8 @@ def advise(
         },
     }
     progress("replaying the recording", 0.6)
-    dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
+    with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
+        dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
     judged = _Judged(dataset, task, share)
     competitors, best = judged.competitors({name: len(found.values) for name, found in fits.items()})
     progress("computing intervals", 0.9)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..compiler import namespace
-from ..compiler.functions import Function, map_arrays
+from ..compiler.functions import Function, empty_lanes, leaves, map_arrays, round_up_lanes
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from ..envs.compiled import AVAILABLE, warn_of
@@ -164,7 +164,8 @@ class WindowLikelihood:
             graph = Graph()
             with namespace.tracing(graph):
                 traced = type(task)(task.parameters, namespace)
-            self._compiled = Function(functools.partial(_update, traced, self.names, apply), graph)
+            update = functools.partial(_update, traced, self.names, apply)
+            self._compiled = Function(update, graph, unchanged=0)
         self._counts = windows.counts
         self._tiles: dict[int, tuple[Any, list[Any]]] = {}
         first = self._by_measurement(numpy.array([[value] for value in start.values()], dtype=float))[:, :, 0]
@@ -206,10 +207,10 @@ class WindowLikelihood:
             return numpy.concatenate([self._by_measurement(values[:, [i]]) for i in range(count)], axis=2)
         W = self._counts.shape[1]
         initial, measurements = self._tiled(count)
-        spread = numpy.repeat(values, W, axis=1)
+        lanes = numpy.minimum(numpy.arange(round_up_lanes(count * W)) // W, count - 1)
         with numpy.errstate(all="ignore"):
-            found = self._run(spread, initial, measurements)
-        return numpy.moveaxis(found.reshape(len(found), count, W), 1, 2)
+            found = self._run(numpy.ascontiguousarray(values[:, lanes]), initial, measurements)
+        return numpy.moveaxis(found[:, : count * W].reshape(len(found), count, W), 1, 2)
 
     def _run(self, values: numpy.ndarray, initial: Any, measurements: list[Any]) -> numpy.ndarray:
         """Run all lanes, ``(T, lanes)``."""
@@ -220,8 +221,7 @@ class WindowLikelihood:
         memory = own.start(initial, lanes)
         if self._compiled is not None:
             try:
-                for k, measurement in enumerate(measurements):
-                    memory, found[k] = self._compiled(values, measurement, memory)
+                self._run_compiled(self._compiled, values, measurements, memory, found)
                 return found
             except NotTraceable as error:
                 warn_of(type(own).__name__, error)
@@ -231,12 +231,37 @@ class WindowLikelihood:
             found[k] = Likelihood.of(*likelihood).log_likelihood if likelihood else numpy.nan
         return found
 
+    @staticmethod
+    def _run_compiled(
+        function: Function, values: numpy.ndarray, measurements: list[Any], memory: Any, found: numpy.ndarray
+    ) -> None:
+        """Run all lanes through code that is bound to two memories, to and fro, and write what was found."""
+        program = function.specialised(values, measurements[0], memory)
+        lanes, inner = found.shape[1], len(program.outputs) - 1
+        memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
+        for place, array in zip(memories[0], leaves(memory), strict=True):
+            place[...] = array
+        first = leaves(measurements[0])
+        calls = [
+            program.bound([values, *first, *before], [*after, found[0]])
+            for before, after in (memories, memories[::-1])
+        ]
+        last = len(calls[0].arrays) - 1
+        for k, measurement in enumerate(measurements):
+            call = calls[k % 2]
+            for i, array in enumerate(leaves(measurement), 1):
+                call.replace(i, array)
+            call.replace(last, found[k])
+            call(0, lanes)
+
     def _tiled(self, count: int) -> tuple[Any, list[Any]]:
         """Initial estimates and measurements of so many candidates, one after another."""
         if count not in self._tiles:
+            W = self._counts.shape[1]
+            windows = numpy.arange(round_up_lanes(count * W)) % W
 
             def tile(part: Any) -> Any:
-                return map_arrays(lambda array: numpy.tile(array, count), part)
+                return map_arrays(lambda array: numpy.ascontiguousarray(array[..., windows]), part)
 
             self._tiles = {count: (tile(self.windows.initial), [tile(m) for m in self.windows.measurements])}
         return self._tiles[count]
