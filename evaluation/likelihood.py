@@ -236,7 +236,7 @@ class WindowLikelihood:
         function: Function, values: numpy.ndarray, measurements: list[Any], memory: Any, found: numpy.ndarray
     ) -> None:
         """Run all lanes through code that is bound to two memories, to and fro, and write what was found."""
-        program = function.specialised(values, measurements[0], memory)
+        program = function.specialise(values, measurements[0], memory)
         lanes, inner = found.shape[1], len(program.outputs) - 1
         memories = [[empty_lanes(leaf.shape, lanes) for leaf in program.outputs[:inner]] for _ in range(2)]
         for place, array in zip(memories[0], leaves(memory), strict=True):
