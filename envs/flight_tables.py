@@ -309,7 +309,8 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     """Times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
 
     Times of day that come back by more than half a day are those of the next one. Dates are ISO 8601, with an offset
-    from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970 are milli-, micro- or nanoseconds since then.
+    from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970
+    are milli-, micro- or nanoseconds since then.
 
     Raises:
         ValueError: for what is neither.
@@ -325,8 +326,8 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
         offset = values.str.contains(OFFSET)
         if offset.any() and not offset.all():
             raise ValueError(
-                f"time has {values[offset.idxmin()]!r} in row {offset.idxmin()}, without the offset from UTC that other "
-                "rows have: write it in all of them"
+                f"time has {values[offset.idxmin()]!r} in row {offset.idxmin()}, without the offset from UTC that "
+                "other rows have: write it in all of them"
             )
         dates = pandas.to_datetime(values, utc=True, format="ISO8601", errors="coerce")
         if dates.isna().any():

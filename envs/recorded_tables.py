@@ -40,13 +40,18 @@ class Columns:
         table: numbers by the names of the columns, missing where a cell is empty, with ``time`` in seconds. Its index
             counts the rows of the file.
         given: parameters that the user has named.
-        log_time: times as they stand in the file, numbers or words, ``(rows,)``.
+        log_time: times as they stand in the file, numbers or words, ``(rows,)``; default: those of the table.
     """
 
     def __init__(
-        self, name: str, table: "pandas.DataFrame", given: Mapping[str, Any], log_time: numpy.ndarray
+        self,
+        name: str,
+        table: "pandas.DataFrame",
+        given: Mapping[str, Any],
+        log_time: numpy.ndarray | None = None,
     ) -> None:
-        self.name, self.table, self.given, self.log_time = name, table, given, log_time
+        self.name, self.table, self.given = name, table, given
+        self.log_time = self.time if log_time is None else log_time
         self.notes: list[str] = []
         """What was done to the table, a line each."""
         self.origin: tuple[float, float] | None = None
@@ -83,20 +88,21 @@ class Columns:
         same = numpy.append(False, numpy.diff(self.time) == 0.0)
         if not same.any():
             return
-        before = self.table.shift().reindex(self.table.index)
-        other = same & ~((self.table == before) | (self.table.isna() & before.isna())).all(axis=1).to_numpy()
+        kept = self.table[~same]
+        first = kept.iloc[numpy.cumsum(~same) - 1].set_axis(self.table.index)
+        other = same & ~((self.table == first) | (self.table.isna() & first.isna())).all(axis=1).to_numpy()
         row, count = int(same.argmax()), int(same.sum())
         if other.sum() > MOST_TWICE * len(same):
             raise ValueError(
-                f"time is the same in rows {row - 1} and {row}, and so in {other.sum():,} of {len(same):,} rows whose "
-                "values differ: write times with their fractions of a second"
+                f"time is the same in rows {row - 1} and {row}: {other.sum():,} of {len(same):,} rows have the time of "
+                "the row before and other values; write times with their fractions of a second"
             )
         what = "row has" if count == 1 else "rows have"
         differing = f", {other.sum():,} of them with other values" if other.any() else ""
         self.notes.append(
             f"{count:,} {what} the time of the row before{differing}: left out, the first is row {row}"
         )
-        self.table, self.log_time = self.table[~same], self.log_time[~same]
+        self.table, self.log_time = kept, self.log_time[~same]
 
     def flatten(self, plane: tuple[str, ...]) -> None:
         """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
@@ -129,8 +135,8 @@ class Columns:
                 first = int(there.argmax())
                 self.origin = float(self[latitude][first]), float(self[longitude][first])
                 self.notes.append(
-                    f"x is east and y north of latitude {self.origin[0]:.8g}, longitude {self.origin[1]:.8g}, the first "
-                    "position"
+                    f"x is east and y north of latitude {self.origin[0]:.8g}, longitude {self.origin[1]:.8g}, "
+                    "the first position"
                 )
             # Of the measurements only: the truth would be as high as they are.
             height = self[altitude] if self.has(altitude) else numpy.zeros(len(there))
@@ -322,6 +328,9 @@ def _side_by_side(
     components = [TRUTH + component.name for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
     notes = [*said, *ignored_columns(names, read)]
+    unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
+    if any(true) and unknown:
+        notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")
     recordings = []
     for own, found in parts:
         if found.parameters != known:

@@ -63,11 +63,9 @@ def _write_csv(path: Path, found: xarray.Dataset) -> None:
             for component in found["component"].values.tolist():
                 columns[f"{name}_{component}"] = found[name].sel(component=component, drop=True)
     numbered = {"measurement": ("time", 1 + numpy.arange(found.sizes["time"]))}
-    flat = (
-        xarray.Dataset(columns).reset_coords("log_time", drop=False)
-        if "log_time" in columns
-        else xarray.Dataset(columns)
-    )
+    flat = xarray.Dataset(columns)
+    if "log_time" in columns:
+        flat = flat.reset_coords("log_time")
     flat = flat.drop_vars("time", errors="ignore").assign(numbered)
     table = flat.to_dataframe(dim_order=["policy", "episode", "time"]).reset_index()
     # Beyond the end of a shorter episode there is no estimate.

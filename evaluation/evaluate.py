@@ -214,8 +214,8 @@ def evaluate(
         flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
         recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
         ``error``, ``cost``, ``charge`` nor ``nees``, and where some of it is not known, errors of that are NaN,
-        ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are. ``to_netcdf`` saves it; :mod:`.evaluation.dataset` reads windows,
-        groups and keywords out of it.
+        ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
+        ``to_netcdf`` saves it; :mod:`.evaluation.dataset` reads windows, groups and keywords out of it.
 
     Raises:
         ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit

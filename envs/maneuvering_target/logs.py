@@ -113,11 +113,12 @@ def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray)
         measured = numpy.stack([across * columns["longitude"], 111e3 * columns["latitude"]], axis=1)
     stale = numpy.zeros(len(position), dtype=bool)
     there = numpy.flatnonzero(numpy.isfinite(position).all(axis=1))
-    steps = numpy.abs(numpy.diff(measured[there], axis=0))
-    if (steps > 0.0).any(axis=0).all():
-        resolution = numpy.where(steps > 0.0, steps, numpy.inf).min(axis=0)
-        if (numpy.median(sigma[there], axis=0) >= FINER * resolution).all():
-            stale[there[1:]] = (steps == 0.0).all(axis=1)
+    repeated = (numpy.diff(measured[there], axis=0) == 0.0).all(axis=1)
+    if repeated.any():
+        # Of two different numbers the nearest: what a column is written in, or finer.
+        finest = [numpy.diff(numpy.unique(values)).min(initial=numpy.inf) for values in measured[there].T]
+        if (numpy.median(sigma[there], axis=0) >= FINER * numpy.array(finest)).all():
+            stale[there[1:]] = repeated
     return stale
 
 
