@@ -13,11 +13,13 @@ from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from .receiver_logs import RECEIVER_READERS, receiver_columns
+
 if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
     import pandas
     import xarray
 
-FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz")
+FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz", *RECEIVER_READERS)
 """Files that can be read."""
 MOST_ROWS = 1_000_000
 """Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
@@ -203,7 +205,13 @@ def _json(file: Path, known: Container[str]) -> Table:
     return Table(found[[name for name in found if name in known]], names)
 
 
+def _receiver(file: Path, known: Container[str]) -> Table:
+    columns, notes = receiver_columns(file, suffix_of(file), MOST_ROWS)
+    return Table(columns[[name for name in columns if name in known]], list(columns), notes)
+
+
 _READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
+_READERS |= dict.fromkeys(RECEIVER_READERS, _receiver)
 _WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
 
 

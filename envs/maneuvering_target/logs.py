@@ -221,7 +221,7 @@ def _variances(columns: Columns, position: numpy.ndarray, there: numpy.ndarray) 
         if "range_sigma" not in columns.given:
             raise ValueError(
                 "nothing says how large the errors of latitude and longitude are: add the columns sigma_x and sigma_y "
-                "(m, east and north), or name one deviation of both, --set range_sigma=3"
+                "(m, east and north; of NMEA the sentences GST), or name one deviation of both, --set range_sigma=3"
             )
         variance[there] = float(columns.given["range_sigma"]) ** 2
         return variance
