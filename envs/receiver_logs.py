@@ -118,12 +118,13 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
         except ValueError:
             broken += 1
         _check_rows(len(rows), most_rows)
+    notes = _broken(broken, len(rows), "are no solutions")
     if not rows:
         raise ValueError("it holds no solution of RTKLIB")
     written, seconds, *values = zip(*rows, strict=True)
     found = dict(zip(names, map(numpy.array, values), strict=True))
-    columns, notes = _rtklib_positions(found)
-    notes += _broken(broken, len(rows), "are no solutions")
+    columns, said = _rtklib_positions(found)
+    notes += said
     if "Q" in found:
         counted = Counter(QUALITY[int(q)] if 0 <= q < len(QUALITY) else f"{q:g}" for q in found["Q"].tolist())
         notes += (f"quality: {', '.join(f'{count:,} {name}' for name, count in counted.most_common())}",)
@@ -167,7 +168,7 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
             columns |= _turned(sigmas, float(latitude[0]), float(longitude[0]))
         return columns, ()
     raise ValueError(
-        f"RTKLIB wrote {', '.join(found)}, and what is read are latitude and longitude, x-ecef and so on, or e-baseline "
+        f"RTKLIB wrote {', '.join(found)}; what is read are latitude and longitude, x-ecef and so on, or e-baseline "
         "and so on"
     )
 
