@@ -113,7 +113,7 @@ def _csv(file: Path, known: Container[str]) -> Table:
             if row:
                 rows.append([row[i] for i in wanted.values()])
     if delimiter != ",":
-        rows = [*zip(*map(_with_decimal_points, zip(*rows, strict=True)), strict=True)]  # type: ignore[arg-type]
+        rows = [[*row] for row in zip(*map(_with_decimal_points, zip(*rows, strict=True)), strict=True)]
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
     return Table(columns.mask(columns.eq("")), names)
 

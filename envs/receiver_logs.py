@@ -12,8 +12,10 @@ refused before it fills the memory.
 """
 
 import bz2
+import contextlib
 import datetime
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -239,8 +241,8 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
     notes = _broken(broken, good, "have a wrong checksum or are no sentence")
     days = _days(epochs)
     places = numpy.array([epoch.place or (math.nan, math.nan) for epoch in epochs])
-    columns = {"time": [_written(epoch.time, day) for epoch, day in zip(epochs, days, strict=True)]}
-    columns |= {"latitude": places[:, 0], "longitude": places[:, 1]}
+    columns: dict[str, Any] = {"latitude": places[:, 0], "longitude": places[:, 1]}
+    columns["time"] = [_written(epoch.time, day) for epoch, day in zip(epochs, days, strict=True)]
     columns["altitude"] = numpy.array([epoch.altitude for epoch in epochs])
     if any(epoch.sigmas for epoch in epochs):
         columns |= _filled([epoch.sigmas for epoch in epochs])
@@ -337,7 +339,9 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
         import pyulog
     except ImportError as error:
         raise ValueError(f"ULog needs one more package: {EXTRA}") from error
-    log = pyulog.ULog(str(file), list(TOPICS))
+    # The library prints what it finds strange.
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
+        log = pyulog.ULog(str(file), list(TOPICS))
     held = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
     chosen = min(held, key=lambda key: (TOPICS.index(key[0]), key[1]), default=None)
     if chosen is None:
@@ -468,5 +472,10 @@ def receiver_columns(file: Path, suffix: str, most_rows: int) -> tuple["pandas.D
     """
     import pandas
 
-    found = RECEIVER_READERS[suffix](file, most_rows)
+    try:
+        found = RECEIVER_READERS[suffix](file, most_rows)
+    except Exception as error:  # libraries raise whatever a broken file makes them stumble over
+        if isinstance(error, ValueError) and not isinstance(error, UnicodeError):
+            raise
+        raise ValueError(f"it cannot be read as a log {suffix}: {error or type(error).__name__}") from error
     return pandas.DataFrame(dict(found.columns)), found.notes

@@ -84,7 +84,7 @@ class Recording:
     licence: str = ""
     notes: tuple[str, ...] = ()
     log_time: numpy.ndarray | None = None
-    started: numpy.ndarray | None = None
+    started: Any = None
 
     def __post_init__(self) -> None:
         episodes, _ = self.seconds.shape
@@ -160,8 +160,9 @@ class Recording:
         The truth must not be None.
         """
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
-        known: numpy.ndarray = (numpy.isfinite(self.truth) & there[..., None]).any(axis=1).all(axis=0)
-        return known
+        truth: Any = self.truth
+        known: numpy.ndarray = numpy.logical_and(numpy.isfinite(truth), there[..., None]).any(axis=1)
+        return numpy.asarray(known.all(axis=0))
 
     @functools.cached_property
     def has_whole_truth(self) -> bool:
@@ -408,7 +409,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         lengths=numpy.concatenate([one.lengths for one in recordings]),
         truth=numpy.concatenate(truths) if len(truths) == len(recordings) else None,
         log_time=numpy.concatenate(times) if len(times) == len(recordings) else None,
-        started=numpy.concatenate([one.started for one in recordings]),  # type: ignore[misc]
+        started=numpy.concatenate([one.started for one in recordings]),
         **{"names": tuple(name for one in recordings for name in one.names), **fields},
     )
 

@@ -426,7 +426,7 @@ def _recording_coords(
         of some is not known.
     """
     length = dataset.sizes["time"]
-    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}  # type: ignore[index]
+    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
     if recording.log_time is not None:
         coords["log_time"] = (("episode", "time"), recording.log_time[episodes, :length])
     if recording.truth is not None and not recording.truth_known.all():
