@@ -113,12 +113,12 @@ def _csv(file: Path, known: Container[str]) -> Table:
             if row:
                 rows.append([row[i] for i in wanted.values()])
     if delimiter != ",":
-        rows = [[*row] for row in zip(*map(_with_decimal_points, zip(*rows, strict=True)), strict=True)]
+        rows = [[*row] for row in zip(*map(_replace_decimal_commas, zip(*rows, strict=True)), strict=True)]
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
     return Table(columns.mask(columns.eq("")), names)
 
 
-def _with_decimal_points(cells: Sequence[str]) -> Sequence[str]:
+def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
     """Return the cells of a column with points in place of decimal commas, if it is numbers and none has a point."""
     if not any("," in cell for cell in cells) or any("." in cell for cell in cells):
         return cells
@@ -289,7 +289,7 @@ def is_true(values: "pandas.Series") -> "pandas.Series":
     return values.astype(str).str.strip().str.lower().isin(["true", "1", "1.0"])
 
 
-def _as_iso(date: Any) -> str:
+def _rewrite_date(date: Any) -> str:
     """Return a date in the form of ISO 8601, if it is one in another that cannot be misread."""
     word = re.sub(r"(:\d{2}),(\d)", r"\1.\2", str(date).strip())
     found = DATE.match(word)
@@ -299,7 +299,7 @@ def _as_iso(date: Any) -> str:
     return f"{year}-{month:>02}-{day:>02}{word[found.end() :]}"
 
 
-def _of_day(values: "pandas.Series") -> "pandas.Series":
+def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
     """Times of day in seconds, on through midnight.
 
     Raises:
@@ -328,9 +328,9 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     types = pandas.api.types
     first = next(iter(values.dropna()), None)
     if isinstance(first, str) and first and pandas.isna(pandas.to_numeric(first, errors="coerce")):
-        values = values.astype(object).where(values.notna(), "").map(_as_iso)
+        values = values.astype(object).where(values.notna(), "").map(_rewrite_date)
         if CLOCK.fullmatch(values.iloc[0]):
-            return _of_day(values)
+            return _parse_times_of_day(values)
         offset = values.str.contains(OFFSET)
         if offset.any() and not offset.all():
             raise ValueError(

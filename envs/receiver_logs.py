@@ -58,7 +58,7 @@ def _check_rows(count: int, most: int) -> None:
         raise ValueError(f"it has more than {most:,} rows: split it, or keep fewer a second")
 
 
-def _broken(count: int, good: int, what: str) -> tuple[str, ...]:
+def _note_broken(count: int, good: int, what: str) -> tuple[str, ...]:
     """Return the note on lines that were left out.
 
     Raises:
@@ -69,7 +69,7 @@ def _broken(count: int, good: int, what: str) -> tuple[str, ...]:
     return (f"{_count_of(count, 'line')} {what}: left out",) if count else ()
 
 
-def _lines(file: Path) -> Iterator[bytes]:
+def _read_lines(file: Path) -> Iterator[bytes]:
     with file.open("rb") as content:
         while line := content.readline(LONGEST_LINE):
             yield line
@@ -93,7 +93,7 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
     """
     names: list[str] = []
     system, rows, broken = "", [], 0
-    for line in _lines(file):
+    for line in _read_lines(file):
         text = line.decode("utf-8", "replace").strip().lstrip("\ufeff")
         if text.startswith("%"):
             words = text.lstrip("% ").replace(",", " ").split()
@@ -120,7 +120,7 @@ def read_rtklib(file: Path, most_rows: int) -> ReceiverLog:
         except ValueError:
             broken += 1
         _check_rows(len(rows), most_rows)
-    notes = _broken(broken, len(rows), "are no solutions")
+    notes = _note_broken(broken, len(rows), "are no solutions")
     if not rows:
         raise ValueError("it holds no solution of RTKLIB")
     written, seconds, *values = zip(*rows, strict=True)
@@ -167,7 +167,7 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
         deviations = ["sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"]
         if {*deviations} <= {*found}:
             sigmas = numpy.stack([found[name] for name in deviations])
-            columns |= _turned(sigmas, float(latitude[0]), float(longitude[0]))
+            columns |= _rotate_sigmas(sigmas, float(latitude[0]), float(longitude[0]))
         return columns, ()
     raise ValueError(
         f"RTKLIB wrote {', '.join(found)}; what is read are latitude and longitude, x-ecef and so on, or e-baseline "
@@ -175,7 +175,7 @@ def _rtklib_positions(found: Mapping[str, numpy.ndarray]) -> tuple[dict[str, Any
     )
 
 
-def _turned(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
+def _rotate_sigmas(sigmas: numpy.ndarray, latitude: float, longitude: float) -> dict[str, numpy.ndarray]:
     """Deviations east and north of Earth-fixed ones.
 
     Args:
@@ -226,11 +226,11 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
         raise ValueError(f"NMEA needs one more package: {EXTRA}") from error
     epochs: list[_Epoch] = []
     good = broken = 0
-    for line in _lines(file):
+    for line in _read_lines(file):
         for found in SENTENCE.findall(line):
             try:
                 message = pynmea2.parse(found.decode("ascii").strip(), check=True)
-                _take(message, epochs)
+                _add_sentence(message, epochs)
                 good += 1
             except (ValueError, TypeError, AttributeError, pynmea2.ParseError):
                 broken += 1
@@ -238,14 +238,14 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
     epochs = [epoch for epoch in epochs if epoch.positioned]
     if not epochs:
         raise ValueError(f"it holds no sentence GGA or RMC that is whole, and {broken:,} broken ones")
-    notes = _broken(broken, good, "have a wrong checksum or are no sentence")
-    days = _days(epochs)
+    notes = _note_broken(broken, good, "have a wrong checksum or are no sentence")
+    days = _find_dates(epochs)
     places = numpy.array([epoch.place or (math.nan, math.nan) for epoch in epochs])
     columns: dict[str, Any] = {"latitude": places[:, 0], "longitude": places[:, 1]}
-    columns["time"] = [_written(epoch.time, day) for epoch, day in zip(epochs, days, strict=True)]
+    columns["time"] = [_format_time(epoch.time, day) for epoch, day in zip(epochs, days, strict=True)]
     columns["altitude"] = numpy.array([epoch.altitude for epoch in epochs])
     if any(epoch.sigmas for epoch in epochs):
-        columns |= _filled([epoch.sigmas for epoch in epochs])
+        columns |= _fill_sigmas([epoch.sigmas for epoch in epochs])
     else:
         notes += (
             "no GST sentence says how large errors are: HDOP tells how satellites stand, and no metres",
@@ -256,7 +256,7 @@ def read_nmea(file: Path, most_rows: int) -> ReceiverLog:
     return ReceiverLog(columns, notes)
 
 
-def _take(message: Any, epochs: list[_Epoch]) -> None:
+def _add_sentence(message: Any, epochs: list[_Epoch]) -> None:
     """Add what a sentence says to the epoch of its time.
 
     Raises:
@@ -286,7 +286,7 @@ def _take(message: Any, epochs: list[_Epoch]) -> None:
         epoch.date = message.datestamp
 
 
-def _days(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
+def _find_dates(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
     """Date of every epoch, of which some say it; None if none does."""
     known = next((i for i, epoch in enumerate(epochs) if epoch.date), None)
     if known is None:
@@ -303,13 +303,13 @@ def _days(epochs: Sequence[_Epoch]) -> list[datetime.date | None]:
     return found
 
 
-def _written(time: float, day: datetime.date | None) -> str:
+def _format_time(time: float, day: datetime.date | None) -> str:
     """Time of day, with its date where it is known."""
     clock = (datetime.datetime.min + datetime.timedelta(seconds=time)).time().isoformat()
     return clock if day is None else f"{day.isoformat()}T{clock}Z"
 
 
-def _filled(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
+def _fill_sigmas(sigmas: Sequence[tuple[float, float] | None]) -> dict[str, numpy.ndarray]:
     """Deviations east and north; where none are said, those said before, and at first those said next."""
     import pandas
 
@@ -407,13 +407,13 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
         topic, count = counts.most_common(1)[0]
         _check_rows(count, most_rows)
         for place, chunk in bag.chunks.items():
-            bag.chunks[place] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+            bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
         chosen = [c for c in bag.connections if c.topic == topic and c.msgtype == NAVSAT]
         fixes = [types.deserialize_ros1(raw, NAVSAT) for _, _, raw in bag.messages(chosen)]
     return _navsat(fixes, topic)
 
 
-def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
     """Return a function that unpacks no more than a chunk may have."""
     import lz4.frame
 

@@ -13,7 +13,7 @@ import numpy
 
 from ..filters.geodesy import east_north
 from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, numbers, read_table, seconds
-from .log_format import LogFormat, TrackLog
+from .log_format import TrackLog
 from .plausibility import check_degrees, check_interval, ignored_columns, limit_notes
 from .recording import Recording, measure_once, side_by_side
 from .task import Task
@@ -104,7 +104,7 @@ class Columns:
         )
         self.table, self.log_time = kept, self.log_time[~same]
 
-    def flatten(self, plane: tuple[str, ...]) -> None:
+    def project_to_plane(self, plane: tuple[str, ...]) -> None:
         """Make metres east and north of latitude and longitude, in the plane that touches the ellipsoid at the first
         position, and say where that is.
 
@@ -222,18 +222,15 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     if log_format is None:
         measure_once(cls(cls.Parameters(**keywords)))  # says what a closed loop is
         raise ValueError(f"{cls.id} reads recordings from NetCDF only, in the form of filtergym record")
-    aliases = _aliases(log_format)
-    known = _ColumnNames({*TIME, RECORDING, *log_format.columns, *aliases})
+    known = _ColumnNames({*TIME, RECORDING, *log_format.columns})
+    if log_format.plane:
+        known |= {true + alias for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
     if not path.name.endswith(FLIGHT_SUFFIXES):
         raise ValueError(f"a recording ends in {', '.join(FLIGHT_SUFFIXES)}")
     read, names, notes = read_table(path, known)
-    names = [aliases.get(name.lower(), name.lower()) for name in names]
-    read = read.rename(columns=lambda name: aliases.get(name, name))
-    if not read.columns.is_unique:
-        twice = read.columns[read.columns.duplicated()][0]
-        raise ValueError(
-            f"it has the column {twice} more than once, under several names: leave one of them out"
-        )
+    names = [name.lower() for name in names]
+    if log_format.plane:
+        read, names = _rename_aliases(read, names)
     time_name = next((name for name in TIME if name in read), None)
     if time_name is None or not any(name in read for name in log_format.columns):
         raise ValueError(
@@ -256,7 +253,7 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
             _check_times(own.time)
             own.drop_duplicates()
             if log_format.plane:
-                own.flatten(log_format.plane)
+                own.project_to_plane(log_format.plane)
             if "sampling_interval" not in keywords:
                 check_interval(own.interval(), log_format.longest_interval)
             parts.append((own, log_format.read(own)))
@@ -267,11 +264,20 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
     return _side_by_side(path, cls, keywords, parts, names, notes)
 
 
-def _aliases(log_format: LogFormat) -> dict[str, str]:
-    """Names of columns by other names under which they are known."""
-    if not log_format.plane:
-        return {}
-    return {true + alias: true + name for true in ("", TRUTH) for name in GEODETIC for alias in COLUMNS[name]}
+def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:
+    """Call latitude, longitude and altitude by these names, and leave out what further names they have.
+
+    Args:
+        read: columns.
+        names: of all columns of the file.
+    """
+    renamed: dict[str, str] = {}
+    for true in ("", TRUTH):
+        for name in GEODETIC:
+            first, *others = [true + alias for alias in COLUMNS[name] if true + alias in read] or [""]
+            read = read.drop(columns=others)
+            renamed |= {first: true + name} if first else {}
+    return read.rename(columns=renamed), [renamed.get(name, name) for name in names]
 
 
 def _times_as_written(values: "pandas.Series") -> numpy.ndarray:
@@ -347,12 +353,12 @@ def _side_by_side(
                 initial={name: numpy.asarray(v)[None] for name, v in found.initial.items()},
                 seconds=(found.time - found.start)[None],
                 lengths=numpy.array([len(found.rows)]),
-                truth=_truth(own, found.rows, true)[None] if any(true) else None,
+                truth=_truth_of_rows(own, found.rows, true)[None] if any(true) else None,
                 names=(own.name,),
                 parameters={**known, **keywords},
                 name=path.name.partition(".")[0],
                 source=str(path),
-                log_time=_of_rows(own.log_time, found.rows)[None],
+                log_time=_take_rows(own.log_time, found.rows)[None],
                 started=numpy.array([found.start - own.time[0]]),
             )
         )
@@ -380,13 +386,13 @@ def _true_columns(task: Task, columns: Columns) -> list[str]:
     return found
 
 
-def _of_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
+def _take_rows(values: numpy.ndarray, rows: numpy.ndarray) -> numpy.ndarray:
     """Values ``(T, ...)`` of the rows that measurements are of; NaN, or no word, where they are of none."""
     shaped = (rows >= 0).reshape(-1, *[1] * (values.ndim - 1))
     return numpy.where(shaped, values[rows], "" if values.dtype.kind == "U" else numpy.nan)
 
 
-def _truth(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
+def _truth_of_rows(columns: Columns, rows: numpy.ndarray, names: list[str]) -> numpy.ndarray:
     """Truth of every component, ``(T, C)``; NaN where it is not known."""
     unknown = numpy.full(len(columns.time), numpy.nan)
-    return _of_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)
+    return _take_rows(numpy.stack([columns[name] if name else unknown for name in names], axis=1), rows)

@@ -406,7 +406,7 @@ def test_a_bag_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
         path = bag(tmp_path / f"{compression}.bag", compression=compression)
         with pytest.raises(ValueError, match=r"a part of it is larger than 0\.001 MB"):
             read_recording(path, TARGET)
-    assert len(receiver_logs._bounded(bz2.decompress)(bz2.compress(b"a" * 999))) == 999
+    assert len(receiver_logs._bound_unpacking(bz2.decompress)(bz2.compress(b"a" * 999))) == 999
 
 
 def test_only_known_columns_of_a_log_are_given(tmp_path):
