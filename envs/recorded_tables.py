@@ -130,17 +130,17 @@ class Columns:
             check_degrees(longitude, self[longitude], 360.0)
             there = numpy.isfinite(self[latitude]) & numpy.isfinite(self[longitude])
             if self.origin is None:
+                if true:
+                    raise ValueError(f"it has {latitude} and no latitude: nobody knows where x and y begin")
                 if not there.any():
                     raise ValueError(f"no row has {latitude} and {longitude}")
                 first = int(there.argmax())
                 self.origin = float(self[latitude][first]), float(self[longitude][first])
                 self.notes.append(
-                    f"x is east and y north of latitude {self.origin[0]:.8g}, longitude {self.origin[1]:.8g}, "
-                    "the first position"
+                    f"x is east and y north of latitude {self.origin[0]:.8f}, longitude {self.origin[1]:.8f}, the "
+                    "first position"
                 )
-            # Of the measurements only: the truth would be as high as they are.
-            height = self[altitude] if self.has(altitude) else numpy.zeros(len(there))
-            height = numpy.where(numpy.isfinite(height), height, 0.0)
+            height = self._height(altitude if self.has(altitude) else GEODETIC[2])
             found = east_north(
                 numpy.radians(self[latitude]),
                 numpy.radians(self[longitude]),
@@ -148,6 +148,13 @@ class Columns:
                 (numpy.radians(self.origin[0]), numpy.radians(self.origin[1])),
             )
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
+
+    def _height(self, name: str) -> numpy.ndarray:
+        """A column of heights, the median where it says nothing, ``(rows,)``, m; zero where there is none."""
+        height = self[name] if self.has(name) else numpy.zeros(len(self.time))
+        there = numpy.isfinite(height)
+        usual = float(numpy.median(height[there])) if there.any() else 0.0
+        return numpy.where(there, height, usual)
 
     def whole(self, *names: str) -> numpy.ndarray:
         """Columns without an empty cell, ``(rows, columns)``.

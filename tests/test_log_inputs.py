@@ -173,7 +173,21 @@ def test_latitude_and_longitude_become_metres_around_the_first(tmp_path):
     east, north, _ = pymap3d.geodetic2enu(*true.values(), *first, 0.0)
     np.testing.assert_allclose(recording.truth[0, :, :2], np.stack([east, north], axis=1)[2:], atol=1e-8)
     assert recording.notes[1] == (
-        f"x is east and y north of latitude {first[0]:.8g}, longitude {first[1]:.8g}, the first position"
+        f"x is east and y north of latitude {first[0]:.8f}, longitude {first[1]:.8f}, the first position"
+    )
+
+
+def test_heights_that_lack_are_those_of_the_others(tmp_path):
+    """At 1.6 km a height of zero would move a target at 10 km by 2.5 m."""
+    log = untold()
+    log = log.drop(columns=["x", "y"]).assign(**geodetic(log["x"], log["y"], 1600.0))
+    whole = read(log.assign(altitude=1720.0, truth_lat=log["lat"], truth_lon=log["lon"]), tmp_path)
+    position = whole.measurements["position"]
+    assert np.abs(position).max() > 10e3
+    np.testing.assert_array_equal(whole.truth[..., :2], position)
+    some = log["altitude"].where(np.arange(COUNT) % 3 == 0) * 0.0 + 1720.0
+    np.testing.assert_array_equal(
+        read(log.assign(altitude=some), tmp_path).measurements["position"], position
     )
 
 
@@ -208,6 +222,10 @@ def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
         ({"lat": None, "lon": np.full(COUNT, np.nan), "latitude": np.full(COUNT, np.nan)}, "no row has latitude"),
         ({"truth_lat": np.full(COUNT, 48.0)}, "lacks the column truth_longitude"),
         ({"x": TIME, "y": TIME}, "it has x and latitude: leave one of them out"),
+        (
+            {"x": TIME, "y": TIME, "lat": None, "lon": None, "truth_lat": TIME / 100.0, "truth_lon": TIME / 100.0},
+            "it has truth_latitude and no latitude: nobody knows where x and y begin",
+        ),
     ],
 )  # fmt: skip
 def test_wrong_places_are_one_sentence(changes, sentence, tmp_path):
