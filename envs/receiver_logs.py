@@ -409,8 +409,22 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
         for place, chunk in bag.chunks.items():
             bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
         chosen = [c for c in bag.connections if c.topic == topic and c.msgtype == NAVSAT]
-        fixes = [types.deserialize_ros1(raw, NAVSAT) for _, _, raw in bag.messages(chosen)]
-    return _navsat(fixes, topic)
+        known = types.generate_msgdef(NAVSAT)[1]
+        if any(connection.digest != known for connection in chosen):
+            raise ValueError(f"its {NAVSAT} is another than that of ROS 1")
+        # Numbers of each at once: messages take a hundred times as much.
+        fixes = [_fix_values(types.deserialize_ros1(raw, NAVSAT)) for _, _, raw in bag.messages(chosen)]
+    if not fixes:
+        raise ValueError(f"its topic {topic} has no messages")
+    return _navsat_columns(numpy.array(fixes).T, topic)
+
+
+def _fix_values(fix: Any) -> tuple[float, ...]:
+    """Time, status, latitude, longitude, altitude, variances east and north, and what is known of them."""
+    stamp, variances = fix.header.stamp, fix.position_covariance.reshape(3, 3).diagonal()
+    place = fix.latitude, fix.longitude, fix.altitude
+    time = stamp.sec + 1e-9 * stamp.nanosec
+    return time, fix.status.status, *place, *variances[:2].tolist(), fix.position_covariance_type
 
 
 def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
@@ -430,21 +444,19 @@ def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], 
     return unpack
 
 
-def _navsat(fixes: Sequence[Any], topic: str) -> ReceiverLog:
-    """Columns of messages; their covariance is of east, north and up."""
-    fixed = numpy.array([fix.status.status != NO_FIX for fix in fixes])
-    places = numpy.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes])
-    places[~fixed] = math.nan
-    stamps = [fix.header.stamp for fix in fixes]
-    columns: dict[str, Any] = {"time": numpy.array([stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps])}
-    columns |= dict(zip(("latitude", "longitude", "altitude"), places.T, strict=True))
+def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Columns of messages, of which there are ``values`` as :func:`_fix_values` returns them, ``(8, n)``."""
+    time, status, latitude, longitude, altitude, east, north, covariance_type = values
+    fixed = status != NO_FIX
+    columns = {"time": time, "altitude": altitude}
+    columns["latitude"] = numpy.where(fixed, latitude, math.nan)
+    columns["longitude"] = numpy.where(fixed, longitude, math.nan)
     notes = [f"positions are of the topic {topic}"]
-    if any(fix.position_covariance_type == UNKNOWN_COVARIANCE for fix in fixes):
+    if (covariance_type == UNKNOWN_COVARIANCE).any():
         notes.append("messages do not say how large errors are")
     else:
-        covariance = numpy.array([fix.position_covariance for fix in fixes]).reshape(-1, 3, 3)
-        sigma = numpy.sqrt(numpy.maximum(covariance[:, [0, 1], [0, 1]], 0.0))
-        columns |= {"sigma_x": sigma[:, 0], "sigma_y": sigma[:, 1]}
+        columns["sigma_x"] = numpy.sqrt(numpy.maximum(east, 0.0))
+        columns["sigma_y"] = numpy.sqrt(numpy.maximum(north, 0.0))
     if not fixed.all():
         notes.append(f"{_count_of(int((~fixed).sum()), 'message')} without a fix")
     return ReceiverLog(columns, tuple(notes))

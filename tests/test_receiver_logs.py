@@ -1,6 +1,7 @@
 """Logs of receivers: RTKLIB, NMEA, ULog and bags of ROS 1, from small files of the same form."""
 
 import bz2
+import re
 import struct
 
 import numpy as np
@@ -274,7 +275,14 @@ def test_what_holds_no_sentence_is_refused(pynmea2, content, sentence, tmp_path)
 
 def test_logs_of_too_many_rows_are_refused(pynmea2, tmp_path, monkeypatch):
     monkeypatch.setattr("filtergym.envs.flight_tables.MOST_ROWS", COUNT - 1)
-    for path in (nmea(tmp_path / "walk.nmea"), rtklib(tmp_path / "drive.pos", GEODETIC, places())):
+    rows = [(round(1e6 * time), *place, 2.0, 3) for time, place in zip(TIME, places().T, strict=True)]
+    pytest.importorskip("pyulog", reason="not installed: pip install 'filtergym[logs]'")
+    for path in (
+        nmea(tmp_path / "walk.nmea"),
+        rtklib(tmp_path / "drive.pos", GEODETIC, places()),
+        ulog(tmp_path / "flight.ulg", NEW, rows),
+        bag(tmp_path / "drive.bag"),
+    ):
         with pytest.raises(ValueError, match="it has more than 39 rows: split it"):
             read_recording(path, TARGET)
 
@@ -398,6 +406,15 @@ def test_a_bag_without_deviations_or_positions(tmp_path):
         ValueError, match=r"it holds no sensor_msgs/msg/NavSatFix; it holds .*std_msgs/msg/String"
     ):
         read_recording(bag(tmp_path / "imu.bag", kind="sensor_msgs/msg/Imu"), TARGET)
+
+
+def test_a_bag_with_a_definition_of_its_own_is_refused(tmp_path):
+    path = bag(tmp_path / "drive.bag")
+    content = path.read_bytes()
+    digest = re.search(rb"md5sum=([0-9a-f]{32})", content[content.index(b"NavSatFix") - 200 :])[1]
+    path.write_bytes(content.replace(digest, b"0" * 32))
+    with pytest.raises(ValueError, match=r"its sensor_msgs/msg/NavSatFix is another than that of ROS 1"):
+        read_recording(path, TARGET)
 
 
 def test_a_bag_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
