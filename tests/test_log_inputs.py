@@ -136,6 +136,7 @@ def test_scans_without_a_row_have_no_truth(tmp_path):
     log = aircraft()
     time = TIME + np.random.default_rng(1).uniform(-1.0, 1.0, COUNT)
     recording = read(log.assign(time=time).drop(index=range(20, 26)), tmp_path)
+    assert recording.notes == ("6 scans have no row: they missed the target",)
     truth = recording.truth[0]
     assert np.isnan(truth).all(axis=1).nonzero()[0].tolist() == [*range(18, 24)]
     np.testing.assert_array_equal(truth[24:], log.iloc[26:, 5:].to_numpy())

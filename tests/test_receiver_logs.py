@@ -430,3 +430,30 @@ def test_only_known_columns_of_a_log_are_given(tmp_path):
     path = rtklib(tmp_path / "drive.pos", GEODETIC, places())
     table = read_table(path, KNOWN)
     assert list(table.columns) == table.names == KNOWN[:6]
+
+
+@pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bag"])
+def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
+    """Bytes that changed and files that end early are read or refused, and nothing else happens."""
+    library = {".ulg": "pyulog", ".nmea": "pynmea2"}.get(suffix, "numpy")
+    pytest.importorskip(library, reason="not installed: pip install 'filtergym[logs]'")
+    rows = [(round(1e6 * time), *place, 2.0, 3) for time, place in zip(TIME, places().T, strict=True)]
+    make = {
+        ".pos": lambda path: rtklib(path, GEODETIC, places()),
+        ".nmea": nmea,
+        ".ulg": lambda path: ulog(path, NEW, rows),
+        ".bag": bag,
+    }[suffix]
+    whole = make(tmp_path / f"whole{suffix}").read_bytes()
+    path, rng, sentences = tmp_path / f"log{suffix}", np.random.default_rng(0), []
+    for _ in range(40):
+        content = bytearray(whole)
+        for place in rng.integers(0, len(whole), int(rng.choice([1, 5, 50]))):
+            content[place] = int(rng.choice([0, 255, rng.integers(0, 256)]))
+        path.write_bytes(content[: int(rng.integers(1, 2 * len(whole)))])
+        try:
+            read_recording(path, TARGET)
+        except ValueError as error:
+            sentences.append(str(error))
+    assert sentences
+    assert all(text.startswith(f"recording {path}: ") and "\n" not in text for text in sentences)

@@ -92,7 +92,7 @@ def read_log(columns: Columns) -> TrackLog:
         parameters,
         float(columns.time[first]),
         time,
-        _stale_notes(stale),
+        (*_stale_notes(stale), *_gap_notes(rows)),
     )
 
 
@@ -129,6 +129,15 @@ def _stale_notes(stale: numpy.ndarray) -> tuple[str, ...]:
     what = "row repeats" if count == 1 else "rows repeat"
     return (
         f"{count:,} {what} the position of the row before: left out as measurements, the first is row {stale.argmax()}",
+    )
+
+
+def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
+    count = int((rows < 0).sum())
+    return (
+        (f"{count:,} scan{'s have' if count > 1 else ' has'} no row: they missed the target",)
+        if count
+        else ()
     )
 
 
