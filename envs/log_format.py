@@ -36,6 +36,8 @@ class TrackLog(NamedTuple):
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
     """Of the measurements, likewise, ``(T,)``."""
+    notes: tuple[str, ...] = ()
+    """What was done to the table, a line each."""
 
 
 @dataclass(frozen=True)
@@ -51,5 +53,8 @@ class LogFormat:
     parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""
     targets_move: bool = False
     """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    plane: tuple[str, ...] = ()
+    """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
+    empty where they may not."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""
