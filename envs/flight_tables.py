@@ -212,7 +212,7 @@ def _receiver(file: Path, known: Container[str]) -> Table:
 
 _READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
 _READERS |= dict.fromkeys(RECEIVER_READERS, _receiver)
-_WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
+_COLUMN_OF_ALIAS = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
 
 
 def suffix_of(file: Path) -> str:

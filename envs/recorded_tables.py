@@ -14,7 +14,7 @@ import numpy
 from ..filters.geodesy import east_north
 from .flight_tables import COLUMNS, FLIGHT_SUFFIXES, numbers, read_table, seconds
 from .log_format import TrackLog
-from .plausibility import check_degrees, check_interval, ignored_columns, limit_notes
+from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
 from .recording import Recording, measure_once, side_by_side
 from .task import Task
 
@@ -340,7 +340,7 @@ def _side_by_side(
     places = [TRUTH + name for name in GEODETIC if log_format.plane]
     components = [TRUTH + component.name for component in task.components]
     read = [*TIME, RECORDING, *log_format.columns, *components, *places]
-    notes = [*said, *ignored_columns(names, read)]
+    notes = [*said, *unknown_column_notes(names, read)]
     unknown = [component.name for component, name in zip(task.components, true, strict=True) if not name]
     if any(true) and unknown:
         notes.append(f"no truth of {', '.join(unknown)}: errors and NEES are of the other components")

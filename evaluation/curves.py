@@ -102,7 +102,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
     """Return the groups of components, where there are any, else the first three; those whose truth is known."""
-    reported = list(reported_components(dataset))
+    reported = list(components_and_groups(dataset))
     return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
 

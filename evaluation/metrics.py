@@ -65,7 +65,7 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
     return (run["error"].sel(component=parts) ** 2).sum("component", skipna=False).values
 
 
-def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
+def components_and_groups(dataset: xarray.Dataset) -> dict[str, str]:
     """Components and groups of components whose truth is known, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
