@@ -313,7 +313,8 @@ def read_recording(
 
     Args:
         path: of a NetCDF file, such as :meth:`.Recording.write` and ``filtergym record`` write; or of a table (CSV,
-            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.log_format`. A
+            NetCDF, Parquet, JSON) with the columns that the environment knows, :attr:`.Task.log_format`, or of a log of
+            a receiver (:mod:`.receiver_logs`), ``.pos``, ``.nmea``, ``.ulg`` or ``.bag``, for ManeuveringTarget. A
             folder, a pattern such as ``"plots/*.csv"``, or a sequence of these: several files are one recording, and a
             broken one is left out and named in the notes.
         environment: id of the environment that it is for; default: what the file says.

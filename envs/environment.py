@@ -98,7 +98,9 @@ def _action_error(expected: str, action: Array) -> ValueError:
 
 
 def _no_truth(course: Course) -> str:
-    return f"recording {course.names[0]!r} has no truth, so the cost of an estimate is not known"
+    known = any(model.task.has_truth for model in course.models)
+    lacks = "lacks some of the truth, so the reward" if known else "has no truth, so the cost"
+    return f"recording {course.names[0]!r} {lacks} of an estimate is not known"
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class _EnvBase:
         """
         self._make, self._keywords = make, dict(keywords)
         course = self._course(scenario, {})
-        if not all(model.task.has_truth for model in course.models):
+        if not all(model.task.has_whole_truth for model in course.models):
             self._disable_reward(course)
         self.model, self._first_course, beside_paper = (
             course.models[0],
@@ -235,7 +237,7 @@ class _EnvBase:
         if (
             hasattr(self, "model")
             and self.reward_kind != "none"
-            and not all(t.task.has_truth for t in models)
+            and not all(t.task.has_whole_truth for t in models)
         ):
             raise ValueError(
                 f"{_no_truth(course)}, and this environment gives rewards: make another one of it"

@@ -8,15 +8,18 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Container, Mapping
+import re
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from .receiver_logs import RECEIVER_READERS, receiver_columns
 
 if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
     import pandas
     import xarray
 
-FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz")
+FLIGHT_SUFFIXES = (".csv", ".nc", ".parquet", ".json", ".json.gz", *RECEIVER_READERS)
 """Files that can be read."""
 MOST_ROWS = 1_000_000
 """Of a file: a day of one target at ten a second; more would not leave room for anything else in memory."""
@@ -43,6 +46,15 @@ package ``traffic``, known by its ``groundspeed``, altitudes are feet. Rows of o
 order of their times; rows on the ``ground`` are not flown.
 """
 FOOT = 0.3048
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+DATE = re.compile(
+    r"(?:(?P<y>\d{4})/(?P<m>\d{1,2})/(?P<d>\d{1,2})|(?P<D>\d{1,2})\.(?P<M>\d{1,2})\.(?P<Y>\d{4}))(?=[ T]|$)"
+)
+"""Year/month/day, or day.month.year."""
+CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:\.\d+)?)")
+OFFSET = r":\d{2}.*(?:[Zz]|[+-]\d{2}(?::?\d{2})?)$"
+"""Of local time from UTC, at the end of a date."""
+DAY = 86400.0
 UNITS: Mapping[str, tuple[str, ...]] = {
     "time": ("s", "second", "seconds", "sec"),
     "x": ("m", "metre", "metres", "meter", "meters"),
@@ -61,6 +73,8 @@ class Table(NamedTuple):
     """Those that are known, by their names in lower case; what is empty is missing."""
     names: list[str]
     """Of all columns that the file has."""
+    notes: tuple[str, ...] = ()
+    """What is to be told of the reading, a line each."""
 
 
 def _check_rows(rows: int) -> None:
@@ -98,8 +112,17 @@ def _csv(file: Path, known: Container[str]) -> Table:
             _check_rows(number + 1)
             if row:
                 rows.append([row[i] for i in wanted.values()])
+    if delimiter != ",":
+        rows = [[*row] for row in zip(*map(_replace_decimal_commas, zip(*rows, strict=True)), strict=True)]
     columns = pandas.DataFrame(rows, columns=list(wanted), dtype=object)
     return Table(columns.mask(columns.eq("")), names)
+
+
+def _replace_decimal_commas(cells: Sequence[str]) -> Sequence[str]:
+    """Return the cells of a column with points in place of decimal commas, if it is numbers and none has a point."""
+    if not any("," in cell for cell in cells) or any("." in cell for cell in cells):
+        return cells
+    return [cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in cells]
 
 
 def open_netcdf(file: Path, **decoding: Any) -> "xarray.Dataset":
@@ -182,7 +205,13 @@ def _json(file: Path, known: Container[str]) -> Table:
     return Table(found[[name for name in found if name in known]], names)
 
 
+def _receiver(file: Path, known: Container[str]) -> Table:
+    columns, notes = receiver_columns(file, suffix_of(file), MOST_ROWS)
+    return Table(columns[[name for name in columns if name in known]], list(columns), notes)
+
+
 _READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
+_READERS |= dict.fromkeys(RECEIVER_READERS, _receiver)
 _COLUMN_OF_ALIAS = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
 
 
@@ -260,10 +289,36 @@ def is_true(values: "pandas.Series") -> "pandas.Series":
     return values.astype(str).str.strip().str.lower().isin(["true", "1", "1.0"])
 
 
-def seconds(values: "pandas.Series") -> "pandas.Series":
-    """Times in seconds: numbers as they are, dates since the first of them.
+def _rewrite_date(date: Any) -> str:
+    """Return a date in the form of ISO 8601, if it is one in another that cannot be misread."""
+    word = re.sub(r"(:\d{2}),(\d)", r"\1.\2", str(date).strip())
+    found = DATE.match(word)
+    if found is None:
+        return word
+    year, month, day = (found[name] or found[name.swapcase()] for name in "ymd")
+    return f"{year}-{month:>02}-{day:>02}{word[found.end() :]}"
 
-    Numbers too large for seconds since 1970 are milli-, micro- or nanoseconds since then.
+
+def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
+    """Times of day in seconds, on through midnight.
+
+    Raises:
+        ValueError: for what is none.
+    """
+    found = values.map(CLOCK.fullmatch)
+    if found.isna().any():
+        row = found.isna().idxmax()
+        raise ValueError(f"time has {values[row]!r} in row {row}, which is no time of day such as 12:00:00")
+    time = found.map(lambda parts: 3600.0 * int(parts[1]) + 60.0 * int(parts[2]) + float(parts[3]))
+    return time + DAY * (time.diff() < -0.5 * DAY).cumsum()
+
+
+def seconds(values: "pandas.Series") -> "pandas.Series":
+    """Times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
+
+    Times of day that come back by more than half a day are those of the next one. Dates are ISO 8601, with an offset
+    from UTC or without, or year/month/day or day.month.year and a time of day. Numbers too large for seconds since 1970
+    are milli-, micro- or nanoseconds since then.
 
     Raises:
         ValueError: for what is neither.
@@ -273,7 +328,16 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     types = pandas.api.types
     first = next(iter(values.dropna()), None)
     if isinstance(first, str) and first and pandas.isna(pandas.to_numeric(first, errors="coerce")):
-        dates = pandas.to_datetime(values.str.strip(), utc=True, format="ISO8601", errors="coerce")
+        values = values.astype(object).where(values.notna(), "").map(_rewrite_date)
+        if CLOCK.fullmatch(values.iloc[0]):
+            return _parse_times_of_day(values)
+        offset = values.str.contains(OFFSET)
+        if offset.any() and not offset.all():
+            raise ValueError(
+                f"time has {values[offset.idxmin()]!r} in row {offset.idxmin()}, without the offset from UTC that "
+                "other rows have: write it in all of them"
+            )
+        dates = pandas.to_datetime(values, utc=True, format="ISO8601", errors="coerce")
         if dates.isna().any():
             row = dates.isna().idxmax()
             raise ValueError(

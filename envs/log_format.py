@@ -36,6 +36,8 @@ class TrackLog(NamedTuple):
     """Time of the start of the track, s, as in the table."""
     time: numpy.ndarray
     """Of the measurements, likewise, ``(T,)``."""
+    notes: tuple[str, ...] = ()
+    """What was done to the table, a line each."""
 
 
 @dataclass(frozen=True)
@@ -56,5 +58,8 @@ class LogFormat:
     predict: Callable[[Any, Any], tuple[Any, Any]] | None = None
     """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
     was received: from the mean ``(C, N)`` after the measurement before, and the ``Measurement``."""
+    plane: tuple[str, ...] = ()
+    """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
+    empty where they may not."""
     longest_interval: float = float("inf")
     """Between measurements, s: what is longer in a table is taken for another unit."""

@@ -267,10 +267,13 @@ def check_recording(recording: "Recording", task: "Task", speeds: tuple[float, f
         except ValueError as error:
             raise ValueError(f"{name}{error}") from error
         notes += [f"{name}{note}" for note in found]
-    return [
-        *notes[:MOST_NOTES],
-        *([f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)),
-    ]
+    return limit_notes(notes)
+
+
+def limit_notes(notes: list[str]) -> list[str]:
+    """Return as many notes as somebody reads, and count the rest."""
+    more = [f"and {len(notes) - MOST_NOTES:,} more notes"] * (len(notes) > MOST_NOTES)
+    return [*notes[:MOST_NOTES], *more]
 
 
 def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) -> None:
@@ -284,11 +287,17 @@ def _check_truth(time: numpy.ndarray, truth: numpy.ndarray, names: list[str]) ->
     if pairs:
         places, rates = map(list, zip(*pairs, strict=True))
         what = ", ".join(f"truth_{names[i]}" for i in rates)
-        check_velocity(what, time, truth[:, places], truth[:, rates])
+        known = numpy.isfinite(truth[:, [*places, *rates]]).all(axis=1)
+        if known.sum() >= 3:
+            check_velocity(what, time[known], truth[known][:, places], truth[known][:, rates])
 
 
 def _check_apart(position: numpy.ndarray, truth: numpy.ndarray, sigma: numpy.ndarray) -> None:
     """Raise ValueError if the truth is nowhere near what was measured."""
+    known = numpy.isfinite(truth).all(axis=1)
+    if not known.any():
+        return
+    position, truth, sigma = position[known], truth[known], sigma[known]
     apart = float(numpy.median(_length(position - truth)))
     if apart > 100.0 * float(numpy.median(sigma)):
         ratio = float(numpy.median(_length(truth)) / numpy.median(_length(position)))

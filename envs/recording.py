@@ -55,13 +55,17 @@ class Recording:
         seconds: times since the start of the track, s, ``(E, T)``; NaN beyond the end of an episode.
         lengths: measurements acted on in each episode, ``(E,)``; if there is one more, the last observation shows it,
             otherwise the last measurement again.
-        truth: true values of the task's components in their units, ``(E, T, C)``; None where they are not known.
+        truth: true values of the task's components in their units, ``(E, T, C)``; NaN where one is not known, None
+            where none is.
         names: of the episodes; default: their numbers.
         parameters: of the environment, where they differ from the defaults; a horizon makes episodes shorter.
         name: of the whole, in reports.
         source: where the data come from, in words.
         licence: of the data, in words.
         notes: what is to be told of the reading, a line each.
+        log_time: times of the measurements as they stand in the log, numbers or words, ``(E, T)``; NaN or empty where
+            the log has no row. None: there is no other time than ``seconds``.
+        started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
 
     Raises:
         ValueError: for arrays that do not fit each other, or are not finite where they must be.
@@ -79,20 +83,26 @@ class Recording:
     source: str = ""
     licence: str = ""
     notes: tuple[str, ...] = ()
+    log_time: numpy.ndarray | None = None
+    started: Any = None
 
     def __post_init__(self) -> None:
         episodes, _ = self.seconds.shape
         if not self.names:
             object.__setattr__(self, "names", tuple(str(i) for i in range(episodes)))
-        arrays = {**self.measurements, "truth": self.truth}
+        if self.started is None:
+            object.__setattr__(self, "started", numpy.zeros(episodes))
+        arrays = {**self.measurements, "truth": self.truth, "log_time": self.log_time}
         for name, values in arrays.items():
             if values is not None and values.shape[:2] != self.seconds.shape:
                 raise ValueError(
                     f"{name} must have shape {self.seconds.shape} as seconds has, and further axes, got {values.shape}"
                 )
-        for name, values in {"length": self.lengths, **self.initial}.items():
-            if len(values) != episodes:
-                raise ValueError(f"{name} must be of {episodes} episodes, got {len(values)}")
+        for name, values in {"length": self.lengths, "started": self.started, **self.initial}.items():
+            if numpy.shape(values)[:1] != (episodes,):
+                raise ValueError(
+                    f"{name} must be of {episodes} episodes, got the shape {numpy.shape(values)}"
+                )
         if len(set(self.names)) != episodes:
             raise ValueError(
                 f"the {episodes} episodes of a recording need as many different names, got {self.names!r:.80}"
@@ -116,10 +126,9 @@ class Recording:
                 f"recording {name!r}: seconds must increase, and measurement {wrong + 2} has {times[wrong + 1]:g} s "
                 f"after {times[wrong]:g} s"
             )
-        checked = (
-            dict(self.measurements) if self.truth is None else {**self.measurements, "truth": self.truth}
-        )
-        for what, values in checked.items():
+        if self.truth is not None and numpy.isinf(self.truth[episode, :rows]).any():
+            raise ValueError(f"recording {name!r}: truth is infinite; what is not known of it is NaN")
+        for what, values in self.measurements.items():
             if not numpy.isfinite(values[episode, :rows]).all():
                 raise ValueError(
                     f"recording {name!r}: {what} is not finite at measurement {_first(values[episode]) + 1}; what is "
@@ -143,6 +152,25 @@ class Recording:
         there = numpy.isfinite(self.seconds)
         # From the last one backwards: what is missing before it is a mistake, and not the end.
         return self.seconds.shape[1] - numpy.argmax(there[:, ::-1], axis=1) * there.any(axis=1)
+
+    @functools.cached_property
+    def truth_known(self) -> numpy.ndarray:
+        """Which components of the truth are known at some measurement of every episode, booleans, ``(C,)``.
+
+        The truth must not be None.
+        """
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        truth: Any = self.truth
+        known: numpy.ndarray = numpy.logical_and(numpy.isfinite(truth), there[..., None]).any(axis=1)
+        return numpy.asarray(known.all(axis=0))
+
+    @functools.cached_property
+    def has_whole_truth(self) -> bool:
+        """Whether every component of the truth is known at every measurement."""
+        if self.truth is None:
+            return False
+        there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
+        return bool(numpy.isfinite(self.truth[there]).all())
 
     # --- as a scenario
 
@@ -230,6 +258,19 @@ class Recording:
                 f"recording {self.name!r}: truth has {self.truth.shape[2]} components and {task.id} has "
                 f"{len(task.components)}: {', '.join(c.name for c in task.components)}"
             )
+        if self.truth is not None and not self.has_whole_truth:
+            self._check_cost_known(task)
+
+    def _check_cost_known(self, task: Task) -> None:
+        """Raise ValueError if what is known of the truth of some episode does not say what an error costs."""
+        world, rows = task.World(task), self.rows
+        for episode, name in enumerate(self.names):
+            nothing = 0.0 * self.truth[episode, : rows[episode]].T  # type: ignore[index]
+            if not numpy.isfinite(world.error_cost(nothing)).any():
+                raise ValueError(
+                    f"recording {name!r}: what its truth holds does not say what an error costs in {task.id}: add "
+                    "more of its components, or leave the truth out"
+                )
 
     # --- as a file
 
@@ -284,6 +325,8 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
         "seconds": None,
         "lengths": None,
         "truth": None,
+        "log_time": None,
+        "started": None,
         "measurements": {},
         "initial": {},
     }
@@ -349,11 +392,12 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
     first, longest = recordings[0], max(one.seconds.shape[1] for one in recordings)
 
     def padded(values: numpy.ndarray) -> numpy.ndarray:
-        fill = numpy.nan if values.dtype.kind == "f" else 0
+        fill: Any = numpy.nan if values.dtype.kind == "f" else "" if values.dtype.kind == "U" else 0
         widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
         return numpy.pad(values, widths, constant_values=fill)
 
     truths = [padded(one.truth) for one in recordings if one.truth is not None]
+    times = [padded(one.log_time) for one in recordings if one.log_time is not None]
     return dataclasses.replace(
         first,
         measurements={
@@ -364,6 +408,8 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         seconds=numpy.concatenate([padded(one.seconds) for one in recordings]),
         lengths=numpy.concatenate([one.lengths for one in recordings]),
         truth=numpy.concatenate(truths) if len(truths) == len(recordings) else None,
+        log_time=numpy.concatenate(times) if len(times) == len(recordings) else None,
+        started=numpy.concatenate([one.started for one in recordings]),
         **{"names": tuple(name for one in recordings for name in one.names), **fields},
     )
 

@@ -22,7 +22,7 @@ from .task import Task
 if TYPE_CHECKING:
     import xarray
 
-OWN = ("seconds", "length", "truth")
+OWN = ("seconds", "length", "truth", "started")
 """Variables that are no measurements."""
 
 
@@ -45,15 +45,20 @@ def dataset_of(recording: Recording) -> "xarray.Dataset":
             name, [f"initial_{name}_axis{i}" for i in range(values.ndim - 1)]
         )
         variables[f"initial_{name}"] = (("episode", *axes), values)
+    if recording.started is not None and recording.started.any():
+        variables["started"] = ("episode", numpy.asarray(recording.started, dtype=float), {"units": "s"})
     if recording.truth is not None:
         variables["truth"] = (
             ("episode", "time", "component"),
             numpy.where(there[..., None], recording.truth, numpy.nan),
         )
     told = {name: getattr(recording, name) for name in ("source", "licence") if getattr(recording, name)}
+    coords: dict[str, Any] = {"recording": ("episode", numpy.array(recording.names, dtype=str))}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time)
     return xarray.Dataset(
         variables,
-        coords={"recording": ("episode", numpy.array(recording.names, dtype=str))},
+        coords=coords,
         attrs={
             "environment": recording.environment,
             "parameters": json.dumps(dict(recording.parameters)),
@@ -117,7 +122,8 @@ def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
         if variable.dtype.kind not in "fiub":
             raise ValueError(f"{variable_name} must be numbers, got {variable.dtype}")
         values = variable.values.astype(variable.dtype.newbyteorder("="))
-        leading = ("episode",) if variable_name.startswith("initial_") else ("episode", "time")
+        of_episode = variable_name.startswith("initial_") or variable_name == "started"
+        leading = ("episode",) if of_episode else ("episode", "time")
         if variable_name == "length":
             continue
         if variable.dims[: len(leading)] != leading:
@@ -126,8 +132,8 @@ def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
             )
         if variable_name.startswith("initial_"):
             fields["initial"][variable_name.removeprefix("initial_")] = values
-        elif variable_name == "truth":
-            fields["truth"] = values.astype(float)
+        elif variable_name in ("truth", "started"):
+            fields[variable_name] = values.astype(float)
         elif variable_name not in OWN:
             fields["measurements"][variable_name] = values
     rows = seconds.shape[1] - numpy.argmax(numpy.isfinite(seconds[:, ::-1]), axis=1)
@@ -137,6 +143,9 @@ def read_dataset(data: "xarray.Dataset", name: str) -> dict[str, Any]:
         fields["names"] = tuple(map(str, data["recording"].values.ravel().tolist()))
     elif len(seconds) == 1:
         fields["names"] = (name,)
+    if "log_time" in data.coords and data["log_time"].dims == ("episode", "time"):
+        times = data["log_time"].values
+        fields["log_time"] = times.astype(float) if times.dtype.kind in "fiu" else times.astype(str)
     return fields
 
 
@@ -193,6 +202,9 @@ def _start(cls: type[Task], fields: dict[str, Any], parameters: Mapping[str, Any
     except KeyError as error:
         raise ValueError(f"it lacks {error.args[0]}") from error
     if start.used:
+        fields["started"] = fields["seconds"][:, start.used - 1] - fields["seconds"][:, 0]
+        if "log_time" in fields:
+            fields["log_time"] = fields["log_time"][:, start.used :]
         fields["seconds"] = fields["seconds"][:, start.used :] - fields["seconds"][:, start.used - 1, None]
         fields["lengths"] = fields["lengths"] - start.used
         if fields["truth"] is not None:

@@ -156,7 +156,10 @@ class Task(ABC):
     recording: Any
     """The :class:`~.recording.Recording` that is replayed in place of a simulated world; None where there is none."""
     has_truth: bool
-    """Whether the true values are known: a recording may lack them, and then there are no errors and no costs."""
+    """Whether true values are known: a recording may lack them, and then there are no errors and no costs."""
+    has_whole_truth: bool
+    """Whether every component's is, at every measurement: a recording may lack some, which are NaN. What they would be
+    compared with is then left out of errors, and rewards, which need all, are zero."""
     flights: tuple[int, ...] = ()
     """Where every episode flies one of several, measurements acted on in each of them, all multiples of
     ``decision_interval``; the longest is the horizon. The first uniform number of the episode draws it."""
@@ -175,6 +178,7 @@ class Task(ABC):
         self.parameters = parameters
         self.recording = recording
         self.has_truth = recording is None or recording.truth is not None
+        self.has_whole_truth = recording is None or recording.has_whole_truth
         self.horizon = parameters.horizon
         self.decision_interval = parameters.decision_interval
         self.xp = xp

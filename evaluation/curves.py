@@ -101,8 +101,9 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
-    """Return the groups of components, where there are any, else the first three components."""
-    return list(groups_of(dataset)) or list(components_and_groups(dataset))[:3]
+    """Return the groups of components, where there are any, else the first three; those whose truth is known."""
+    reported = list(components_and_groups(dataset))
+    return [name for name in groups_of(dataset) if name in reported] or reported[:3]
 
 
 def curve_statistics(

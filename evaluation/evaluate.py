@@ -3,6 +3,7 @@
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from ..envs.catalogue import find_scenario, importable_name, make_task, nearest,
 from ..envs.compiled import Report
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
+from ..envs.recording import Recording
 from ..envs.reward import charge
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
@@ -91,9 +93,33 @@ def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
         "error": error,
         "cost": model.cost(episode),
         "charge": charge(model, episode),
-        "nees": log_density(error, model.covariance(episode))[1],
+        **_normalised_error(model, error, model.covariance(episode)),
         **model.records(episode),
     }
+
+
+def _normalised_error(model: Model, error: Any, covariance: Any) -> dict[str, Any]:
+    """Normalised squared error of the components whose truth is known, with their marginal covariance.
+
+    Args:
+        model: task with a filter.
+        error: estimate minus truth, ``(C, N)``; NaN where the truth is not known.
+        covariance: reported for it, ``(C, C, N)``.
+
+    Returns:
+        ``nees``, ``(N,)``; where some truth is not known, NaN where none is, and beside it how many components are
+        known, ``nees_degrees``.
+    """
+    if model.task.has_whole_truth:
+        return {"nees": log_density(error, covariance)[1]}
+    xp = model.task.xp
+    known = error == error  # no number differs from itself
+    # A component of its own, with error zero: what remains is the quadratic form of the marginal covariance.
+    pairs = known[:, None] & known[None]
+    apart = xp.eye(len(model.task.components), dtype=error.dtype, device=error.device)[:, :, None]
+    squared = log_density(xp.where(known, error, 0.0), xp.where(pairs, covariance, apart))[1]
+    degrees = xp.sum(xp.where(known, 1.0, 0.0), axis=0)
+    return {"nees": xp.where(degrees > 0.0, squared, math.nan), "nees_degrees": degrees}
 
 
 def _expectation_report(model: Model, episode: Episode) -> dict[str, Any]:
@@ -226,8 +252,9 @@ def run_experiment(
         track, where measurements come regularly. Of a set of flights ``flight`` and ``length`` say which each episode
         flies and its measurements; what lies beyond is NaN. The attribute ``notes`` tells what was left out. Of a
         recording likewise, where ``flight`` names the episode of the recording; without truth there are neither
-        ``error``, ``cost``, ``charge`` nor ``nees``. ``to_netcdf`` saves it; :mod:`.evaluation.dataset` reads windows,
-        groups and keywords out of it.
+        ``error``, ``cost``, ``charge`` nor ``nees``, and where some of it is not known, errors of that are NaN,
+        ``nees`` is of the other components, ``nees_degrees`` of them, and ``truth_known`` says which they are.
+        ``to_netcdf`` saves it; :mod:`.evaluation.dataset` reads windows, groups and keywords out of it.
 
     Raises:
         ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
@@ -389,6 +416,10 @@ class Plan(NamedTuple):
                 flight=("episode", [self.scenario.flights[i] for i in self.flown]),
                 length=("episode", self.lengths),
             )
+            if self.scenario.recording is not None:
+                dataset = dataset.assign_coords(
+                    _recording_coords(self.scenario.recording, self.flown, dataset)
+                )
         return dataset.assign_attrs(
             paper=experiment.paper,
             reference=experiment.reference,
@@ -396,6 +427,30 @@ class Plan(NamedTuple):
             recorded=int(self.scenario.recording is not None),
             truth=int(next(iter(self.models.values())).task.has_truth),
         )
+
+
+def _recording_coords(
+    recording: Recording, episodes: numpy.ndarray, dataset: xarray.Dataset
+) -> dict[str, Any]:
+    """What the evaluation of a recording says of its log.
+
+    Args:
+        recording: that is replayed.
+        episodes: number of its episode that each episode of the evaluation replays, ``(M,)``.
+        dataset: the evaluation.
+
+    Returns:
+        Coordinates: ``started``, seconds from the first measurement of the log to the start of the track; ``log_time``
+        of every measurement, where the log has times of its own; ``truth_known`` of every component, where the truth
+        of some is not known.
+    """
+    length = dataset.sizes["time"]
+    coords: dict[str, Any] = {"started": ("episode", recording.started[episodes], {"units": "s"})}
+    if recording.log_time is not None:
+        coords["log_time"] = (("episode", "time"), recording.log_time[episodes, :length])
+    if recording.truth is not None and not recording.truth_known.all():
+        coords["truth_known"] = ("component", recording.truth_known.astype(numpy.int32))
+    return coords
 
 
 def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:

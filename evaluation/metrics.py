@@ -66,9 +66,13 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
 
 
 def components_and_groups(dataset: xarray.Dataset) -> dict[str, str]:
-    """Components and groups of components, with their units."""
+    """Components and groups of components whose truth is known, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
-    return units | {name: units[parts[0]] for name, parts in groups_of(dataset).items()}
+    if "truth_known" in dataset.coords:
+        known = dataset["truth_known"].values > 0
+        units = {name: unit for (name, unit), judged in zip(units.items(), known, strict=True) if judged}
+    groups = groups_of(dataset).items()
+    return units | {name: units[parts[0]] for name, parts in groups if {*parts} <= {*units}}
 
 
 def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
@@ -217,9 +221,9 @@ def consistency_metrics(run: xarray.Dataset) -> list[str]:
 
 def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:
     """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
-    if metric == "nees":
+    if metric == "nees" and "nees_degrees" not in run:
         return numpy.full(run["nees"].shape, float(run.sizes["component"]))
-    return numpy.nan_to_num(run["nis_degrees"].values)
+    return numpy.nan_to_num(run[f"{metric}_degrees"].values)
 
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:

@@ -97,11 +97,21 @@ class Series:
             kept = values[..., :count]
             # A view of a few episodes would keep the numbers of all.
             kept = kept.copy() if count < self.episodes else kept
-            self._values[name].append(numpy.moveaxis(kept, -1, 0))
+            self._values[name].append(kept)
 
     def arrays(self) -> dict[str, numpy.ndarray]:
         """Return what was kept, ``(episodes, time, ...)`` by name."""
-        return {name: numpy.stack(values, axis=1) for name, values in self._values.items()}
+        return {name: _by_episodes(values) for name, values in self._values.items()}
+
+
+def _by_episodes(values: Sequence[numpy.ndarray]) -> numpy.ndarray:
+    """Put the arrays ``(..., N)`` of T measurements into one, ``(N, T, ...)``, rows one after the other."""
+    first = values[0]
+    together = numpy.empty(
+        (first.shape[-1], len(values), *first.shape[:-1]), dtype=numpy.result_type(*values[:1])
+    )
+    numpy.stack(values, out=numpy.moveaxis(together, 0, -1), casting="same_kind")
+    return together
 
 
 def run_competitor(

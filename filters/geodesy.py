@@ -75,3 +75,28 @@ def east_north(latitude: Array, longitude: Array, height: Array, site: tuple[flo
     """
     away = earth_fixed(latitude, longitude, height) - earth_fixed(*site, 0.0)[:, None]
     return (east_north_up(*site) @ away)[:2]
+
+
+def geodetic(position: Array) -> Array:
+    """Latitude, rad, longitude, rad, and height above the ellipsoid, m, of Earth-fixed coordinates, ``(3, n)``.
+
+    The inverse of :func:`earth_fixed`, within a hundredth of a micrometre near the ground: Bowring's formula, The
+    accuracy of geodetic latitude and height equations, Survey Review 28, 1985.
+
+    Args:
+        position: Earth-fixed, m, ``(3, n)``, not near the Earth's centre.
+    """
+    x, y, z = position
+    axis = numpy.hypot(x, y)
+    minor = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
+    second = ECCENTRICITY_SQUARED / (1.0 - ECCENTRICITY_SQUARED)
+    distance = numpy.hypot(axis, z)
+    # Of the reduced latitude the tangent.
+    reduced = numpy.arctan2(minor * z * (1.0 + second * minor / distance), SEMI_MAJOR_AXIS * axis)
+    latitude = numpy.arctan2(
+        z + second * minor * numpy.sin(reduced) ** 3,
+        axis - ECCENTRICITY_SQUARED * SEMI_MAJOR_AXIS * numpy.cos(reduced) ** 3,
+    )
+    sine, cosine = numpy.sin(latitude), numpy.cos(latitude)
+    height = axis * cosine + z * sine - SEMI_MAJOR_AXIS * numpy.sqrt(1.0 - ECCENTRICITY_SQUARED * sine**2)
+    return numpy.array([latitude, numpy.arctan2(y, x), height])

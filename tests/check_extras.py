@@ -64,6 +64,14 @@ pyarrow.parquet.write_table(pyarrow.table(track), 'flight.parquet')
 data = xarray.Dataset({name: ('time', track[name]) for name in ('x', 'y')}, {'time': time})
 data.to_netcdf('flight.nc', engine='h5netcdf')"""
 FLOWN = f"{EVALUATE} --policy imm --scenario"
+RECORDED = f"filtergym evaluate {ID} --policy imm --speeds 0,100 --recording"
+LOGS = """
+from pathlib import Path
+from test_receiver_logs import NEW, TIME, bag, nmea, places, ulog
+nmea(Path('log.nmea'))
+rows = [(round(1e6 * t), *place, 2.0, 3) for t, place in zip(TIME, places().T)]
+ulog(Path('log.ulg'), NEW, rows)
+bag(Path('log.bag'))"""
 VIDEO = f"""
 import gymnasium, filtergym
 env = gymnasium.make({ID!r}, render_mode='rgb_array', horizon=5)
@@ -80,6 +88,7 @@ NEEDS = {
     "report": [Need("filtergym report results.json --out report.html", RESULTS)],
     "render": [Need(f"python -c {shlex.quote(VIDEO)}", refusal="moviepy is not installed")],
     "flights": [Need(f"{FLOWN} flight.parquet", FLIGHT), Need(f"{FLOWN} flight.nc", FLIGHT)],
+    "logs": [Need(f"{RECORDED} log{suffix}", LOGS) for suffix in (".nmea", ".ulg", ".bag")],
     "adapters": [
         Need(f"{EVALUATE} --policy {name}:Kalman", ESTIMATORS)
         for name in ("filterpy_filters", "stone_soup_kalman")

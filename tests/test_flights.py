@@ -380,7 +380,7 @@ def test_millions_of_rows_are_refused_before_they_are_read(tmp_path, monkeypatch
     parquet.write_table(pyarrow.table(ONE), tmp_path / "a.parquet")
     data = {name: ("time", values) for name, values in ONE.items()}
     xarray.Dataset(data).to_netcdf(tmp_path / "a.nc", engine="scipy")
-    for suffix in flight_tables.FLIGHT_SUFFIXES:
+    for suffix in (".csv", ".nc", ".parquet", ".json", ".json.gz"):
         with pytest.raises(ValueError, match="it has more than 30 rows"):
             read_flights(tmp_path / f"a{suffix}")
     monkeypatch.setattr(flight_tables, "MOST_BYTES", 300)

@@ -548,22 +548,20 @@ def test_missed_and_irregular_scans_are_replayed_bit_for_bit(scenario, tmp_path)
 def test_a_folder_is_one_recording_and_broken_files_are_named(tmp_path):
     table(tmp_path / "a.csv", **PLOTS)
     table(tmp_path / "b.csv", **{name: values[:4] for name, values in PLOTS.items()})
-    table(tmp_path / "c.csv", **changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]))
+    table(tmp_path / "c.csv", **changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]))
     table(tmp_path / "d.csv", **changed(time=[0.0, 6.0, 12.0, 18.0, 24.0]))
     for source in (tmp_path, str(tmp_path / "*.csv"), [tmp_path / f"{name}.csv" for name in "abcd"]):
         read = read_recording(source, TARGET)
         assert read.names == ("a", "b")
         assert read.lengths.tolist() == [3, 2]
         assert read.notes == (
-            "c.csv: left out: time is the same in rows 1 and 2: rows must be in the order of their times",
+            "c.csv: left out: time decreases between rows 1 and 2: rows must be in the order of their times",
             "d: left out: sampling_interval is 6.0, and of a 5.0",
         )
     dataset = evaluate(TARGET, ["imm"], scenario=read)
     assert notes_of(dataset) == list(read.notes)
     assert np.isfinite(dataset["nis"].values[0]).sum(axis=1).tolist() == [3, 2]
-    with pytest.raises(
-        ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time is the same"
-    ):
+    with pytest.raises(ValueError, match=r"nothing of .* can be replayed: c\.csv: left out: time decreases"):
         read_recording([tmp_path / "c.csv"] * 2, TARGET)
 
 
@@ -606,7 +604,11 @@ WRONG = {
     ),
     "words": (TARGET, changed(x=["a", 1.0, 2.0, 3.0, 4.0]), "x has 'a' in row 0, which is no number"),
     "decreasing": (TARGET, changed(time=[0.0, 5.0, 4.0, 15.0, 20.0]), "time decreases between rows 1 and 2"),
-    "twice": (TARGET, changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]), "time is the same in rows 1 and 2"),
+    "twice": (
+        TARGET,
+        changed(time=[0.0, 5.0, 5.0, 15.0, 20.0]),
+        "time is the same in rows 1 and 2: 1 of 5 rows",
+    ),
     "no time": (TARGET, changed(time=None), "reads time and x, y"),
     "two rows": (TARGET, {name: values[:2] for name, values in PLOTS.items()}, "it has 2 plots"),
     "one row": (
@@ -624,7 +626,17 @@ WRONG = {
         {"time": PLOTS["time"], "range": [9e3, -1.0, 1.0, 1.0, 1.0], "azimuth": [1.0] * 5},
         "range is a distance, and row 1 has -1 m",
     ),
-    "half the truth": (TARGET, changed(truth_position_x=[1.0] * 5), "truth needs every component"),
+    "half the truth": (TARGET, changed(truth_position_x=[1.0] * 5), "the column truth_position_y is missing"),
+    "no such truth": (
+        TARGET,
+        changed(truth_height=[1.0] * 5),
+        "truth_height is no truth of filtergym/ManeuveringTarget-v0, whose components are truth_position_x",
+    ),
+    "truth without a cost": (
+        TARGET,
+        changed(truth_velocity_x=[1.0] * 5, truth_velocity_y=[1.0] * 5),
+        "does not say what an error costs",
+    ),
     "irregular": (
         LOOSE,
         {**LOG, "time": [0.0, 1.0, 2.0, 4.0]},

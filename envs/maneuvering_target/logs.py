@@ -1,6 +1,7 @@
 """Radar plots of a user's own as measurements of ManeuveringTarget.
 
-x is east and y is north of the radar; an azimuth is counted clockwise from north. The track starts from the first two
+x is east and y is north of the radar; an azimuth is counted clockwise from north. Latitude and longitude, of a
+receiver, become x and y around the first of them. The track starts from the first two
 plots, equation (24): the position of the second, and the difference of both over the time between them, with the
 covariance that belongs to it.
 """
@@ -22,11 +23,16 @@ COLUMNS = {
     "y": "m, north of it",
     "range": "m, in place of x and y",
     "azimuth": "degrees clockwise from north, likewise",
+    "latitude": "degrees, in place of x and y",
+    "longitude": "degrees, likewise",
+    "altitude": "m above the ellipsoid, beside them; optional",
     "sigma_x": "m, standard deviation of x; optional",
     "sigma_y": "m, likewise",
     "range_sigma": "m, standard deviation of the range; optional, default: the parameter",
     "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
 }
+FINER = 10.0
+"""Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
 PAIRS = (("x", "y"), ("range", "azimuth"), ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma"))
 FARTHEST_RANGE = 500e3
 """m; what lies beyond this is taken for a mistake of units."""
@@ -50,6 +56,8 @@ def read_log(columns: Columns) -> TrackLog:
         row = int(numpy.flatnonzero(numpy.isfinite(position).any(axis=1) & ~there)[0])
         raise ValueError(f"row {row} has one coordinate of two")
     variance = _variances(columns, position, there)
+    stale = _find_stale(columns, position, numpy.sqrt(variance))
+    there &= ~stale
     farthest = float(numpy.hypot(*position[there].T).max(initial=0.0))
     if farthest > FARTHEST_RANGE:
         raise ValueError(
@@ -84,6 +92,52 @@ def read_log(columns: Columns) -> TrackLog:
         parameters,
         float(columns.time[first]),
         time,
+        (*_stale_notes(stale), *_gap_notes(rows)),
+    )
+
+
+def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray) -> numpy.ndarray:
+    """Find positions that are those of the row before: no new measurement, ``(rows,)``.
+
+    A receiver that stands still may give the same numbers again. So they are stale only where noise of the stated size,
+    in the resolution of the numbers, would hardly ever give both again.
+
+    Args:
+        columns: of one track.
+        position: m, ``(rows, 2)``; NaN where there is none.
+        sigma: of their errors, m, likewise.
+    """
+    measured = position
+    if columns.origin is not None:  # x and y change with altitude, too
+        across = 111e3 * numpy.cos(numpy.radians(columns.origin[0]))
+        measured = numpy.stack([across * columns["longitude"], 111e3 * columns["latitude"]], axis=1)
+    stale = numpy.zeros(len(position), dtype=bool)
+    there = numpy.flatnonzero(numpy.isfinite(position).all(axis=1))
+    repeated = (numpy.diff(measured[there], axis=0) == 0.0).all(axis=1)
+    if repeated.any():
+        # Of two different numbers the nearest: what a column is written in, or finer.
+        finest = [numpy.diff(numpy.unique(values)).min(initial=numpy.inf) for values in measured[there].T]
+        if (numpy.median(sigma[there], axis=0) >= FINER * numpy.array(finest)).all():
+            stale[there[1:]] = repeated
+    return stale
+
+
+def _stale_notes(stale: numpy.ndarray) -> tuple[str, ...]:
+    count = int(stale.sum())
+    if not count:
+        return ()
+    what = "row repeats" if count == 1 else "rows repeat"
+    return (
+        f"{count:,} {what} the position of the row before: left out as measurements, the first is row {stale.argmax()}",
+    )
+
+
+def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
+    count = int((rows < 0).sum())
+    return (
+        (f"{count:,} scan{'s have' if count > 1 else ' has'} no row: they missed the target",)
+        if count
+        else ()
     )
 
 
@@ -149,7 +203,10 @@ def _positions(columns: Columns) -> numpy.ndarray:
     if columns.has("x", "y"):
         return numpy.stack([columns["x"], columns["y"]], axis=1)
     if not columns.has("range", "azimuth"):
-        raise ValueError("it needs x and y (m), or range (m) and azimuth (degrees clockwise from north)")
+        raise ValueError(
+            "it needs x and y (m), or range (m) and azimuth (degrees clockwise from north), or latitude and longitude "
+            "(degrees)"
+        )
     distance, azimuth = columns["range"], numpy.radians(columns["azimuth"])
     if (distance < 0.0).any():
         row = int(numpy.argmax(distance < 0.0))
@@ -167,6 +224,15 @@ def _variances(columns: Columns, position: numpy.ndarray, there: numpy.ndarray) 
     variance = numpy.full(position.shape, numpy.nan)
     if columns.has("sigma_x", "sigma_y"):
         variance[there] = columns.only(there).sigmas("sigma_x", "sigma_y") ** 2
+        return variance
+    if columns.origin is not None:
+        # No radar stands at the first position, by whose distance errors could be told.
+        if "range_sigma" not in columns.given:
+            raise ValueError(
+                "nothing says how large the errors of latitude and longitude are: add the columns sigma_x and sigma_y "
+                "(m, east and north; of NMEA the sentences GST), or name one deviation of both, --set range_sigma=3"
+            )
+        variance[there] = float(columns.given["range_sigma"]) ** 2
         return variance
     if columns.has("range_sigma", "azimuth_sigma"):
         sigmas = columns.only(there).sigmas("range_sigma", "azimuth_sigma").T
@@ -227,5 +293,6 @@ LOG_FORMAT = LogFormat(
     targets_move=True,
     scale_noise=scale_noise,
     predict=predict_position,
+    plane=("x", "y", "truth_position_x", "truth_position_y"),
     longest_interval=60.0,
 )

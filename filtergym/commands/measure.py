@@ -113,8 +113,8 @@ def evaluate_policies(
     recording: Annotated[
         str | None,
         typer.Option(
-            help="In place of a scenario: what sensors really said, NetCDF or tables (CSV): a file, a folder, or a "
-            "pattern in quotes."
+            help="In place of a scenario: what sensors really said, NetCDF, tables (CSV) or logs of receivers (.pos, "
+            ".nmea): a file, a folder, or a pattern in quotes."
         ),
     ] = None,
     estimates: Annotated[

@@ -1,0 +1,400 @@
+"""Logs as they come: truth of positions only, latitude and longitude, decimal commas, gaps, duplicates and clocks."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pandas
+import pymap3d
+import pytest
+from filtergym.envs.flight_tables import seconds
+from filtergym.evaluation.estimates import write_estimates
+
+from filtergym import evaluate, read_recording, tidy_records
+
+TARGET = "filtergym/ManeuveringTarget-v0"
+COUNT = 60
+TIME = 5.0 * np.arange(COUNT)
+ORIGIN = (48.7, 2.4, 120.0)
+"""Latitude, longitude and height."""
+
+
+def aircraft(**changes):
+    """Plots of a slow turn, with deviations and the truth; columns that are None are left out."""
+    heading = 0.01 * np.maximum(TIME - 100.0, 0.0)
+    velocity = 150.0 * np.stack([np.cos(heading), np.sin(heading)])
+    truth = np.cumsum(5.0 * velocity, axis=1)
+    plots = truth + np.random.default_rng(0).normal(0.0, 40.0, truth.shape)
+    columns = {"time": TIME, "x": plots[0], "y": plots[1], "sigma_x": np.full(COUNT, 40.0)}
+    columns |= {"sigma_y": np.full(COUNT, 40.0), "truth_position_x": truth[0], "truth_position_y": truth[1]}
+    columns |= {"truth_velocity_x": velocity[0], "truth_velocity_y": velocity[1]}
+    return pandas.DataFrame({name: v for name, v in {**columns, **changes}.items() if v is not None})
+
+
+def untold(**changes):
+    """Without the truth."""
+    found = aircraft(**changes)
+    return found[[name for name in found if not name.startswith("truth_")]]
+
+
+def read(log, tmp_path, **options):
+    """Write a table and read it as a recording."""
+    log.to_csv(tmp_path / "log.csv", index=False, **options)
+    return read_recording(tmp_path / "log.csv", TARGET)
+
+
+def same_measurements(one, other):
+    """Whether two recordings are bit for bit the same, but for what they are called."""
+    np.testing.assert_array_equal(one.seconds, other.seconds)
+    for name, values in one.measurements.items():
+        np.testing.assert_array_equal(values, other.measurements[name])
+
+
+# --- truth that is known in part
+
+
+def marginal(error, covariance):
+    """Oracle: squared Mahalanobis distance of the components that are known, and how many they are."""
+    known = np.isfinite(error)
+    if not known.any():
+        return np.nan, 0
+    inverse = np.linalg.inv(covariance[np.ix_(known, known)])
+    return error[known] @ inverse @ error[known], known.sum()
+
+
+@pytest.mark.parametrize("backend", ["numpy", "auto"])
+def test_what_is_not_known_of_the_truth_is_left_out(backend, tmp_path):
+    log = aircraft()
+    holes = log.copy()
+    holes.loc[10:19, ["truth_velocity_x", "truth_velocity_y"]] = np.nan
+    holes.loc[30:34, [name for name in holes if name.startswith("truth_")]] = np.nan
+    whole = evaluate(TARGET, ["imm", "bptt"], scenario=read(log, tmp_path), tracks=True, backend=backend)
+    found = evaluate(TARGET, ["imm", "bptt"], scenario=read(holes, tmp_path), tracks=True, backend=backend)
+    np.testing.assert_array_equal(found["estimate"].values, whole["estimate"].values)
+    # The first two rows make the start.
+    unknown = np.isnan(holes.iloc[2:, 5:].to_numpy())
+    np.testing.assert_array_equal(np.isnan(found["error"].values[0, 0]), unknown)
+    kept = np.where(unknown, np.nan, whole["error"].values)
+    np.testing.assert_array_equal(found["error"].values, kept)
+    cost = np.where(unknown[:, 0], np.nan, whole["cost"].values)
+    np.testing.assert_array_equal(found["cost"].values, cost)
+    for policy in range(2):
+        for i in range(COUNT - 2):
+            expected = marginal(found["error"].values[policy, 0, i], found["covariance"].values[policy, 0, i])
+            nees = found["nees"].values[policy, 0, i]
+            # Two ways to invert covariances whose condition is below 1e4.
+            np.testing.assert_allclose(nees, expected[0], rtol=1e-10)
+            assert found["nees_degrees"].values[policy, 0, i] == expected[1]
+    records = {(r.policy, r.metric, r.component, r.window): r.value for r in tidy_records(found)}
+    for i, policy in enumerate(("imm", "bptt")):
+        squares = kept[i, 0] ** 2
+        position = np.sqrt(np.nanmean(squares[:, 0] + squares[:, 1]))
+        np.testing.assert_allclose(records[policy, "rmse", "position", "all"], position, rtol=1e-12)
+        np.testing.assert_allclose(records[policy, "cost", "", "all"], np.nanmean(cost[i]), rtol=1e-12)
+        of_each = found["nees"].values[i, 0] / np.where(unknown[:, 0], np.nan, 4.0 - 2.0 * unknown[:, 2])
+        np.testing.assert_allclose(records[policy, "anees", "state", "all"], np.nanmean(of_each), rtol=1e-12)
+
+
+def test_positions_alone_judge_positions(tmp_path):
+    log = aircraft(truth_velocity_x=None, truth_velocity_y=None)
+    recording = read(log, tmp_path)
+    assert recording.notes == (
+        "no truth of velocity_x, velocity_y: errors and NEES are of the other components",
+    )
+    assert not recording.has_whole_truth
+    found = evaluate(TARGET, ["imm", "kalman-imm"], scenario=recording)
+    records = tidy_records(found)
+    assert {r.component for r in records if r.metric == "rmse"} == {"position_x", "position_y", "position"}
+    whole = {
+        (r.policy, r.metric, r.component): r.value
+        for r in tidy_records(evaluate(TARGET, ["imm", "kalman-imm"], scenario=read(aircraft(), tmp_path)))
+    }
+    for r in records:
+        if r.metric in ("rmse", "cost", "relative_cost_difference", "log_likelihood") and r.window == "all":
+            assert r.value == whole[r.policy, r.metric, r.component]
+    assert (found["nees_degrees"].values == 2.0).all()
+    # A file of it says the same.
+    recording.write(tmp_path / "again.nc")
+    again = evaluate(TARGET, ["imm"], scenario=read_recording(tmp_path / "again.nc"))
+    np.testing.assert_array_equal(again["nees"].values[0], found["nees"].values[0])
+
+
+def test_rewards_need_the_whole_truth(tmp_path):
+    import gymnasium as gym
+
+    recording = read(aircraft(truth_velocity_x=None, truth_velocity_y=None), tmp_path)
+    env = gym.make(TARGET, scenario=recording)
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[1] == 0.0
+    with pytest.raises(
+        ValueError, match=r"lacks some of the truth, so the reward .* leave out reward='cost'"
+    ):
+        gym.make(TARGET, scenario=recording, reward="cost")
+
+
+def test_scans_without_a_row_have_no_truth(tmp_path):
+    log = aircraft()
+    time = TIME + np.random.default_rng(1).uniform(-1.0, 1.0, COUNT)
+    recording = read(log.assign(time=time).drop(index=range(20, 26)), tmp_path)
+    assert recording.notes == ("6 scans have no row: they missed the target",)
+    truth = recording.truth[0]
+    assert np.isnan(truth).all(axis=1).nonzero()[0].tolist() == [*range(18, 24)]
+    np.testing.assert_array_equal(truth[24:], log.iloc[26:, 5:].to_numpy())
+    found = evaluate(TARGET, ["imm"], scenario=recording)
+    assert np.isfinite([r.value for r in tidy_records(found) if r.metric in ("rmse", "cost", "anees")]).all()
+
+
+def test_truth_is_not_infinite(tmp_path):
+    recording = read(aircraft(), tmp_path)
+    with pytest.raises(ValueError, match="truth is infinite; what is not known of it is NaN"):
+        dataclasses.replace(recording, truth=np.where(recording.truth > 1e3, np.inf, recording.truth))
+
+
+# --- latitude and longitude
+
+
+def geodetic(x, y, up=30.0):
+    """Latitude, longitude and height of metres east and north of the origin, by another library."""
+    found = pymap3d.enu2geodetic(x, y, np.full(len(x), up), *ORIGIN)
+    return dict(zip(("lat", "lon", "altitude"), found, strict=True))
+
+
+def test_latitude_and_longitude_become_metres_around_the_first(tmp_path):
+    log = aircraft(truth_velocity_x=None, truth_velocity_y=None)
+    places = geodetic(log["x"], log["y"])
+    true = geodetic(log["truth_position_x"], log["truth_position_y"])
+    true = {f"truth_{name}": values for name, values in true.items()}
+    log = log.drop(columns=["x", "y", "truth_position_x", "truth_position_y"]).assign(**places, **true)
+    recording = read(log, tmp_path)
+    first = (places["lat"][0], places["lon"][0])
+    east, north, _ = pymap3d.geodetic2enu(places["lat"], places["lon"], places["altitude"], *first, 0.0)
+    # Both round Earth-fixed coordinates of 6e6 m.
+    position = recording.measurements["position"][0]
+    np.testing.assert_allclose(position, np.stack([east, north], axis=1)[2:], atol=1e-8)
+    east, north, _ = pymap3d.geodetic2enu(*true.values(), *first, 0.0)
+    np.testing.assert_allclose(recording.truth[0, :, :2], np.stack([east, north], axis=1)[2:], atol=1e-8)
+    assert recording.notes[1] == (
+        f"x is east and y north of latitude {first[0]:.8f}, longitude {first[1]:.8f}, the first position"
+    )
+
+
+def test_heights_that_lack_are_those_of_the_others(tmp_path):
+    """At 1.6 km a height of zero would move a target at 10 km by 2.5 m."""
+    log = untold()
+    log = log.drop(columns=["x", "y"]).assign(**geodetic(log["x"], log["y"], 1600.0))
+    whole = read(log.assign(altitude=1720.0, truth_lat=log["lat"], truth_lon=log["lon"]), tmp_path)
+    position = whole.measurements["position"]
+    assert np.abs(position).max() > 10e3
+    np.testing.assert_array_equal(whole.truth[..., :2], position)
+    some = log["altitude"].where(np.arange(COUNT) % 3 == 0) * 0.0 + 1720.0
+    np.testing.assert_array_equal(
+        read(log.assign(altitude=some), tmp_path).measurements["position"], position
+    )
+
+
+def test_of_several_altitudes_one_is_taken(tmp_path):
+    log = untold()
+    log = log.drop(columns=["x", "y"]).assign(**geodetic(log["x"], log["y"]))
+    recording = read(log, tmp_path)
+    several = log.rename(columns={"altitude": "geoaltitude"}).assign(
+        baroaltitude=9e9, latitude=log["lat"], lat=0.0
+    )
+    again = read(several, tmp_path)
+    same_measurements(again, recording)
+    assert again.notes[0] == "not read: columns lat, baroaltitude"
+
+
+def test_truth_that_one_file_lacks_judges_nobody(tmp_path):
+    aircraft().to_csv(tmp_path / "a.csv", index=False)
+    aircraft(truth_velocity_x=None, truth_velocity_y=None).to_csv(tmp_path / "b.csv", index=False)
+    recording = read_recording(tmp_path, TARGET)
+    assert recording.truth_known.tolist() == [True, True, False, False]
+    records = tidy_records(evaluate(TARGET, ["imm"], scenario=recording))
+    assert {r.component for r in records if r.metric == "rmse"} == {"position_x", "position_y", "position"}
+    assert all(r.value is not None for r in records)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"sigma_x": None, "sigma_y": None}, "nothing says how large the errors of latitude and longitude are"),
+        ({"lon": None}, "lacks the column longitude, which belongs to latitude and longitude"),
+        ({"lat": np.full(COUNT, 4870.0)}, "latitude reaches 4870, and degrees from -90 to 90"),
+        ({"lat": None, "lon": np.full(COUNT, np.nan), "latitude": np.full(COUNT, np.nan)}, "no row has latitude"),
+        ({"truth_lat": np.full(COUNT, 48.0)}, "lacks the column truth_longitude"),
+        ({"x": TIME, "y": TIME}, "it has x and latitude: leave one of them out"),
+        (
+            {"x": TIME, "y": TIME, "lat": None, "lon": None, "truth_lat": TIME / 100.0, "truth_lon": TIME / 100.0},
+            "it has truth_latitude and no latitude: nobody knows where x and y begin",
+        ),
+    ],
+)  # fmt: skip
+def test_wrong_places_are_one_sentence(changes, sentence, tmp_path):
+    log = untold()
+    columns = {**log.drop(columns=["x", "y"]), **geodetic(log["x"], log["y"]), **changes}
+    with pytest.raises(ValueError, match=r"recording .*log\.csv: ") as refusal:
+        read(pandas.DataFrame({n: v for n, v in columns.items() if v is not None}), tmp_path)
+    assert sentence in str(refusal.value)
+
+
+def test_one_deviation_of_latitude_and_longitude_can_be_named(tmp_path):
+    log = untold(sigma_x=None, sigma_y=None)
+    log.drop(columns=["x", "y"]).assign(**geodetic(log["x"], log["y"])).to_csv(
+        tmp_path / "log.csv", index=False
+    )
+    recording = read_recording(tmp_path / "log.csv", TARGET, range_sigma=40.0)
+    assert (recording.measurements["variance"] == 1600.0).all()
+
+
+# --- decimal commas, duplicates, repeats
+
+
+def test_decimal_commas(tmp_path):
+    log = aircraft().round(3)
+    other = read(log, tmp_path)
+    same_measurements(read(log, tmp_path, sep=";", decimal=","), other)
+    same_measurements(read(log, tmp_path, sep="\t", decimal=","), other)
+
+
+def test_points_between_thousands_are_refused(tmp_path):
+    log = untold().astype({"x": object})
+    log.loc[3, "x"] = "19.337,5"
+    with pytest.raises(ValueError, match=r"x has '19\.337,5' in row 3, which is no number"):
+        read(log, tmp_path, sep=";")
+
+
+def test_rows_that_come_twice_are_left_out(tmp_path):
+    log = aircraft()
+    recording = read(pandas.concat([log.iloc[:21], log.iloc[20:]]), tmp_path)
+    same_measurements(recording, read(log, tmp_path))
+    assert recording.notes == ("1 row has the time of the row before: left out, the first is row 21",)
+    other = log.iloc[20:21].assign(x=0.0)
+    recording = read(pandas.concat([log.iloc[:21], other, log.iloc[20:]]), tmp_path)
+    same_measurements(recording, read(log, tmp_path))
+    assert recording.notes == (
+        "2 rows have the time of the row before, 1 of them with other values: left out, the first is row 21",
+    )
+
+
+def test_times_in_whole_seconds_that_were_faster_are_refused(tmp_path):
+    log = untold(time=np.floor(0.25 * np.arange(COUNT)))
+    with pytest.raises(
+        ValueError, match=r"rows 0 and 1: 45 of 60 rows have the time .* fractions of a second"
+    ):
+        read(log, tmp_path)
+
+
+def test_positions_that_repeat_are_no_measurements(tmp_path):
+    log = untold()
+    log.loc[20:23, ["x", "y"]] = log.loc[19, ["x", "y"]].to_numpy()
+    recording = read(log, tmp_path)
+    assert (recording.measurements["available"][0] == 0.0).nonzero()[0].tolist() == [18, 19, 20, 21]
+    assert recording.notes == (
+        "4 rows repeat the position of the row before: left out as measurements, the first is row 20",
+    )
+    log.loc[20:23, ["x", "y"]] = np.nan
+    same_measurements(recording, read(log, tmp_path))
+
+
+def test_a_receiver_that_stands_still_may_repeat_itself(tmp_path):
+    """In numbers as coarse as the noise a position comes again by chance."""
+    rng = np.random.default_rng(4)
+    steps = np.where(np.arange(COUNT) < 15, 0.0, 5.0)
+    east = np.round(np.cumsum(steps) + rng.normal(0.0, 0.003, COUNT), 2)
+    north = np.round(rng.normal(0.0, 0.003, COUNT), 2)
+    assert ((np.diff(east) == 0.0) & (np.diff(north) == 0.0)).any()
+    sigma = np.full(COUNT, 0.01)
+    recording = read(untold(time=np.arange(COUNT), x=east, y=north, sigma_x=sigma, sigma_y=sigma), tmp_path)
+    assert (recording.measurements["available"] == 1.0).all()
+
+
+# --- clocks
+
+
+PARIS = pandas.Timestamp("2026-10-25T00:57:00Z") + pandas.to_timedelta(TIME, unit="s")
+"""Three minutes before clocks in Paris go back."""
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        [t.isoformat() for t in PARIS],
+        [t.isoformat() for t in PARIS.tz_convert("Europe/Paris")],
+        [t.strftime("%Y/%m/%d %H:%M:%S.%f") for t in PARIS],
+        [t.strftime("%d.%m.%Y %H:%M:%S") for t in PARIS],
+        [t.strftime("%d.%m.%Y %H:%M:%S,000") for t in PARIS],
+        [(t + pandas.Timedelta(hours=23)).strftime("%H:%M:%S") for t in PARIS],
+    ],
+)
+def test_clocks_of_every_kind(written, tmp_path):
+    recording = read(aircraft(time=written), tmp_path)
+    same_measurements(recording, read(aircraft(), tmp_path))
+    assert recording.log_time[0].tolist() == written[2:]
+
+
+@pytest.mark.parametrize(
+    ("zone", "start", "sentence"),
+    [
+        ("Europe/Paris", "2026-10-25T00:57:00Z", "time decreases between rows 35 and 36: .*, in UTC if the clock"),
+        ("Europe/Paris", "2026-03-29T00:57:00Z", "3,605 s pass .* did the clock change, as in daylight saving"),
+    ],
+)  # fmt: skip
+def test_a_local_clock_that_jumps_is_refused(zone, start, sentence, tmp_path):
+    local = (pandas.Timestamp(start) + pandas.to_timedelta(TIME, unit="s")).tz_convert(zone).tz_localize(None)
+    with pytest.raises(ValueError, match=sentence):
+        read(untold(time=[t.isoformat() for t in local]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("times", "sentence"),
+    [
+        (["2026-05-01T12:00:00Z", "2026-05-01T12:00:05"], "row 1, without the offset from UTC that other rows"),
+        (["2026-05-01T12:00:00", "2026-05-01T12:00:05+02:00"], "row 0, without the offset from UTC"),
+        (["12:00:00", "noon"], "'noon' in row 1, which is no time of day"),
+        (["05/01/2026 12:00:00", "05/01/2026 12:00:05"], "row 0, which is neither seconds nor a date"),
+        (["31.04.2026 12:00:00", "31.04.2026 12:00:05"], "row 0, which is neither seconds nor a date"),
+    ],
+)  # fmt: skip
+def test_wrong_clocks_are_one_sentence(times, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        seconds(pandas.Series(times))
+
+
+def test_midnight_passes(tmp_path):
+    found = seconds(
+        pandas.Series(["23:59:58.5", "23:59:59.5", "0:00:00.5", "12:00:00", "23:00:00", "1:00:00"])
+    )
+    assert (found - found[0]).tolist() == [0.0, 1.0, 2.0, 43201.5, 82801.5, 90001.5]
+
+
+# --- estimates
+
+
+def test_estimates_can_be_joined_with_the_log(tmp_path):
+    start = 1756402239.749
+    log = aircraft(time=start + TIME)
+    recording = read(log.drop(index=range(20, 26)), tmp_path)
+    recording.write(tmp_path / "again.nc")
+    for again in (recording, read_recording(tmp_path / "again.nc")):
+        found = evaluate(TARGET, ["imm", "bptt"], scenario=again, tracks=True)
+        write_estimates(tmp_path / "estimates.csv", found)
+        estimates = pandas.read_csv(tmp_path / "estimates.csv")
+        assert len(estimates) == 2 * (COUNT - 2)
+        # Times near 1.8e9 s are rounded to 2.4e-7 s.
+        np.testing.assert_allclose(estimates["seconds"], np.tile(TIME[2:], 2), atol=1e-6)
+        joined = estimates.merge(log, left_on="log_time", right_on="time")
+        assert len(joined) == 2 * (COUNT - 2 - 6)
+        np.testing.assert_array_equal(joined["truth_position_x_x"], joined["truth_position_x_y"])
+
+
+def test_estimates_of_several_logs_have_their_own_times(tmp_path):
+    log = untold()
+    log.assign(time=[t.isoformat() for t in PARIS]).to_csv(tmp_path / "a.csv", index=False)
+    log.iloc[:30].assign(time=TIME[:30] + 0.5).to_csv(tmp_path / "b.csv", index=False)
+    recording = read_recording(tmp_path, TARGET)
+    write_estimates(tmp_path / "estimates.csv", evaluate(TARGET, ["imm"], scenario=recording, tracks=True))
+    with (tmp_path / "estimates.csv").open() as lines:
+        rows = [(row["recording"], row["log_time"], float(row["seconds"])) for row in csv.DictReader(lines)]
+    assert rows[0] == ("a", PARIS[2].isoformat(), 10.0)
+    assert rows[COUNT - 2] == ("b", "10.5", 10.0)
+    write_estimates(tmp_path / "estimates.nc", evaluate(TARGET, ["imm"], scenario=recording, tracks=True))
