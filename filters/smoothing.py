@@ -100,7 +100,7 @@ def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estima
     Raises:
         ValueError: for a negative lag.
     """
-    return backward(rauch_tung_striebel_step, (_but_last(filtered), motion), filtered, lag)
+    return backward(rauch_tung_striebel_step, (but_last(filtered), motion), filtered, lag)
 
 
 # --- several models
@@ -200,7 +200,7 @@ def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | N
         filtered.mean, 0.0 * filtered.probabilities, 0.0 * filtered.mean, 0.0 * filtered.covariance
     )
     step = functools.partial(imm_step, transition=transition)
-    return backward(step, (_but_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
+    return backward(step, (but_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
 
 
 # --- the recursion over time
@@ -234,20 +234,42 @@ def backward(
             found.append(
                 step(*(_mapped(lambda values, k=k: values[..., k, :], part) for part in given), found[-1])
             )
-        return _mapped(lambda *scans: namespace(scans[0]).stack(scans, axis=-2), *reversed(found))
-    flat = [_mapped(_without_time, part) for part in given]
+        return stacked(found[::-1])
     carried = nothing_later
     for _ in range(lag):
-        stepped = step(*flat, _mapped(lambda values: _without_time(values[..., 1:, :]), carried))
+        stepped = over_time(step, *given, _mapped(lambda values: values[..., 1:, :], carried))
         carried = _mapped(
-            lambda early, last: namespace(last).concat(
-                [namespace(last).reshape(early, (*early.shape[:-1], K - 1, N)), last[..., K - 1 :, :]],
-                axis=-2,
-            ),
+            lambda early, last: namespace(last).concat([early, last[..., K - 1 :, :]], axis=-2),
             stepped,
             nothing_later,
         )
     return carried
+
+
+def over_time(function: Callable[..., Any], *parts: Any) -> Any:
+    """Call a function that knows no time axis once for all scans.
+
+    Args:
+        function: of nested tuples of arrays ``(..., N)``, each episode for itself.
+        *parts: the same with a time axis, ``(..., K, N)``.
+
+    Returns:
+        What it returns, with a time axis.
+    """
+    first = _arrays_of(parts)[0]
+    last = first.shape[-2:]
+    found = function(*_mapped(_without_time, parts))
+    return _mapped(lambda values: namespace(values).reshape(values, (*values.shape[:-1], *last)), found)
+
+
+def stacked(scans: Sequence[Any]) -> Any:
+    """Put a time axis into nested tuples of arrays ``(..., N)``, one for each scan: ``(..., K, N)``."""
+    return _mapped(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
+
+
+def but_last(part: Any) -> Any:
+    """Return nested tuples of arrays ``(..., K, N)`` without the last scan."""
+    return _mapped(lambda values: values[..., :-1, :], part)
 
 
 def _mapped(function: Callable[..., Array], *parts: Any) -> Any:
@@ -261,10 +283,6 @@ def _mapped(function: Callable[..., Array], *parts: Any) -> Any:
 
 def _arrays_of(part: Any) -> list[Array]:
     return [array for each in part for array in _arrays_of(each)] if isinstance(part, tuple) else [part]
-
-
-def _but_last(part: Any) -> Any:
-    return _mapped(lambda values: values[..., :-1, :], part)
 
 
 def _broadcast(values: Array, last: tuple[int, int]) -> Array:
