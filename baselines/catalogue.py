@@ -10,7 +10,7 @@ from functools import cache
 from types import ModuleType
 
 from ..envs.catalogue import nearest, task_class
-from ..evaluation.competitors import RANKED, RandomPolicy, kind_of
+from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
 
 ADDED: dict[str, Baselines] = {}
@@ -65,6 +65,7 @@ def add_baselines(table: Baselines) -> None:
     tables = {
         "policy": table.policies,
         "estimator": table.estimators,
+        "smoother": table.smoothers,
         "reference": table.references,
         "bound": table.bounds,
     }
@@ -74,6 +75,6 @@ def add_baselines(table: Baselines) -> None:
                 raise ValueError(
                     f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
                 )
-            if kind not in RANKED and not getattr(maker, "knows", ""):
+            if kind in TOLD_MORE and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
     ADDED[cls.id] = table

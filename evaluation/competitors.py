@@ -5,7 +5,8 @@ call. An **estimator** sees what a policy's filters see, the start of the track 
 mean and covariance; it is ranked with the policies, and marked. A **smoother** is an estimator that answers after the
 last measurement and uses later ones, too: it is not causal, and never ranked. A **reference** is an estimator
 that may be told what no competitor knows; it is never ranked. A **bound** is computed. Each says what it is by its
-``kind``; what says nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of Stable-Baselines3.
+``kind``; what says nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of
+Stable-Baselines3.
 """
 
 import inspect
@@ -295,8 +296,8 @@ class Smoother(Estimator, Protocol):
     """An estimator that answers after the last measurement, each time with all measurements or some scans later.
 
     It runs forward like any estimator, and what it has kept is given back to it. It says so by ``kind = "smoother"``;
-    an estimator with a method ``smooth`` alone is judged by what it says at the time. In a closed loop, where the estimate
-    decides what is measured next, it is refused.
+    an estimator with a method ``smooth`` alone is judged by what it says at the time. In a closed loop, where the
+    estimate decides what is measured next, it is refused.
     """
 
     kind: ClassVar[Kind] = "smoother"

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation: every policy, estimator, reference and bound on identical noise.
+"""Monte Carlo evaluation: every policy, estimator, smoother, reference and bound on identical noise.
 
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
 """
@@ -21,11 +21,12 @@ from ..envs.reward import charge
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
-from .competitors import RANKED, Kind, kind_of
+from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers, check_workers
 from .rollout import Progress, run_competitor
 from .seeds import episode_seeds
+from .smoothers import check_open_loop
 from .threads import one_thread
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
@@ -156,7 +157,8 @@ def evaluate(
     Args:
         env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
         competitors: by the name that stands in the tables: each a class or function that makes it,
-            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
+            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother
+            with ``smooth``, too.
         scenario: name of a scenario, a trajectory, a set of flights, or a recording; default: the environment's
             training distribution.
         episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up. Of a recording
@@ -408,6 +410,8 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         models[name] = experiment.make_model(maker, controls[name])
     for name, model in models.items():
         check_observation(model, competitors[name], name)
+        if kinds[name] == "smoother":
+            check_open_loop(model, name)
     first = next(iter(models.values()))
     group_of_each(
         [c.name for c in first.task.components], first.task.groups
@@ -448,7 +452,7 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
 def _check_known_truth(kinds: Mapping[str, Kind], name: str) -> None:
     """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
-        if kind not in RANKED:
+        if kind in TOLD_MORE:
             raise ValueError(
                 f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
                 "components: leave it out"

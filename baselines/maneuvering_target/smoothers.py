@@ -14,6 +14,7 @@ from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters import coordinated_turn, imm, kalman, smoothing
 from ...filters.small_matrices import apply
+from ..table import Variant
 from .estimators import (
     KalmanBank,
     KalmanInteractingMultipleModel,
@@ -117,7 +118,7 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
 
 
 class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleModel):
-    """IMM over quiet and noisy constant velocity and the coordinated turn, smoothed by a second filter backward in time.
+    """IMM over quiet and noisy constant velocity and the coordinated turn, smoothed by a second filter backward.
 
     The turn is linearised where the filter has linearised it. A filter of constant velocity forgets the turn rate: its
     transition is zero there, and its noise the variance of a turn that begins.
@@ -145,3 +146,13 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
             xp.stack([*noises, self.turn.noise(T)], axis=2),
             xp.stack([*predicted, coordinated_turn.turned(mixed[:, 2], T)], axis=1),
         )
+
+
+SMOOTHERS = {
+    "kalman-smoother": ConstantVelocitySmoother,
+    "imm-smoother": KalmanIMMSmoother,
+    "imm-turn-smoother": KalmanTurnIMMSmoother,
+    "imm-fixed-lag": Variant(
+        KalmanIMMSmoother, "``imm-smoother`` with a lag of five scans: an estimate with a known delay.", lag=5
+    ),
+}
