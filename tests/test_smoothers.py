@@ -85,8 +85,8 @@ def test_the_whole_track_is_its_least_squares_solution():
         unknown = np.linalg.lstsq(A, b, rcond=None)[0]
         covariance = states @ np.linalg.inv(A.T @ A) @ np.moveaxis(states, 1, 2)
         # Positions of 1e5 m and variances of 1e4 m^2, to rounding of 1e3 scans.
-        np.testing.assert_allclose(run["estimate"].values, (mean + states @ unknown)[1:], rtol=0, atol=1e-7)
-        np.testing.assert_allclose(run["covariance"].values, covariance[1:], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(run["estimate"].values, (mean + states @ unknown)[1:], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(run["covariance"].values, covariance[1:], rtol=0, atol=1e-8)
     assert missed > 5
 
 
