@@ -25,8 +25,8 @@ RANKED: tuple[Kind, ...] = ("policy", "estimator")
 """What is ranked: it knows nothing that is hidden, and nothing before it is measured."""
 TOLD_MORE: tuple[Kind, ...] = ("reference", "bound")
 """What may be told more than is measured, and says so in ``knows``."""
-NOT_CAUSAL = "is not causal: it uses later measurements"
-"""What is said of a smoother wherever it is reported, after its name."""
+NOT_CAUSAL = "Not causal, with later measurements"
+"""What is said of smoothers wherever they are reported, before their names."""
 
 
 def kind_of(competitor: Any) -> Kind:
@@ -72,9 +72,9 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
         kind, ("start", "update")
     )
     if kind not in get_args(Kind) or not _has(found, *methods):
+        too = ", a smoother smooth too" if kind == "smoother" else ""
         raise ValueError(
-            f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update, "
-            "a smoother smooth as well"
+            f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update{too}"
         )
     return found
 

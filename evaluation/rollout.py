@@ -92,11 +92,11 @@ def _smoothed_estimates(
     lengths = task.lengths(numpy.concatenate(noise, axis=1))
     K, C, width = task.horizon, len(task.components), padded_width(len(seeds))
     means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
-    for length in numpy.unique(lengths):
+    for length in numpy.unique(lengths).tolist():
         lanes = numpy.flatnonzero(lengths == length)
-        own = [seeds[lane] for lane in lanes]
+        own = [seeds[lane] for lane in lanes.tolist()]
         looped = put_in_loop(model, competitor, "smoother", name, len(own))
-        found = run_forward(looped, start_lanes(looped, own), int(length), name)
+        found = run_forward(looped, start_lanes(looped, own), length, name)
         for kept, answered in zip((means, covariances), found, strict=True):
             kept[..., :length, lanes] = answered[..., : len(own)]
             kept[..., length:, lanes] = answered[..., -1:, : len(own)]

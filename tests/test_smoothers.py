@@ -17,14 +17,18 @@ from filtergym.baselines.maneuvering_target.smoothers import (
 from filtergym.baselines.problem import problem_of
 from filtergym.baselines.table import Baselines, Variant
 from filtergym.evaluation.competitors import RANKED, kind_of
+from filtergym.evaluation.curves import curves_of
 from filtergym.evaluation.filters import put_in_loop
 from filtergym.filters import kalman
 from models import make_model
 
 from filtergym import evaluate, record, tidy_records
 from filtergym.commands.evaluation import find_names
-from filtergym.reports.ranking import ranking, ranking_sentence
-from filtergym.reports.tables import ranked
+from filtergym.reports.benchmark import result_of
+from filtergym.reports.html_report import report_html
+from filtergym.reports.ranking import best_of_origins, ranking, ranking_sentence, verdict
+from filtergym.reports.results import Settings
+from filtergym.reports.tables import ranked, results_tables
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SMOOTHERS = baselines_of(TARGET).smoothers
@@ -91,7 +95,7 @@ def test_the_whole_track_is_its_least_squares_solution():
 
 
 def test_smoothers_are_marked_and_never_ranked():
-    names = ["imm", "kalman-imm", "imm-smoother", "imm-fixed-lag", "known-turn"]
+    names = ["imm", "kalman-imm", "imm-smoother", "imm-lag-5", "known-turn"]
     found = evaluate(TARGET, names, scenario="paper", episodes=30, paper="imm", reference="known-turn")
     records = tidy_records(found)
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
@@ -103,11 +107,13 @@ def test_smoothers_are_marked_and_never_ranked():
     assert {r.component or r.policy for r in records if r.metric == "behind_best"} <= {"kalman-imm", "imm"}
     assert [place.name for place in ranking(records)] == ["kalman-imm", "imm"]
     assert ranking_sentence(records, "imm").startswith("On `paper` `kalman-imm` (estimator) costs least")
+    tables = results_tables(records, problem_of(TARGET).knows, 200)
+    assert "Not causal, with later measurements: imm-smoother, imm-lag-5." in tables[-1].caption
     assert [name for name, *_ in ranked(records)] == [
         "kalman-imm",
         "imm",
         "imm-smoother",
-        "imm-fixed-lag",
+        "imm-lag-5",
         "known-turn",
     ]
 
@@ -200,7 +206,7 @@ def test_errors_of_a_smoother_of_ones_own_name_it():
         evaluate(TARGET, {"a": Short}, **arguments)
     with pytest.raises(ValueError, match="smoother 'b' failed after 10 measurements"):
         evaluate(TARGET, {"b": Raises}, **arguments)
-    with pytest.raises(ValueError, match="a smoother smooth as well"):
+    with pytest.raises(ValueError, match="a smoother smooth too"):
         evaluate(TARGET, {"c": Without}, **arguments)
 
 
@@ -256,3 +262,15 @@ def test_recordings_are_shown_to_smoothers_but_not_to_references():
 def test_a_table_of_baselines_names_smoothers_as_what_they_are():
     table = Baselines(TARGET, {}, smoothers={"mine": PythonSmoother})
     assert table.names == ("mine",)
+
+
+def test_reports_mark_smoothers_and_compare_them_with_nobody():
+    names = ["imm", "kalman-imm", "imm-smoother", "known-turn"]
+    dataset = evaluate(
+        TARGET, names, scenario="paper", episodes=20, paper="imm", reference="known-turn", drawn_episodes=1
+    )
+    found = result_of(problem_of(TARGET), dataset, tidy_records(dataset), curves_of(dataset), [])
+    assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
+    assert "imm-smoother" not in " ".join(verdict([found]))
+    page = report_html([found], Settings("filtergym benchmark", {}))
+    assert "Not causal, with later measurements: <code>imm-smoother</code>." in page

@@ -152,7 +152,7 @@ SMOOTHERS = {
     "kalman-smoother": ConstantVelocitySmoother,
     "imm-smoother": KalmanIMMSmoother,
     "imm-turn-smoother": KalmanTurnIMMSmoother,
-    "imm-fixed-lag": Variant(
-        KalmanIMMSmoother, "``imm-smoother`` with a lag of five scans: an estimate with a known delay.", lag=5
-    ),
+    "imm-lag-1": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for one later scan only.", lag=1),
+    "imm-lag-2": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for two later scans only.", lag=2),
+    "imm-lag-5": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for five later scans only.", lag=5),
 }

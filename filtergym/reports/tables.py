@@ -171,7 +171,8 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         notes.append(
             "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."
         )
-    notes += [f"{name} {NOT_CAUSAL}." for name, kind, _ in names if kind == "smoother"]
+    smoothers = [name for name, kind, _ in names if kind == "smoother"]
+    notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
     tables[-1].caption = "\n".join(notes)
     return tables
@@ -252,6 +253,10 @@ def recording_table(records: Sequence[Any]) -> Table:
         "predicted, nats; the higher the better.\nmean NIS: normalised innovation squared over its dimension; in the "
         "band if the innovations are as large as predicted; - : it reports none."
     )
+    if any(record.kind == "smoother" for record in records):
+        table.caption += (
+            "\nA smoother predicts nothing: --estimates writes what it has found, with its deviation."
+        )
     table.caption_justify = "left"
     return table
 
