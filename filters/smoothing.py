@@ -1,7 +1,8 @@
 r"""Smoothing: estimates that use later measurements too, from what a filter has kept.
 
-**One model.** Rauch, Tung and Striebel (1965); Särkkä, Bayesian Filtering and Smoothing (2013), theorem 8.2, equations
-(8.6). With x, P after the update at a scan, x' = F x + b and P' = F P F^T + Q before that of the next one,
+**One model.** Rauch, Tung and Striebel, AIAA Journal 3 (1965), 1445-1450; Särkkä, Bayesian Filtering and Smoothing
+(2013), theorem 8.2, equations (8.6). With x, P after the update at a scan, x' = F x + b and P' = F P F^T + Q before
+that of the next one,
 
     G = P F^T P'^-1,  x^s = x + G (x^s_next - x'),  P^s = P + G (P^s_next - P') G^T
 
@@ -92,7 +93,8 @@ def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estima
     Args:
         filtered: after the update at each of K scans, ``(n, K, N)`` and ``(n, n, K, N)``.
         motion: from each of the first K - 1 scans to the next one, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``.
-        lag: how many later scans each estimate uses; default: all of them. Zero gives the filter's estimates.
+        lag: how many later scans each estimate uses, fewer where the track ends before; default: all of them.
+            Zero gives the filter's estimates.
 
     Returns:
         The smoothed estimates, in the same shapes.

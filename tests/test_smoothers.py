@@ -274,3 +274,41 @@ def test_reports_mark_smoothers_and_compare_them_with_nobody():
     assert "imm-smoother" not in " ".join(verdict([found]))
     page = report_html([found], Settings("filtergym benchmark", {}))
     assert "Not causal, with later measurements: <code>imm-smoother</code>." in page
+
+
+class Holds:
+    """The initial estimate, whatever is measured."""
+
+    def start(self, initial, N):
+        return initial.mean, initial.covariance + 1e-3 * np.eye(len(initial.mean))[:, :, None]
+
+    def update(self, measurement, memory):
+        return *memory, memory
+
+
+class HoldsToTheEnd(Holds):
+    """The same, said when all is measured."""
+
+    kind = "smoother"
+
+    def smooth(self, measurements, memories):
+        means, covariances = zip(*memories[1:], strict=True)
+        return np.stack(means, axis=1), np.stack(covariances, axis=2)
+
+
+@pytest.mark.parametrize(
+    ("env", "keywords"),
+    [
+        ("filtergym/LooselyCoupledNavigation-v0", {"horizon": 40, "axes": 2}),
+        ("filtergym/RadarEsmTracking-v0", {"horizon": 24}),
+        (
+            "filtergym/TightlyCoupledNavigation-v0",
+            {"scenario": "rates-lost", "horizon": 12, "decision_interval": 3},
+        ),
+    ],
+)
+def test_every_open_loop_takes_a_smoother(env, keywords):
+    found = evaluate(env, {"smoother": HoldsToTheEnd, "estimator": Holds}, episodes=9, **keywords)
+    for name in ("error", "cost", "nees", "lost"):
+        one, other = (found[name].sel(policy=policy).values for policy in ("smoother", "estimator"))
+        np.testing.assert_array_equal(one, other)
