@@ -325,7 +325,7 @@ def train_bptt(run: TrainingRun, session: Session) -> TrainingRun:
     Raises:
         ValueError: for a control with discrete actions, or a checkpoint that cannot be read.
     """
-    if session.resume and run.finished:
+    if session.resume and run.is_complete:
         return run
     began = time.monotonic()
     descent = Descent(run)

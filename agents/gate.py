@@ -14,7 +14,14 @@ import numpy
 from ..baselines.alarm import Alarm, InnovationAlarm
 from ..baselines.problem import Problem
 from ..envs.model import Model
-from ..evaluation.competitors import ConstantPolicy, Policy, check_competitor, expose_spaces, kind_of, made
+from ..evaluation.competitors import (
+    ConstantPolicy,
+    Policy,
+    check_competitor,
+    expose_spaces,
+    kind_of,
+    make_competitor,
+)
 from .residual import ResidualPolicy, policy_to_correct
 
 NEVER = numpy.iinfo(numpy.int64).max // 2
@@ -73,8 +80,10 @@ class Gate:
         self, model: Model, fallback: Any = None, alarm: Any = None, window: int | None = None
     ) -> None:
         alarm = alarm or Problem.of(type(model.task)).baselines.alarm or InnovationAlarm
-        self.alarm: Alarm = made(alarm, model)
-        self.fallback: Any = check_competitor("fallback", made(fallback or PaperAction, model), "policy")
+        self.alarm: Alarm = make_competitor(alarm, model)
+        self.fallback: Any = check_competitor(
+            "fallback", make_competitor(fallback or PaperAction, model), "policy"
+        )
         own = getattr(self.fallback, "control", model.control)
         if own != model.control:
             raise ValueError(f"the fallback is made for control {own!r}, but the task has {model.control!r}")
@@ -133,7 +142,7 @@ class Gated(Policy):
     ) -> None:
         super().__init__(model)
         self.control = model.control  # type: ignore[misc]  # made for it
-        self.policy = check_competitor("policy", made(policy, model), "policy")
+        self.policy = check_competitor("policy", make_competitor(policy, model), "policy")
         own = getattr(self.policy, "control", model.control)
         if own != model.control:
             raise ValueError(f"the policy is made for control {own!r}, but the task has {model.control!r}")
@@ -171,10 +180,10 @@ class PolicyMaker:
 
     def __call__(self, model: Model) -> Any:
         """Make it."""
-        return self.wrap(model, made(self.maker, model))
+        return self.wrap(model, make_competitor(self.maker, model))
 
 
-def gated(name: str, maker: Any) -> PolicyMaker:
+def add_gate(name: str, maker: Any) -> PolicyMaker:
     """Return what makes a policy behind a gate: what a name ``gated:POLICY`` stands for.
 
     Args:

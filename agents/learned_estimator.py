@@ -9,7 +9,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
-from ..compiler.functions import mapped
+from ..compiler.functions import map_arrays
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
 from ..envs.task import Task
@@ -44,7 +44,7 @@ class LearnedEstimator:
     def update(self, measurement: Any, memory: Filtered) -> tuple[Array, Array, Filtered]:
         """Predict, show the network what comes of it, and update as it answers."""
         bank: Any = self.model.filter
-        measurement = mapped(numpy.nan_to_num, measurement)  # banks weigh values by their availability
+        measurement = map_arrays(numpy.nan_to_num, measurement)  # banks weigh values by their availability
         state = bank.predict(memory.bank, measurement)
         shown = self.model.observe(Episode(None, measurement, state))
         action, network = self.network.predict(shown.T, memory.network)

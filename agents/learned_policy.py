@@ -94,7 +94,7 @@ class LearnedPolicy(Policy):
         x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(numpy.float32)
         if "gru_input_weight" in a:
             memory = self._memory(state, start, a["gru_memory_weight"].shape[1])
-            x = state = self._gated_unit(x, memory)
+            x = state = self._gru_step(x, memory)
         elif "lstm_input_weight" in a:
             memory = self._memory(state, start, 2 * a["lstm_memory_weight"].shape[1])
             state = self._long_short_term(x, memory)
@@ -115,7 +115,7 @@ class LearnedPolicy(Policy):
         memory = numpy.zeros((len(start), width), numpy.float32) if state is None else state
         return numpy.where(start[:, None], numpy.float32(0.0), memory)
 
-    def _gated_unit(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
+    def _gru_step(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
         """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""
         a = self.arrays
         from_input = _product(x, a["gru_input_weight"]) + a["gru_input_bias"]

@@ -9,12 +9,12 @@ from .learned_policy import load_policy, pretrained_path
 from .training_run import TrainingRun, best_agent, load_run
 
 
-def shipped_agents(id: str) -> list[str]:
+def pretrained_agents(id: str) -> list[str]:
     """Names of the agents that are shipped for the environment of a Gymnasium id."""
     return sorted(path.stem for path in pretrained_path(id, "").parent.glob("*.safetensors"))
 
 
-def learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
+def find_learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     """Return what makes a learned policy, or None if the name means nothing here.
 
     Args:
@@ -27,7 +27,7 @@ def learned_policy(cls: type[Task], name: str, trust: bool = False) -> Any:
     Raises:
         ValueError: if the file or folder is not what its name says, or takes ``trust``.
     """
-    if name in shipped_agents(cls.id):
+    if name in pretrained_agents(cls.id):
         return load_policy(cls, pretrained_path(cls.id, name))
     path = Path(name)
     if path.is_dir():

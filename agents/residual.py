@@ -13,7 +13,7 @@ import numpy
 from ..baselines.problem import Problem
 from ..envs.environment import TaskEnv
 from ..envs.model import Model
-from ..evaluation.competitors import Policy, expose_spaces, kind_of, made
+from ..evaluation.competitors import Policy, expose_spaces, kind_of, make_competitor
 
 
 def check_residual(model: Model, policy: Any) -> None:
@@ -46,7 +46,7 @@ def policy_to_correct(model: Model, name: str) -> Any:
             "another policy to correct"
         )
     check_residual(model, maker)
-    return made(maker, model)
+    return make_competitor(maker, model)
 
 
 class ResidualActions(gymnasium.Wrapper):

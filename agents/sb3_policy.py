@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from .training_run import check_trust
 
-LOADED: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
+POLICY_CLASSES: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
     (RecurrentPPO, "RecurrentActorCriticPolicy", ""),
     (PPO, "ActorCriticPolicy", "clip_range"),
     (TRPO, "ActorCriticPolicy", "cg_max_steps"),
@@ -200,7 +200,7 @@ def _load_model(path: Path) -> BaseAlgorithm:
     """
     data = load_from_zip_file(path, device="cpu")[0] or {}
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
-    for algorithm, policy, stored in LOADED:
+    for algorithm, policy, stored in POLICY_CLASSES:
         if policy in names and (not stored or stored in data):
             return algorithm.load(path, device="cpu")
     raise ValueError(

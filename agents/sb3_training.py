@@ -113,7 +113,7 @@ def save_agent(agent: Sb3Policy, run: TrainingRun, folder: Path) -> None:
         write_arrays(folder / "agent.safetensors", arrays, run, output, activation)
 
 
-def as_kept(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
+def as_saved_agent(agent: Sb3Policy, algorithm: str, model: Model) -> LearnedPolicy | Sb3Policy:
     """Return an agent as :func:`save_agent` keeps it and an evaluation finds it: several times as fast as the model.
 
     The model itself, if a learned policy cannot hold it.
@@ -220,7 +220,7 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
         ValueError: for an algorithm that does not fit the control, or a checkpoint that is not trusted or cannot be
             read.
     """
-    if session.resume and run.finished:
+    if session.resume and run.is_complete:
         return run
     began = time.monotonic()
     check_algorithm(run)
@@ -233,7 +233,7 @@ def train_sb3(run: TrainingRun, session: Session) -> TrainingRun:
     policy = Sb3Policy(model, normalisation, run.control)
     trainee = Trainee(
         PolicyMaker(
-            functools.partial(as_kept, policy, run.algorithm),
+            functools.partial(as_saved_agent, policy, run.algorithm),
             lambda task, agent: as_trained(task, agent, run.residual_to, run.gated),
             run.control,
         ),

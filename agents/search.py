@@ -31,7 +31,7 @@ from ..baselines.problem import Problem
 from ..envs.parameters import check_integer
 from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
-from .settings import merged, read_section
+from .settings import merge_settings, read_section
 from .training_run import FILES, RunOptions, Session, TrainingRun, Validated, load_run, new_run, open_run
 
 VALIDATIONS = 5
@@ -63,7 +63,7 @@ class Search:
         Raises:
             ValueError: for what :func:`~.training_run.new_run` refuses.
         """
-        overrides = merged(self.options.overrides, chosen)
+        overrides = merge_settings(self.options.overrides, chosen)
         return new_run(self.problem, replace(self.options, steps=self.steps, seed=seed, overrides=overrides))
 
     def as_json(self) -> dict[str, Any]:
@@ -121,7 +121,9 @@ def _check_space(space: Any, path: str) -> None:
         )
 
 
-def suggested(trial: optuna.Trial, space: Mapping[str, Any], inside: str = "") -> dict[str, Any]:
+def suggest_hyperparameters(
+    trial: optuna.Trial, space: Mapping[str, Any], inside: str = ""
+) -> dict[str, Any]:
     """Return hyperparameters of a trial, drawn from a space."""
     found: dict[str, Any] = {}
     for name, choice in space.items():
@@ -130,7 +132,7 @@ def suggested(trial: optuna.Trial, space: Mapping[str, Any], inside: str = "") -
             # As text: what is chosen from may be lists, which a storage does not hold.
             found[name] = json.loads(trial.suggest_categorical(path, [json.dumps(value) for value in choice]))
         elif "low" not in choice:
-            found[name] = suggested(trial, choice, f"{path}.")
+            found[name] = suggest_hyperparameters(trial, choice, f"{path}.")
         else:
             low, high, log = choice["low"], choice["high"], bool(choice.get("log"))
             if isinstance(low, int) and isinstance(high, int):
@@ -203,7 +205,7 @@ def search_hyperparameters(
             n_startup_trials=STARTUP_TRIALS, seed=1_000_003 * search.sampling + done
         )
         trial = study.ask()
-        chosen = suggested(trial, search.space)
+        chosen = suggest_hyperparameters(trial, search.space)
         try:
             costs = _costs(search, folder, trial, chosen, train)
         except optuna.TrialPruned as reason:
@@ -248,26 +250,29 @@ def _costs(
         place = run_folder(folder, trial.number, seed)
         shutil.rmtree(place, ignore_errors=True)
         run = open_run(place, search.run(seed, chosen), resume=False)
-        lowest, told = math.inf, -1
+        lowest, last_share = math.inf, -1
         behind = False
 
-        def validated(entry: Validated) -> bool:
-            nonlocal lowest, told, behind
+        def report_validation(entry: Validated) -> bool:
+            nonlocal lowest, last_share, behind
             lowest = min(lowest, entry["cost"])
             # Rollouts differ in length, so trials are compared at the same share of their steps.
             share = min(VALIDATIONS, entry["steps"] * VALIDATIONS // search.steps)
-            if share > told:
-                told = share
+            if share > last_share:
+                last_share = share
                 trial.report(_mean([*costs, lowest]), len(costs) * (VALIDATIONS + 1) + share)
                 behind = entry["steps"] < search.steps and trial.should_prune()
             return behind
 
-        train(run, Session(place, validate_every=max(1, search.steps // VALIDATIONS), validated=validated))
+        train(
+            run,
+            Session(place, validate_every=max(1, search.steps // VALIDATIONS), validated=report_validation),
+        )
         # Nobody resumes it, and replay buffers are large.
         shutil.rmtree(place / "checkpoint", ignore_errors=True)
         if behind:
             raise optuna.TrialPruned(f"pruned after {run.steps_done:,} steps of seed {seed}")
-        if not run.finished:
+        if not run.is_complete:
             break
         costs.append(lowest)
     return costs

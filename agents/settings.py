@@ -38,12 +38,14 @@ def with_numbers(value: Any) -> Any:
     return value
 
 
-def merged(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
+def merge_settings(first: Mapping[str, Any], then: Mapping[str, Any]) -> dict[str, Any]:
     """Return two mappings as one; the second goes before the first, within mappings too."""
     both = dict(first)
     for name, value in then.items():
         own = both.get(name)
-        both[name] = merged(own, value) if isinstance(own, Mapping) and isinstance(value, Mapping) else value
+        both[name] = (
+            merge_settings(own, value) if isinstance(own, Mapping) and isinstance(value, Mapping) else value
+        )
     return both
 
 
@@ -72,7 +74,7 @@ def parse_settings(words: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]
             raise ValueError(f"--set {path}: cannot read the value {text!r} as YAML") from error
         for name in reversed(names):
             value = {name: value}
-        found[kind] = merged(found[kind], value)
+        found[kind] = merge_settings(found[kind], value)
     return found["env"], found["algo"]
 
 

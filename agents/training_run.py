@@ -45,10 +45,10 @@ from ..evaluation.competitors import kind_of
 from ..evaluation.files import find_folder, settle_folder, whole_folder, writable_folder, write_text
 from ..evaluation.rollout import run_competitor
 from ..evaluation.seeds import episode_seeds
-from ..evaluation.stored import read_json, restored
+from ..evaluation.stored import read_json, restore
 from .gate import Gate
 from .residual import policy_to_correct
-from .settings import ESTIMATORS, OPTIONS, check_hyperparameters, check_keywords, merged, read_config
+from .settings import ESTIMATORS, OPTIONS, check_hyperparameters, check_keywords, merge_settings, read_config
 
 FILES = {
     "ppo": "ppo",
@@ -132,7 +132,7 @@ class TrainingRun:
         return make_model(self.problem.task, self.control, scenario, **self.task_keywords)
 
     @property
-    def finished(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether all steps asked for are done."""
         return self.steps_done >= self.steps
 
@@ -188,7 +188,7 @@ def new_run(problem: Problem, options: RunOptions) -> TrainingRun:
     if algorithm not in FILES:
         raise nearest("algorithm", algorithm, FILES)
     values, own_keywords = _merge_settings(problem, options)
-    of_environment = merged(values.get("env_kwargs", {}), own_keywords)
+    of_environment = merge_settings(values.get("env_kwargs", {}), own_keywords)
     named = {name: of_environment.pop(name, None) for name in OPTIONS}
     control = options.control
     if options.residual_to and control is None and "control" not in own_keywords:
@@ -232,9 +232,9 @@ def _merge_settings(problem: Problem, options: RunOptions) -> tuple[dict[str, An
     """
     shipped = read_hyperparameters(problem.id, options.algorithm)
     keywords, values = ({}, {}) if options.config is None else read_config(options.config, problem.id)
-    keywords, values = merged(keywords, options.keywords), merged(values, options.overrides)
+    keywords, values = merge_settings(keywords, options.keywords), merge_settings(values, options.overrides)
     check_keywords(problem.task, options.algorithm, keywords)
-    every = merged(shipped, values)
+    every = merge_settings(shipped, values)
     if values:
         check_hyperparameters(options.algorithm, every, shipped)
     return every, keywords
@@ -352,7 +352,7 @@ def schedule(name: str, value: float | str) -> Callable[[float], float]:
     return LinearSchedule(start, 0.0, 1.0) if text.startswith("lin_") else ConstantSchedule(start)
 
 
-def installed_versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Versions of what a run's result depends on."""
     versions = {}
     for name in ("filtergym", "numpy", "torch", "gymnasium", "stable_baselines3", "sb3_contrib"):
@@ -398,7 +398,7 @@ def load_run(folder: Path, trust: bool = False) -> TrainingRun:
     except FileNotFoundError as error:
         raise ValueError(f"no training run in {folder}: it has no run.json") from error
     try:
-        run = restored(TrainingRun, values)
+        run = restore(TrainingRun, values)
     except ValueError as error:
         raise ValueError(f"{path} is not the record of a run: {error}") from error
     module, colon, _ = run.environment.partition(":")
@@ -506,7 +506,7 @@ def open_run(folder: Path, asked: TrainingRun, resume: bool, same: bool = False)
             *_settings_in_words(run),
         ]
     )
-    run.versions = installed_versions()
+    run.versions = package_versions()
     return run
 
 

@@ -9,11 +9,12 @@ import pkgutil
 from functools import cache
 from types import ModuleType
 
-from ..envs.catalogue import nearest, task_class
+from ..envs.catalogue import nearest
+from ..envs.task import Task
 from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
 
-ADDED: dict[str, Baselines] = {}
+USER_BASELINES: dict[str, Baselines] = {}
 """Baselines of users' environments: Gymnasium id -> table."""
 
 
@@ -43,16 +44,19 @@ def baselines_of(id: str) -> Baselines:
     package = package_of(id)
     if package is not None:
         return package.BASELINES
-    return ADDED.get(id) or Baselines(id, {"random": RandomPolicy})
+    return USER_BASELINES.get(id) or Baselines(id, {"random": RandomPolicy})
 
 
-def add_baselines(table: Baselines) -> None:
+def add_baselines(task: type[Task], table: Baselines) -> None:
     """Keep what a user's environment is compared with.
+
+    Args:
+        task: class of the environment's.
+        table: what it is compared with.
 
     Raises:
         ValueError: if the table names what is not there.
     """
-    cls = task_class(table.environment)
     reference = {**table.references, **table.bounds}
     if table.score_paper not in ("", *table.policies):
         raise nearest("policy as score_paper", table.score_paper, table.policies)
@@ -60,8 +64,8 @@ def add_baselines(table: Baselines) -> None:
         raise nearest("reference as score_reference", table.score_reference, reference)
     for name, maker in table.policies.items():
         control = getattr(maker, "control", None)
-        if control is not None and control not in cls.controls:
-            raise nearest(f"control of policy {name!r}", control, cls.controls)
+        if control is not None and control not in task.controls:
+            raise nearest(f"control of policy {name!r}", control, task.controls)
     tables = {
         "policy": table.policies,
         "estimator": table.estimators,
@@ -77,4 +81,4 @@ def add_baselines(table: Baselines) -> None:
                 )
             if kind in TOLD_MORE and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
-    ADDED[cls.id] = table
+    USER_BASELINES[task.id] = table

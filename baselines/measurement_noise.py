@@ -112,9 +112,9 @@ RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
 """Rules by their names in tables, and how they estimate the noise."""
 
 
-def chosen(which: Array, one: Any, other: Any) -> Any:
+def select_memory(which: Array, one: Any, other: Any) -> Any:
     """Entries of one memory where ``which``, ``(N,)``, is true, and of another elsewhere."""
     if isinstance(one, tuple):
-        parts = [chosen(which, a, b) for a, b in zip(one, other, strict=True)]
+        parts = [select_memory(which, a, b) for a, b in zip(one, other, strict=True)]
         return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
     return namespace(which).where(which, one, other)

@@ -15,12 +15,12 @@ def evaluate(
 
     Args:
         id: environment id.
-        competitors: a name, or names; or by name what :func:`.evaluation.evaluate.evaluate` takes, or a name.
-        *arguments: of that function.
+        competitors: a name, or names; or by name what :func:`.evaluation.evaluate.run_experiment` takes, or a name.
+        *arguments: of :meth:`.Problem.evaluate`.
         **keywords: likewise.
 
     Raises:
-        ValueError: for an unknown name, and whatever that function refuses.
+        ValueError: for an unknown name, and whatever that method refuses.
     """
     if isinstance(competitors, str):
         competitors = [competitors]

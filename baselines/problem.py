@@ -10,7 +10,9 @@ import xarray
 
 from ..envs.catalogue import import_task, importable_name, nearest, short_name, task_class
 from ..envs.task import Task
-from ..evaluation.evaluate import Experiment, evaluate
+from ..evaluation.evaluate import OPTIONS, Experiment, run_experiment
+from ..evaluation.parallel import Workers
+from ..evaluation.rollout import Progress
 from .catalogue import baselines_of, package_of
 from .table import Baselines
 from .tuned_values import TunedValues, table_path
@@ -65,8 +67,8 @@ class Problem:
     @property
     def knows(self) -> dict[str, str]:
         """What its references and bounds are told beyond the measurements, by their names."""
-        told = {**self.baselines.references, **self.baselines.bounds}
-        return {name: maker.knows for name, maker in told.items()}
+        makers = {**self.baselines.references, **self.baselines.bounds}
+        return {name: maker.knows for name, maker in makers.items()}
 
     @property
     def tuned_values(self) -> TunedValues:
@@ -75,14 +77,14 @@ class Problem:
         return TunedValues(self.id, self.baselines.tunable, [table_path(self.id), *shipped])
 
     @property
-    def tuned(self) -> list[str]:
+    def tuned_policies(self) -> list[str]:
         """Names of policies with tuned values."""
         return self.tuned_values.names()
 
     @property
     def names(self) -> list[str]:
         """Names of its policies, estimators, smoothers, references and bounds, and of policies that were tuned."""
-        return [*self.baselines.names, *self.tuned]
+        return [*self.baselines.names, *self.tuned_policies]
 
     def competitor(self, name: str) -> Any:
         """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds.
@@ -102,24 +104,33 @@ class Problem:
         """Return an experiment on it, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            *arguments: what follows the environment in :class:`.evaluation.evaluate.Experiment`.
+            *arguments: what follows the task in :class:`.evaluation.evaluate.Experiment`.
             **fields: likewise.
         """
         known = self.baselines
-        experiment = Experiment(self.name, *arguments, **fields)
+        experiment = Experiment(self.task, *arguments, **fields)
         return replace(experiment, paper=known.score_paper, reference=known.score_reference)
 
-    def evaluate(self, competitors: Mapping[str, Any], *arguments: Any, **keywords: Any) -> xarray.Dataset:
+    def evaluate(
+        self,
+        competitors: Mapping[str, Any],
+        *arguments: Any,
+        progress: Progress | None = None,
+        workers: Workers | None = None,
+        **keywords: Any,
+    ) -> xarray.Dataset:
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:
-            competitors: by their names, as of :func:`.evaluation.evaluate.evaluate`.
-            *arguments: what follows them there.
-            **keywords: likewise.
+            competitors: by their names, as of :func:`.evaluation.evaluate.run_experiment`.
+            *arguments: of :meth:`experiment`.
+            progress: as of :func:`.evaluation.evaluate.run_experiment`.
+            workers: likewise.
+            **keywords: of :meth:`experiment` what :data:`.evaluation.evaluate.OPTIONS` names; parameters of the task.
         """
-        known = self.baselines
-        keywords |= {"paper": known.score_paper, "reference": known.score_reference}
-        return evaluate(self.name, competitors, *arguments, **keywords)
+        options = {name: keywords.pop(name) for name in OPTIONS if name in keywords}
+        experiment = self.experiment(*arguments, **options, keywords=keywords)
+        return run_experiment(experiment, competitors, progress, workers)
 
 
 def problem_of(id: str) -> Problem:

@@ -109,7 +109,7 @@ class TunedValues:
             )
         for name, (low, high) in limits.items():
             # Values are stored rounded, so that one at a limit can lie just beyond it.
-            if not min(low, rounded(low)) <= values[name] <= max(high, rounded(high)):
+            if not min(low, round_value(low)) <= values[name] <= max(high, round_value(high)):
                 raise ValueError(
                     f"{place}: {name} of policy {policy!r} must be from {low:g} to {high:g}, got {values[name]!r}"
                 )
@@ -128,7 +128,7 @@ class TunedValues:
         return TunedPolicy(keywords, tunable.control, make)
 
 
-def rounded(value: float) -> float:
+def round_value(value: float) -> float:
     """Six digits, as tuned values are stored."""
     return float(f"{value:.6g}")
 

@@ -23,7 +23,7 @@ from ..evaluation.seeds import episode_seeds
 from ..evaluation.store import Store, Work
 from .problem import Problem
 from .table import Tunable
-from .tuned_values import Tuned, rounded
+from .tuned_values import Tuned, round_value
 
 FEWEST = 16
 """Episodes that a process is given at once: of fewer the work is less than what sending it takes."""
@@ -205,7 +205,7 @@ def tune(
     cost = mean_cost(candidate(values, fresh), workers)
     if untuned <= cost:
         cost, values = untuned, dict(tunable.start)
-    kept = {name: rounded(value) for name, value in values.items()}
+    kept = {name: round_value(value) for name, value in values.items()}
     store.clear()
     return Tuned(problem.id, policy, chosen.name, kept, cost, untuned, generations.spent * steps, search.seed)
 

@@ -306,8 +306,8 @@ def measured_elsewhere(client: str, id: str) -> dict[str, Any]:
     for line in done.stdout.splitlines():
         if line.startswith(RESULT):
             return json.loads(line.removeprefix(RESULT))
-    said = done.stderr.strip().splitlines()
-    return {"failed": said[-1] if said else f"exit status {done.returncode}"}
+    lines = done.stderr.strip().splitlines()
+    return {"failed": lines[-1] if lines else f"exit status {done.returncode}"}
 
 
 def table(clients: list[str], ids: list[str]) -> None:

@@ -409,8 +409,8 @@ def report(recorded: xarray.Dataset) -> None:
             )
     for correlation_time in (None, 1.0):
         levels, likelihood = likeliest(recorded, correlation_time)
-        said = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
-        print(f"likeliest levels: {said}; log-likelihood {likelihood:.3f} for each fix")
+        fitted = ", ".join(f"{name} {value:.3g}" for name, value in levels.items())
+        print(f"likeliest levels: {fitted}; log-likelihood {likelihood:.3f} for each fix")
 
 
 def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:

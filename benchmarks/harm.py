@@ -9,7 +9,7 @@ in a hundred of the paper's episodes in that scenario.
 import argparse
 
 import numpy
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.evaluation.bootstrap import Bootstrap
 
@@ -64,6 +64,6 @@ if __name__ == "__main__":
     )
     for id in asked.environment:
         problem = problem_of(id)
-        agents = asked.policy or shipped_agents(problem.id)
+        agents = asked.policy or pretrained_agents(problem.id)
         for line in rows(problem, agents, asked.episodes, asked.split):
             print(line, flush=True)

@@ -106,19 +106,20 @@ def killing(words: list[str]) -> None:
     """A cluster of two nodes; after some results a worker is killed, then a node with everything on it."""
     import ray
     from filtergym.evaluation.parallel import Workers
+    from filtergym.evaluation.rollout import Progress
     from ray.cluster_utils import Cluster
 
-    from filtergym.reports.benchmark import run_benchmark
+    from filtergym.reports.benchmark import BenchmarkOptions, Callbacks, run_benchmark
 
-    environments = words or ["filtergym/ManeuveringTarget-v0"]
+    options = BenchmarkOptions(environments=words or ["filtergym/ManeuveringTarget-v0"])
     with tempfile.TemporaryDirectory() as folder:
-        run_benchmark(Path(folder) / "one", False, 0, environments)
+        run_benchmark(Path(folder) / "one", options)
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         lost = cluster.add_node(num_cpus=1)
         ray.init(cluster.address, log_to_driver=False, logging_level="error")
         done = 0.0
 
-        def started(total: int) -> object:
+        def started(total: int) -> Progress:
             def tick(measurements: int) -> None:
                 nonlocal done
                 before, done = done / total, done + measurements
@@ -133,7 +134,7 @@ def killing(words: list[str]) -> None:
             return tick
 
         with Workers(cluster="ray") as workers:
-            run_benchmark(Path(folder) / "many", False, 0, environments, started=started, workers=workers)
+            run_benchmark(Path(folder) / "many", options, Callbacks(started), workers)
         ray.shutdown()
         cluster.shutdown()
         same = results(Path(folder) / "one") == results(Path(folder) / "many")

@@ -41,7 +41,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import numpy
 from filtergym.agents.learned_policy import PRETRAINED
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.settings import THROUGH_THE_FILTER
 from filtergym.agents.training_run import FILES, Bookkeeping, RunOptions, Session, new_run
 from filtergym.baselines.catalogue import baselines_of, package_of
@@ -49,8 +49,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.baselines.tuning import Candidate, mean_cost
 from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
-from filtergym.evaluation.curves import DISTRIBUTED
-from filtergym.evaluation.evaluate import Experiment
+from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.files import write_text
 from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
@@ -313,7 +312,7 @@ def _competitor(id: str, name: str, trained: Path | None, two_sizes: bool) -> Un
 
 def classical(id: str) -> list[str]:
     """Competitors of the full benchmark without the agents that are shipped."""
-    return [name for name in benchmark_policies(problem_of(id), True) if name not in shipped_agents(id)]
+    return [name for name in benchmark_policies(problem_of(id), True) if name not in pretrained_agents(id)]
 
 
 # --- the plan
@@ -370,7 +369,7 @@ def makespan(items: Sequence[Item], cores: int, start: float) -> float:
 
 def distributed(episodes: int, T: int) -> int:
     """Episodes whose distribution is told."""
-    return min(episodes, max(block_of(T), DISTRIBUTED // T))
+    return min(episodes, max(block_of(T), DISTRIBUTION_LIMIT // T))
 
 
 def sent_bytes(u: Units, pieces: int, episodes: int, T: int) -> float:
@@ -491,7 +490,7 @@ def unit_tables(units: Units, episodes: int, seeds: int) -> Iterator[Table]:
         learned = units["training"][id]
         T = max(c.measurements // (c.episodes * len(c.policies)) for c in cells(True, [id]))
         work = {name: 1e6 * u["work"] for name, u in found.items()}
-        pieces = len(EvaluationRequest(Experiment("", episodes=episodes), "", None).pieces())
+        pieces = len(EvaluationRequest(problem_of(id).experiment(episodes=episodes), "", None).pieces())
         sent = {name: sent_bytes(u, pieces, episodes, T) for name, u in found.items()}
         joining = [u["read"] * sent[name] + finish_seconds(u, episodes, T) for name, u in found.items()]
         table.add_row(

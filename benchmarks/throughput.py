@@ -193,7 +193,7 @@ def compiled_floor(id: str, control: str, costs: Costs) -> float | None:
     if model.backend != "compiled":
         return None
     parts = model.programs.later
-    halves = [parts.act, parts.advance, parts.predict, model.programs.reported(cost_reward)]
+    halves = [parts.act, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
     names = [step.operation for special in halves for step in special.program.steps]
     functions = sum(name in FUNCTIONS or name == "pow" for name in names)
     operations = sum(name not in ("input", "constant") for name in names) - functions

@@ -46,7 +46,7 @@ def key(*texts: str) -> str:
     return digest.hexdigest()
 
 
-def kept(name: str) -> bytes | None:
+def load(name: str) -> bytes | None:
     """Return an entry, or None."""
     place = folder()
     if place is None:
@@ -90,14 +90,14 @@ class _Untrusted(Exception):  # noqa: N818  (no error of a user's: why an entry 
     """Somebody else can have written what would be executed."""
 
 
-_EXPLAINED: set[Path] = set()
+_REPORTED_FOLDERS: set[Path] = set()
 """Folders of which it was said why they are not used."""
 
 
 def _explain(place: Path, reason: _Untrusted) -> None:
     """Say once why a folder, or an entry in it, is not used."""
-    if place not in _EXPLAINED:
-        _EXPLAINED.add(place)
+    if place not in _REPORTED_FOLDERS:
+        _REPORTED_FOLDERS.add(place)
         warnings.warn(
             f"compiled code in {place} is not used, and compiled anew: {reason}, so that somebody else can have "
             f"written what would be executed. Remove the folder, or set {SWITCH} to one that only you can write to, or "

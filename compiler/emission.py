@@ -241,7 +241,7 @@ def _slots(program: Program, part_of: dict[int, int]) -> dict[int, int]:
     return found
 
 
-def emitted(program: Program, lane_first: Sequence[bool], library: Library) -> str:
+def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
     """Text of a program.
 
     Args:

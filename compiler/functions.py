@@ -45,14 +45,14 @@ def leaves(part: Any) -> list[Any]:
     return [part]
 
 
-def mapped(function: Callable[[Any], Any], part: Any) -> Any:
+def map_arrays(function: Callable[[Any], Any], part: Any) -> Any:
     """Nested tuples and dictionaries with a function applied to every array."""
     if part is None:
         return None
     if isinstance(part, dict):
-        return {name: mapped(function, item) for name, item in part.items()}
+        return {name: map_arrays(function, item) for name, item in part.items()}
     if isinstance(part, tuple):
-        parts = [mapped(function, item) for item in part]
+        parts = [map_arrays(function, item) for item in part]
         return type(part)(*parts) if hasattr(part, "_fields") else tuple(parts)
     return function(part)
 
@@ -96,13 +96,13 @@ class Specialised:
         self.inputs = [_leaf(array) for part in parts for array in leaves(part)]
         with namespace.tracing(graph):
             places = iter(range(len(self.inputs)))
-            traced = [mapped(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
+            traced = [map_arrays(lambda _: _input(graph, next(places), self.inputs), part) for part in parts]
             answer = function(*traced)
             made = [namespace.asarray(array) for array in leaves(answer)]
         if any(array.shape[-1:] not in ((), (1,)) for array in made):  # more than the code has memory for
             raise namespace.NotTraceable("an array of the answer does not have the lanes as its last axis")
         count = iter(range(len(made)))
-        self.template = mapped(lambda _: next(count), answer)
+        self.template = map_arrays(lambda _: next(count), answer)
         self.outputs = [_leaf(array) for array in made]
         given = {
             (_leaf(array), array.nodes.tobytes()): i
@@ -140,7 +140,7 @@ class Specialised:
             table += [address_of(array), _stride(array, 0 if lane_first else -2)]
         return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
-    def called(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
+    def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
         """Run on inputs of some width; returns new outputs, None where an input stands for one."""
         self.compile()
         assert self.native is not None
@@ -169,7 +169,7 @@ class Specialised:
 
     def example(self) -> Any:
         """Answer made of arrays that hold nothing in particular, for whoever traces what comes after."""
-        return mapped(
+        return map_arrays(
             lambda place: numpy.zeros(
                 (*self.outputs[place].shape, LANES), dtype=DTYPES[self.outputs[place].kind]
             ),
@@ -217,7 +217,7 @@ def _pool(threads: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="lanes")
 
 
-def padded_width(count: int) -> int:
+def round_up_lanes(count: int) -> int:
     """Lanes that so many take: the next multiple of ``LANES``."""
     return -(-count // LANES) * LANES
 
@@ -259,7 +259,7 @@ class Function:
         self.function, self.graph, self.turned, self.unchanged = function, graph, turned, unchanged
         self._specialised: dict[Any, Specialised] = {}
 
-    def specialised(self, *parts: Any) -> Specialised:
+    def specialise(self, *parts: Any) -> Specialised:
         """Return the function for arguments of this structure."""
         key = tuple(_structure(part) for part in parts)
         if key not in self._specialised:
@@ -276,12 +276,12 @@ class Function:
             threads: how many share the lanes.
         """
         given = [array for part in parts for array in leaves(part)]
-        special = self.specialised(*parts)
+        special = self.specialise(*parts)
         count = max(array.shape[-1] for array in given)
         if any(array.shape[-1] not in (1, count) for array in given):
             raise ValueError(f"arrays have one width, got {sorted({array.shape[-1] for array in given})}")
-        width = padded_width(count)
-        outputs = special.called([_ready(array, width) for array in given], width, threads)
+        width = round_up_lanes(count)
+        outputs = special.call([_ready(array, width) for array in given], width, threads)
         answer: list[Any] = []
         for output, same, leaf in zip(outputs, special.same, special.outputs, strict=True):
             if output is None or same is not None:
@@ -289,7 +289,7 @@ class Function:
                 continue
             cut = output if width == count else output[..., :count]
             answer.append(cut if leaf.kind == "f" else cut.astype(DTYPES[leaf.kind]))
-        return mapped(lambda place: answer[place], special.template)
+        return map_arrays(lambda place: answer[place], special.template)
 
 
 def _structure(part: Any) -> Any:

@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from . import cache
-from .emission import emitted
+from .emission import emit
 from .library import Library, fastest
 from .program import LOCK, Program
 
@@ -75,18 +75,18 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
     with LOCK:
         binding, (name, features) = llvm(), processor()
         library = library or fastest(features)
-        text = emitted(program, lane_first, library)
+        text = emit(program, lane_first, library)
         version = ".".join(map(str, binding.llvm_version_info))
         return _load(text, cache.key(text, name, features, version), library)
 
 
 def _load(text: str, key: str, library: Library) -> Native:
-    if key in _LOADED:
-        return _LOADED[key]
+    if key in _LIBRARIES:
+        return _LIBRARIES[key]
     binding = llvm()
     for function in library.functions.values():
         binding.add_symbol(function.symbol, function.address)
-    code = cache.kept(key)
+    code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(text)
         module.verify()
@@ -97,8 +97,8 @@ def _load(text: str, key: str, library: Library) -> Native:
     engine.finalize_object()
     _ENGINES.append(engine)
     signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-    _LOADED[key] = signature(engine.get_function_address("program"))
-    return _LOADED[key]
+    _LIBRARIES[key] = signature(engine.get_function_address("program"))
+    return _LIBRARIES[key]
 
 
-_LOADED: dict[str, Native] = {}
+_LIBRARIES: dict[str, Native] = {}

@@ -31,7 +31,7 @@ from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
 
-ADDED: dict[str, type[Task]] = {}
+USER_TASKS: dict[str, type[Task]] = {}
 """Environments of users, as they were registered: Gymnasium id -> task class."""
 
 
@@ -44,11 +44,11 @@ MIXTURE = re.compile(r"[^:,]+:[^:,]+(,[^:,]+:[^:,]+)*")
 
 def catalogue() -> dict[str, type[Task]]:
     """Return every environment: Gymnasium id -> task class."""
-    return {**_shipped_tasks(), **ADDED}
+    return {**_builtin_tasks(), **USER_TASKS}
 
 
 @functools.cache
-def _shipped_tasks() -> dict[str, type[Task]]:
+def _builtin_tasks() -> dict[str, type[Task]]:
     package = importlib.import_module(__package__)
     rooms = (
         importlib.import_module(f"{__package__}.{m.name}")
@@ -77,7 +77,7 @@ def _meant(name: Any, valid: Iterable[str], choices: Iterable[str] | None = None
     return f"choose from {', '.join(valid if choices is None else choices)}" if valid else "there are none"
 
 
-_SEARCHED: list[str] = []
+_SEARCH_FOLDERS: list[str] = []
 """Folders in which modules that a user names are looked for, after ``sys.path``."""
 FOUND_IN: list[str] = []
 """Those of them in which one was found; other processes are told, see :mod:`..evaluation.parallel`."""
@@ -86,11 +86,11 @@ FOUND_IN: list[str] = []
 @contextmanager
 def modules_from(folder: str) -> Iterator[None]:
     """Let modules that a user names be found in a folder, too, and nothing else: a file there is no library."""
-    _SEARCHED.append(folder)
+    _SEARCH_FOLDERS.append(folder)
     try:
         yield
     finally:
-        _SEARCHED.remove(folder)
+        _SEARCH_FOLDERS.remove(folder)
         FOUND_IN.clear()
 
 
@@ -105,7 +105,7 @@ def on_path(folders: Iterable[str]) -> Iterator[None]:
         sys.path[:] = [path for path in sys.path if path not in further]
 
 
-def imported(module: str, refusal: str) -> ModuleType:
+def import_user_module(module: str, refusal: str) -> ModuleType:
     """Import a module that a user has named: the one function that imports by a name, and doors alone call it.
 
     A door is an argument of the command line or of a function that the user calls. What was read from a file goes
@@ -121,7 +121,7 @@ def imported(module: str, refusal: str) -> ModuleType:
     try:
         if not all(part.isidentifier() for part in module.split(".")):
             raise ImportError("a module is named by words with dots between them")
-        with on_path(_SEARCHED):
+        with on_path(_SEARCH_FOLDERS):
             found = importlib.import_module(module)
     except Exception as error:  # a module is a program: it can raise anything
         # A ValueError says all that there is to say.
@@ -130,7 +130,7 @@ def imported(module: str, refusal: str) -> ModuleType:
     places = (*getattr(found, "__path__", ()), getattr(found, "__file__", None) or "")
     FOUND_IN.extend(
         folder
-        for folder in _SEARCHED
+        for folder in _SEARCH_FOLDERS
         if folder not in FOUND_IN and any(Path(place).is_relative_to(folder) for place in places)
     )
     return found
@@ -147,7 +147,7 @@ def import_task(id: str) -> type[Task]:
     if not isinstance(id, str) or ":" not in id:
         return task_class(id)
     module, _, own = id.partition(":")
-    imported(module, f"cannot import {module!r}, which registers environment {own!r}")
+    import_user_module(module, f"cannot import {module!r}, which registers environment {own!r}")
     try:
         return task_class(own)
     except ValueError as error:
@@ -199,7 +199,7 @@ def _import_name(name: str) -> ImportableName:
 
 def importable_name(cls: type[Task]) -> str:
     """Id by which another process finds an environment: of a user's with the module that registers it."""
-    return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in ADDED else cls.id
+    return ImportableName(f"{cls.__module__}:{cls.id}") if cls.id in USER_TASKS else cls.id
 
 
 def short_name(id: str) -> str:
@@ -278,7 +278,7 @@ def find_mixture(cls: type[Task], scenario: Any) -> dict[str, float] | None:
     return {name: weight / total for name, weight in weights.items() if weight > 0.0}
 
 
-def opened(cls: type[Task], scenario: Any) -> Any:
+def read_files(cls: type[Task], scenario: Any) -> Any:
     """Return flights or a recording in place of what names them, so that files are read once; anything else as it is.
 
     Args:
@@ -329,17 +329,16 @@ def read_recording(
     several = list(path) if isinstance(path, list | tuple) else [path]
     if not several:
         raise ValueError("name at least one file of recordings, got none")
-    if environment is not None:
-        environment = import_task(environment).id
-        check_names(task_class(environment), keywords)
+    cls = None if environment is None else import_task(environment)
+    if cls is not None:
+        check_names(cls, keywords)
     files = [file for one in several for file in files_of(one)]
     found: list[Recording] = []
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(
-                _read_recording(file, found[0].environment if found else environment, speeds, keywords)
-            )
+            found.append(_read_recording(file, cls, speeds, keywords))
+            cls = cls or task_class(found[0].environment)
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
             if len(files) == 1:
@@ -355,7 +354,7 @@ def read_recording(
 
 
 def _read_recording(
-    file: Path, environment: str | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
+    file: Path, cls: type[Task] | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
 ) -> Recording:
     """Read one file."""
     if not file.is_file():
@@ -363,14 +362,14 @@ def _read_recording(
     if file.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     if names_environment(file):
-        recording = read_netcdf(file, task_class, environment, keywords)
-    elif environment is None:
+        recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
+    elif cls is None:
         raise ValueError(
             "it does not say of which environment it is: give its id, as the argument environment or before --recording"
         )
     else:
-        recording = read_columns(file, task_class(environment), keywords)
-    task = make_task(task_class(recording.environment), recording)
+        recording = read_columns(file, cls, keywords)
+    task = make_task(cls or task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))
 
@@ -400,7 +399,7 @@ def find_scenario(
             "a mixture of scenarios is for gymnasium.make, gymnasium.make_vec and training only: name one scenario, "
             f"got {scenario!r}"
         )
-    scenario = opened(cls, scenario)
+    scenario = read_files(cls, scenario)
     if isinstance(scenario, (Trajectory, Flights)):
         return cls.scenario_of_flights(scenario, keywords or {})
     if isinstance(scenario, Recording):

@@ -26,7 +26,7 @@ from ..compiler.functions import (
     Specialised,
     empty_lanes,
     leaves,
-    mapped,
+    map_arrays,
     run_over,
 )
 from ..compiler.namespace import NotTraceable
@@ -43,7 +43,7 @@ AVAILABLE = importlib.util.find_spec("llvmlite") is not None
 """Whether steps can be compiled here."""
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
-REMEMBERED = 8
+PROGRAM_CACHE_SIZE = 8
 """Tasks whose programs a process keeps."""
 MANY = 64
 """Lanes from which on observations are written where the caller will keep them, instead of into a copy."""
@@ -100,7 +100,7 @@ class Parts(NamedTuple):
     """After the measurement, its arrays of the right shapes."""
 
 
-def stepped(
+def step_episodes(
     kind: str, model: Model, episode: Episode, action: Array, noise: Array
 ) -> tuple[Episode, Array, Array]:
     """A whole step: episodes at the next measurement, the reward of the action, and the observation."""
@@ -151,7 +151,7 @@ class Programs:
                 programs = Programs(self.traced.with_filter(make), self.graph, self._of_world)
             if not programs.traced.filter.in_python:
                 _ = programs.later
-            while len(self._with_filter) >= REMEMBERED:
+            while len(self._with_filter) >= PROGRAM_CACHE_SIZE:
                 self._with_filter.pop(next(iter(self._with_filter)))
             self._with_filter[make] = programs
         return self._with_filter[make]
@@ -166,43 +166,43 @@ class Programs:
         return self._functions[function]
 
     @_Once
-    def updated(self) -> Function:
+    def filter_update(self) -> Function:
         """The filter with the measurement; a part of it that stays is not written again."""
         return self.function(_update, unchanged=None)
 
     @_Once
-    def advanced(self) -> Function:
+    def world_advance(self) -> Function:
         """The world; a part of the truth that stays is not written again."""
         if self._of_world is not self:
-            return self._of_world.advanced
-        return self.function(_advance, unchanged=len(leaves(self.world_begun.example()[0])))
+            return self._of_world.world_advance
+        return self.function(_advance, unchanged=len(leaves(self.world_start.example()[0])))
 
     @_Once
-    def predicted(self) -> Function:
+    def filter_prediction(self) -> Function:
         """The filter at the next measurement."""
         return self.function(_predict, turned=True)
 
     @_Once
-    def world_begun(self) -> Specialised:
+    def world_start(self) -> Specialised:
         """World at the start of the track."""
         if self._of_world is not self:
-            return self._of_world.world_begun
+            return self._of_world.world_start
         noise = self.traced.task.noise
         uniforms, normals = numpy.zeros((noise.uniforms, 8)), numpy.zeros((noise.initial_normals, 8))
-        return self.function(_begin_world).specialised(uniforms, normals)
+        return self.function(_begin_world).specialise(uniforms, normals)
 
     @_Once
-    def begun(self) -> tuple[Specialised, Specialised]:
+    def start(self) -> tuple[Specialised, Specialised]:
         """World and filter at the start of the track."""
-        truth, initial = self.world_begun.example()
-        return self.world_begun, self.function(_start_filter).specialised(
+        truth, initial = self.world_start.example()
+        return self.world_start, self.function(_start_filter).specialise(
             initial, self.traced.truth_for_filter(truth)
         )
 
     @_Once
     def first(self) -> Parts:
         """Parts of the way from the start of the track over the first measurement."""
-        world, started = self.begun
+        world, started = self.start
         return self._parts(world.example()[0], *started.example())
 
     @_Once
@@ -231,21 +231,21 @@ class Programs:
         space = self.traced.action_space
         discrete = isinstance(space, gymnasium.spaces.Discrete)
         action = numpy.zeros((*(space.shape or ()), 8), dtype=int if discrete else float)
-        advance = self.advanced.specialised(truth, feedback, self.row)
+        advance = self.world_advance.specialise(truth, feedback, self.row)
         following, measurement = advance.example()
-        predict = self.predicted.specialised(state, measurement)
+        predict = self.filter_prediction.specialise(state, measurement)
         predicted = predict.example()[0]
         known = self.traced.truth_for_filter(following)
-        update = self.updated.specialised(known, predicted, measurement, action)
+        update = self.filter_update.specialise(known, predicted, measurement, action)
         return Parts(update, advance, predict, Episode(following, measurement, predicted))
 
-    def reported(self, report: Report) -> Specialised:
+    def report_program(self, report: Report) -> Specialised:
         """A report on an episode.
 
         Raises:
             NotTraceable: if it is no straight line of arithmetic.
         """
-        return self.function(report).specialised(self.later.episode)
+        return self.function(report).specialise(self.later.episode)
 
 
 def _compile(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -344,8 +344,8 @@ class CompiledModel(Model):
         functions, threads = self.programs, self.threads
         given = episode.filter, episode.measurement
         feedback = self.filter.feedback(*given) if self.filter.in_python else self.run(_feedback, *given)
-        truth, measurement = functions.advanced(episode.truth, feedback, noise, threads=threads)
-        state, _ = functions.predicted(episode.filter, measurement, threads=threads)
+        truth, measurement = functions.world_advance(episode.truth, feedback, noise, threads=threads)
+        state, _ = functions.filter_prediction(episode.filter, measurement, threads=threads)
         return Episode(truth, measurement, state)
 
     def act(self, episode: Episode, action: Array) -> Episode:
@@ -353,7 +353,7 @@ class CompiledModel(Model):
         if self.filter.in_python:
             return super().act(episode, action)
         arguments = (self.truth_for_filter(episode.truth), episode.filter, episode.measurement, action)
-        return episode._replace(filter=self.programs.updated(*arguments, threads=self.threads)[0])
+        return episode._replace(filter=self.programs.filter_update(*arguments, threads=self.threads)[0])
 
 
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
@@ -364,7 +364,7 @@ def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Pr
     return programs
 
 
-_remembered = functools.lru_cache(REMEMBERED)(_trace)
+_remembered = functools.lru_cache(PROGRAM_CACHE_SIZE)(_trace)
 
 
 def _hashes(value: Any) -> bool:
@@ -392,7 +392,7 @@ def can_step(model: Any, report: Report) -> bool:
     if not isinstance(model, CompiledModel) or model.filter.in_python or report in model.programs.refused:
         return False
     try:
-        model.programs.reported(report)
+        model.programs.report_program(report)
     except NotTraceable as error:
         model.programs.refused.add(report)
         warn_of(f"{report.__qualname__} of {model.task.id}", error)
@@ -414,11 +414,11 @@ class Stepper:
 
     def __init__(self, model: Any, report: Report, width: int) -> None:
         update, advance, predict, episode = model.programs.later
-        tell = model.programs.reported(report)
+        tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
         self.width, self._threads, self._model = width, model.threads, model
         count = itertools.count()
-        self._template, self._kinds = mapped(lambda _: next(count), episode), _kinds(leaves(episode))
+        self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
 
         def memory(outputs: Sequence[Leaf]) -> list[numpy.ndarray]:
@@ -437,7 +437,7 @@ class Stepper:
         written = memory(update.outputs)
         nothing = numpy.zeros((advance.inputs[-1].rows, width))
         self._calls, self._begin = [], []
-        world, start = model.programs.begun
+        world, start = model.programs.start
         self._drawn = memory(world.inputs)
         initial = memory(world.outputs[truths:])
         begun = model.programs.first
@@ -527,7 +527,7 @@ class Stepper:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
         return _copy_numbers(self._report_template, self._reported, self._report_kinds)
 
-    def shown(self) -> numpy.ndarray:
+    def observation_by_field(self) -> numpy.ndarray:
         """What is shown, ``(fields, width)``, until the next step."""
         return self._shown.T
 
@@ -555,4 +555,4 @@ def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:
 
 def _copy_numbers(template: Any, memory: Sequence[numpy.ndarray], kinds: Sequence[str]) -> Any:
     """Copies of arrays of numbers in their places, in their own types."""
-    return mapped(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)
+    return map_arrays(lambda i: memory[i].astype(DTYPES[kinds[i]], order="C"), template)

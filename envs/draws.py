@@ -93,7 +93,7 @@ class Draws:
         return self._keep(name, category(self._rows(None), thresholds, self.xp))
 
 
-def between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
+def draw_between(draw: Callable[..., Array], name: str, limits: tuple[float, float]) -> Array:
     """Draw between two limits; where they are one it is that, a float, and no number is used."""
     return limits[0] if limits[0] == limits[1] else draw(name, limits)
 

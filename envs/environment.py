@@ -20,10 +20,10 @@ from .fleet import Course, Fleet, check_alike
 from .lanes import Lanes, mean_of
 from .model import Model
 from .observation import Array, Field
-from .parameters import Limits, check, frozen
+from .parameters import Limits, check, freeze
 from .privileged import context_shapes, in_sigmas
 from .reward import REWARDS
-from .specification import told
+from .specification import with_episode_length
 from .step_report import step_report
 from .task import Task
 
@@ -353,7 +353,7 @@ class _EnvBase:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = None if spec is None else told(spec, self.last_decision)
+        self._spec = None if spec is None else with_episode_length(spec, self.last_decision)
 
     @property
     def backend(self) -> str:
@@ -507,7 +507,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         self._forget_errors([0])
         self.model = self.fleet.model_of(0)
         if self._late is not None and ahead is not None:
-            self.fleet.course_of(0).drawn(ahead)  # comes before the episode
+            self.fleet.course_of(0).draw_task(ahead)  # comes before the episode
             if self._late.model is not self.model:
                 self._late.close()
                 self._picture_of(self.fleet.scenario_of(0))
@@ -529,7 +529,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply the action to the measurement just shown, then show the next one."""
-        if not self.fleet.begun:
+        if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         array = check_action(self.action_space, action, None)
         info: dict[str, Any] = {}
@@ -542,7 +542,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         if self.options.context:
             self._with_context(info)
         reward = float(self._to_dtype(reward)[0])
-        return self._single_observation(), reward, False, bool(self.fleet.finished[0]), info
+        return self._single_observation(), reward, False, bool(self.fleet.done[0]), info
 
     def _show(self) -> None:
         """Draw into the window of render mode "human"."""
@@ -569,7 +569,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
                 'render was called without a render mode: use gym.make(..., render_mode="rgb_array")'
             )
             return None
-        if not self.fleet.begun:
+        if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first render")
         if self.render_mode == "human":
             self._show()
@@ -648,7 +648,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         **keywords: Any,
     ) -> None:
         self._set_options(task, EnvOptions(reward, detailed_info, dtype, context, observation), keywords)
-        num_envs, max_episode_steps = frozen(num_envs), frozen(max_episode_steps)
+        num_envs, max_episode_steps = freeze(num_envs), freeze(max_episode_steps)
         check("num_envs", num_envs, int, Limits(at_least=1))
         if max_episode_steps not in (None, -1):
             check("max_episode_steps", max_episode_steps, int, Limits(at_least=1))
@@ -675,7 +675,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         if render_mode is not None:
             from . import rendering
 
-            if self.fleet.mixed:
+            if self.fleet.mixes_scenarios:
                 raise ValueError(
                     "a vector of environments that mix scenarios cannot be drawn: use gymnasium.make, or one scenario"
                 )
@@ -740,7 +740,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                     f"options['reset_mask'] must be a boolean array of shape ({self.num_envs},) with "
                     f"at least one True, got {mask!r}"
                 )
-            if not self.fleet.begun and not mask.all():
+            if not self.fleet.has_episodes and not mask.all():
                 raise gymnasium.error.ResetNeeded("reset every sub-environment once before resetting some")
             chosen = numpy.flatnonzero(mask).tolist()
         shortened = wanted.get("shortened_by")
@@ -760,10 +760,10 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Add the context of some lanes to ``info``, in Gymnasium's form, if it is wanted."""
         if self.options.context and lanes.any():
             values, present = self._context()
-            told = {}
+            context = {}
             for name, array in values.items():
-                told[name], told[f"_{name}"] = array, self._mask(present[name] & lanes)
-            info["context"], info["_context"] = told, self._mask(lanes)
+                context[name], context[f"_{name}"] = array, self._mask(present[name] & lanes)
+            info["context"], info["_context"] = context, self._mask(lanes)
         return info
 
     def _check_shortening(self, values: Any) -> numpy.ndarray:
@@ -791,7 +791,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Any, Array, numpy.ndarray, numpy.ndarray, dict[str, Any]]:
         """Apply the actions to the measurements just shown, then show the next ones."""
-        if not self.fleet.begun:
+        if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
         waiting = self._finished
         if self.autoreset_mode is AutoresetMode.DISABLED and waiting.any():
@@ -806,7 +806,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
             # NEXT_STEP: this step only resets those that finished in the last one; their action is ignored.
             self._restart(numpy.flatnonzero(waiting).tolist())
             reward = self.task.xp.where(self._mask(waiting), 0.0, reward)
-        finished = self.fleet.finished
+        finished = self.fleet.done
         if self.autoreset_mode is AutoresetMode.SAME_STEP and finished.any():
             done = numpy.flatnonzero(finished)
             info = self._with_masks(info, ~finished) | {
@@ -833,7 +833,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         return lambda state: pictures.keep(state, actions, shown)
 
     def render(self) -> tuple[numpy.ndarray, ...] | None:
-        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.DRAWN`).
+        """Draw the episodes so far of the first few sub-environments (:data:`.rendering.MAX_PICTURES`).
 
         Returns:
             A frame for each sub-environment, ``(height, width, 3)`` bytes, blank beyond the first few: drawing takes
@@ -847,7 +847,7 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
                 'render was called without a render mode: use gymnasium.make_vec(..., render_mode="rgb_array")'
             )
             return None
-        if not self.fleet.begun:
+        if not self.fleet.has_episodes:
             raise gymnasium.error.ResetNeeded("call reset before the first render")
         return self.pictures.frames(self.fleet.only.state)
 

@@ -18,7 +18,7 @@ class Outliers(NamedTuple):
         """Uniform numbers that a measurement takes: one, or none where there are no outliers."""
         return 1 if self.probability else 0
 
-    def amplified(self, deviation: Array, uniforms: Array, xp: ModuleType) -> Array:
+    def amplify(self, deviation: Array, uniforms: Array, xp: ModuleType) -> Array:
         """Return standard deviations, or errors, multiplied by the factor where a measurement is an outlier.
 
         Args:

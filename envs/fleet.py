@@ -49,7 +49,7 @@ class Course(NamedTuple):
             alike = repr(plain(self.scenario)) == repr(plain(scenario))
         return alike and repr(plain(self.parameters)) == repr(plain(parameters))
 
-    def drawn(self, generator: numpy.random.Generator) -> int:
+    def draw_task(self, generator: numpy.random.Generator) -> int:
         """Number of the task of the next episode; one task takes no random number."""
         if len(self.models) == 1:
             return 0
@@ -65,13 +65,13 @@ def check_alike(model: Model, other: Model, name: str) -> None:
         other: that is to be flown too.
         name: of its scenario, in errors.
     """
-    said: dict[str, Callable[[Model], Any]] = {
+    properties: dict[str, Callable[[Model], Any]] = {
         "the fields of the observation": lambda t: [(f.name, f.unit, f.over_interval) for f in t.fields],
         "the action space": lambda t: t.action_space,
         "decision_interval": lambda t: t.task.decision_interval,
         "what is estimated": lambda t: t.task.components,
     }
-    for what, of in said.items():
+    for what, of in properties.items():
         if of(model) != of(other):
             raise ValueError(
                 f"scenario {name!r} with these parameters would change {what} of this environment, which stays as it "
@@ -124,7 +124,7 @@ class Fleet:
         return self._parts[self._part[0]]
 
     @property
-    def mixed(self) -> bool:
+    def mixes_scenarios(self) -> bool:
         """Whether the coming episodes may be of several tasks."""
         return len({id(model) for course in self._courses for model in course.models}) > 1
 
@@ -194,7 +194,7 @@ class Fleet:
             self._sources.append(source)
             first += self._parts[i].count
         own_places = self._flying == [0] and numpy.array_equal(self._place, numpy.arange(self.count))
-        alone = len(self._parts) == 1 and self._parts[0].count == self.count and not self.mixed
+        alone = len(self._parts) == 1 and self._parts[0].count == self.count and not self.mixes_scenarios
         self._whole = self._parts[0] if own_places and alone else None
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
@@ -218,7 +218,7 @@ class Fleet:
         fresh: dict[int, list[int]] = {}
         for lane in chosen:
             course = self._courses[lane]
-            which = course.drawn(self.generators[lane])
+            which = course.draw_task(self.generators[lane])
             part = self._part_of(course.models[which])
             number = next(i for i, other in enumerate(self._parts) if other is part)
             fresh.setdefault(number, []).append(lane)
@@ -239,7 +239,7 @@ class Fleet:
     def _leave(self, whole: Lanes) -> None:
         """Make room for lanes of other tasks."""
         self._whole = None
-        if whole.begun:
+        if whole.has_episodes:
             whole.grow(whole.width)
         else:
             self._parts, self._part[:] = [], -1
@@ -281,11 +281,11 @@ class Fleet:
         return numpy.asarray(self.gather([part.decisions for (part,) in self.parts()]))
 
     @property
-    def finished(self) -> numpy.ndarray:
+    def done(self) -> numpy.ndarray:
         """Lanes whose episode is over, ``(count,)`` booleans; episodes of different tasks may differ in length."""
         if self._whole is not None:
-            return self._whole.finished
-        return numpy.asarray(self.gather([part.finished for (part,) in self.parts()]))
+            return self._whole.done
+        return numpy.asarray(self.gather([part.done for (part,) in self.parts()]))
 
     def shorten(self, lanes: Sequence[int], decisions: numpy.ndarray) -> None:
         """Let the episodes that have just begun in some lanes end so many decisions early, but take one at least."""
@@ -293,9 +293,9 @@ class Fleet:
             self._parts[self._part[lane]].shorten([int(self._place[lane])], by)
 
     @property
-    def begun(self) -> bool:
+    def has_episodes(self) -> bool:
         """Whether every lane has an episode."""
-        return self._whole.begun if self._whole is not None else bool((self._part >= 0).all())
+        return self._whole.has_episodes if self._whole is not None else bool((self._part >= 0).all())
 
     def detach(self) -> None:
         """Cut the gradient (torch only)."""
@@ -304,7 +304,7 @@ class Fleet:
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
-        kept = {name: copy.deepcopy(getattr(self, name)) for name in _KEPT}
+        kept = {name: copy.deepcopy(getattr(self, name)) for name in _STATE_ATTRIBUTES}
         return {"count": self.count, **kept, "parts": [(p.model, p.count, p.snapshot()) for p in self._parts]}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -315,7 +315,7 @@ class Fleet:
         """
         if snapshot["count"] != self.count:
             raise ValueError(f"the snapshot holds {snapshot['count']} environments, not {self.count}")
-        for name in _KEPT:
+        for name in _STATE_ATTRIBUTES:
             setattr(self, name, copy.deepcopy(snapshot[name]))
         there = {(part.model, part.count): part for part in self._parts}
         self._parts = [
@@ -329,5 +329,5 @@ class Fleet:
         self._arrange()
 
 
-_KEPT = ("generators", "_courses", "_part", "_place", "_names", "_sent")
+_STATE_ATTRIBUTES = ("generators", "_courses", "_part", "_place", "_names", "_sent")
 """Attributes of a fleet that change."""

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
-from .parameters import Limits, check, frozen
-from .plausibility import check_speed, check_velocity, isolated, speeds_of
+from .parameters import Limits, check, freeze
+from .plausibility import check_speed, check_velocity, find_outliers, speeds_of
 from .trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -25,12 +25,12 @@ class Cleaning(NamedTuple):
     def check(self) -> None:
         """Raise ValueError if a limit cannot be."""
         check("longest_gap", self.longest_gap, float, Limits(above=0.0))
-        check("speeds", frozen(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
+        check("speeds", freeze(self.speeds), tuple[float, float], Limits(at_least=0.0, ascending=True))
         check("reach", self.reach, float, Limits(above=0.0))
         check("smoothing", self.smoothing, float, Limits(at_least=0.0))
 
 
-COUNTED: dict[str, Any] = {
+CLEANING_COUNTS: dict[str, Any] = {
     "ground": (("row on the ground", "rows on the ground"), lambda limits: ""),
     "missing": (("row without position", "rows without position"), lambda limits: ""),
     "repeated": (("repeated position",), lambda limits: ""),
@@ -42,7 +42,9 @@ COUNTED: dict[str, Any] = {
 """What is counted while a flight is cleaned, and how it is told."""
 
 
-def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list[Trajectory], dict[str, int]]:
+def clean_flight(
+    name: str, rows: "pandas.DataFrame", limits: Cleaning
+) -> tuple[list[Trajectory], dict[str, int]]:
     """Cut one flight into pieces.
 
     Args:
@@ -52,12 +54,12 @@ def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list
         limits: what it may look like.
 
     Returns:
-        The pieces, and how much of what ``COUNTED`` names there was.
+        The pieces, and how much of what ``CLEANING_COUNTS`` names there was.
 
     Raises:
         ValueError: if it cannot be a flight, with the likely cause.
     """
-    counts = dict.fromkeys(COUNTED, 0)
+    counts = dict.fromkeys(CLEANING_COUNTS, 0)
 
     def keep(good: Any, what: str) -> None:
         nonlocal rows
@@ -87,7 +89,7 @@ def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list
     highest = limits.speeds[1]
 
     time, position, _ = _arrays(rows)
-    keep(~isolated(time, position, lambda elapsed: highest * elapsed), "outliers")
+    keep(~find_outliers(time, position, lambda elapsed: highest * elapsed), "outliers")
     time, position, velocity = _arrays(rows)
     gaps, jumps = numpy.diff(time) > limits.longest_gap, speeds_of(time, position) > highest
     counts["gaps"], counts["jumps"] = int(gaps.sum()), int((jumps & ~gaps).sum())
@@ -98,7 +100,7 @@ def cleaned(name: str, rows: "pandas.DataFrame", limits: Cleaning) -> tuple[list
     for number, part in enumerate(long, 1):
         flown, moving = position[part], None if velocity is None else velocity[part]
         if limits.smoothing and len(flown) >= FEWEST_IN_WINDOW:
-            flown, moving = smoothed(time[part], flown, limits.smoothing)
+            flown, moving = fit_parabolas(time[part], flown, limits.smoothing)
         own = name if len(parts) == 1 else f"{name} {number}/{len(long)}"
         pieces.append(Trajectory(time[part], flown, moving, own, name))
     return pieces, counts
@@ -119,7 +121,7 @@ FEWEST_IN_WINDOW = 5
 """Positions that a parabola is fitted to at least."""
 
 
-def smoothed(
+def fit_parabolas(
     time: numpy.ndarray, position: numpy.ndarray, half_width: float
 ) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Position and velocity of the parabolas that fit best around each time.

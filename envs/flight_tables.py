@@ -136,7 +136,7 @@ def _netcdf(file: Path, known: Container[str]) -> Table:
             if lower not in known:
                 continue
             _check_rows(data[name].size)
-            unit, meant = str(data[name].attrs.get("units", "")), UNITS.get(_WANTED.get(lower, ""))
+            unit, meant = str(data[name].attrs.get("units", "")), UNITS.get(_COLUMN_OF_ALIAS.get(lower, ""))
             if unit and meant and unit not in meant:
                 raise ValueError(f"{name} is in {unit!r}, and {meant[0]!r} is expected")
             values = data[name].values
@@ -183,7 +183,7 @@ def _json(file: Path, known: Container[str]) -> Table:
 
 
 _READERS = {".csv": _csv, ".nc": _netcdf, ".parquet": _parquet, ".json": _json, ".json.gz": _json}
-_WANTED = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
+_COLUMN_OF_ALIAS = {alias: name for name, aliases in COLUMNS.items() for alias in aliases}
 
 
 def suffix_of(file: Path) -> str:
@@ -191,7 +191,7 @@ def suffix_of(file: Path) -> str:
     return next((suffix for suffix in FLIGHT_SUFFIXES if file.name.endswith(suffix)), "")
 
 
-def read_table(file: Path, known: Container[str] = _WANTED) -> Table:
+def read_table(file: Path, known: Container[str] = _COLUMN_OF_ALIAS) -> Table:
     """Read the known columns of a file.
 
     Args:

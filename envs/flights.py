@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy
 
 from ..filters.geodesy import east_north
-from .flight_cleaning import COUNTED, Cleaning, cleaned
+from .flight_cleaning import CLEANING_COUNTS, Cleaning, clean_flight
 from .flight_tables import (
     FLIGHT_SUFFIXES,
     FOOT,
@@ -45,7 +45,7 @@ class Source(NamedTuple):
 
     name: str
     trajectories: tuple[Trajectory, ...]
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     """What was cut: "2 gaps over 60 s"."""
     wrong: str = ""
     """Why nothing of it is used; empty if something is."""
@@ -105,19 +105,19 @@ class Flights:
                     dropped += 1
                 else:
                     kept.append(piece)
-            said = [*source.said]
-            if source.said or dropped:
-                said.append(_count_of(len(source.trajectories), "piece"))
+            notes = [*source.notes]
+            if source.notes or dropped:
+                notes.append(_count_of(len(source.trajectories), "piece"))
             if dropped:
-                said.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
+                notes.append(f"{dropped} dropped (shorter than {self.fewest_scans} scans of {interval:g} s)")
             if far:
-                said.append(f"{far}: left out (positions are metres)")
+                notes.append(f"{far}: left out (positions are metres)")
             if source.wrong:
-                said = [f"left out: {source.wrong}"]
+                notes = [f"left out: {source.wrong}"]
             elif not kept:
-                said = [f"left out: {', '.join(said)}"]
-            if said:
-                lines.append(f"{source.name}: {', '.join(said)}")
+                notes = [f"left out: {', '.join(notes)}"]
+            if notes:
+                lines.append(f"{source.name}: {', '.join(notes)}")
             used += kept
         if not used:
             raise ValueError(_nothing(self.name, lines))
@@ -390,7 +390,7 @@ def _flights_of(
         _check_degrees(limits.site, rows)
     rows["ground"] = is_true(columns["ground"]) if "ground" in columns else False
     good: list[Trajectory] = []
-    counts = dict.fromkeys(COUNTED, 0)
+    counts = dict.fromkeys(CLEANING_COUNTS, 0)
     bad: list[Source] = []
     groups = _by_flight(rows, columns.get("flight"))
     for flight, own in groups.items():
@@ -398,7 +398,7 @@ def _flights_of(
         try:
             if not plane and limits.site:
                 own = _around(limits.site, own)
-            pieces, found = cleaned(name, own, limits)
+            pieces, found = clean_flight(name, own, limits)
         except ValueError as error:
             if len(groups) == 1:
                 raise
@@ -409,16 +409,16 @@ def _flights_of(
             counts[what] += count
     if not good:
         raise ValueError(_nothing(label, [f"{s.name}: {s.wrong}" for s in bad]))
-    said = [
+    notes = [
         f"{_count_of(count, *words)}{tail(limits)}"
-        for (words, tail), count in zip(COUNTED.values(), counts.values(), strict=True)
+        for (words, tail), count in zip(CLEANING_COUNTS.values(), counts.values(), strict=True)
         if count
     ]
-    if len(groups) > 1 and said:
-        said = [f"{len(groups) - len(bad)} flights", *said]
+    if len(groups) > 1 and notes:
+        notes = [f"{len(groups) - len(bad)} flights", *notes]
     if placed:
-        said = [placed, *said]
-    return [Source(file.name, tuple(good), tuple(said)), *bad]
+        notes = [placed, *notes]
+    return [Source(file.name, tuple(good), tuple(notes)), *bad]
 
 
 def _median_site(rows: "pandas.DataFrame") -> tuple[float, float]:

@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..compiler.functions import mapped, padded_width
+from ..compiler.functions import map_arrays, round_up_lanes
 from ..filters.ordered_sums import ordered_sum
 from .compiled import Report, Stepper, can_step
 from .model import Episode, Model
@@ -112,13 +112,13 @@ class ModelStepper:
         """Return the last report, in arrays ``(..., width)``."""
         return self._report
 
-    def shown(self) -> Array:
+    def observation_by_field(self) -> Array:
         """What is shown, ``(fields, width)``."""
         if self._shown is None:
             self._shown = self.model.observe(self._episode)
         return self._shown
 
-    def computed_observation(self) -> Array:
+    def observation_if_computed(self) -> Array:
         """What is shown where it was computed, else None."""
         return self._shown
 
@@ -129,11 +129,11 @@ class ModelStepper:
         spread = [
             means[list(fields).index(i)] if i in fields else 0.0 * means[0] for i in range(len(model.fields))
         ]
-        self._shown = xp.where(fresh > 0.0, xp.stack(spread), self.shown())
+        self._shown = xp.where(fresh > 0.0, xp.stack(spread), self.observation_by_field())
 
     def observation(self, count: int) -> Array:
         """Observation of the first lanes, batch first; the caller may keep it."""
-        shown = self.shown()[:, :count].T
+        shown = self.observation_by_field()[:, :count].T
         # Contiguous, in memory of its own.
         return shown.copy() if isinstance(shown, numpy.ndarray) else shown.contiguous()
 
@@ -145,7 +145,7 @@ class Lanes:
         model: task with a filter; the task's namespace decides where arrays live.
         count: number of lanes.
         paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
-        begun: called with new episodes at the start of the track, before their first measurement.
+        on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
 
     Attributes:
@@ -158,16 +158,16 @@ class Lanes:
         model: Model,
         count: int,
         paper: Model | None = None,
-        begun: Callable[[Episode], None] | None = None,
+        on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
     ) -> None:
         self.model = model
         self.task = task = model.task
         self.count = count
-        self.width = padded_width(count)
+        self.width = round_up_lanes(count)
         self.paper = paper
         self._models = [model] if paper is None else [model, paper]
-        self._begun = begun
+        self._on_start = on_start
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
@@ -184,7 +184,7 @@ class Lanes:
 
     def _pad(self, values: numpy.ndarray, fill: float) -> Array:
         """Widen ``(rows, lanes)`` to a multiple of eight lanes."""
-        width = padded_width(values.shape[1])
+        width = round_up_lanes(values.shape[1])
         padded = numpy.full((values.shape[0], width), fill)
         padded[:, : values.shape[1]] = values
         return self.task.xp.asarray(padded, device=self.task.device)
@@ -208,8 +208,8 @@ class Lanes:
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
         # The padding lanes fly an average episode without noise.
         scenario, start = self._pad(uniforms, 0.5), self._pad(normals, 0.0)
-        if self._begun is not None:
-            self._begun(self.model.begin(scenario, start))
+        if self._on_start is not None:
+            self._on_start(self.model.begin(scenario, start))
         if everyone:
             self._moving = self._moving or self._by_functions()
             for stepper in self._moving:
@@ -217,7 +217,7 @@ class Lanes:
             return
         where = index if xp is numpy else xp.asarray(chosen, device=task.device)
         row = self.noise.row[:, where]
-        padding = padded_width(len(chosen)) - len(chosen)
+        padding = round_up_lanes(len(chosen)) - len(chosen)
         if padding:
             row = xp.concat(
                 [row, xp.zeros((row.shape[0], padding), dtype=row.dtype, device=task.device)], axis=1
@@ -257,7 +257,7 @@ class Lanes:
                 stepper.step(self.noise)
             answers.append((own.report(), steppers[1].report() if self.paper else None))
             if self._averaged:
-                total = total + own.shown()[self._averaged]
+                total = total + own.observation_by_field()[self._averaged]
         if self._averaged:
             own.show_means(self._averaged, total / self.task.decision_interval)
         self.decisions += 1
@@ -294,7 +294,7 @@ class Lanes:
                 stepper.report_function = report
             return self._moving
         for i, (old, new) in enumerate(zip(before, after, strict=True)):
-            new.load(old.episode(), old.shown() if i == 0 else None)
+            new.load(old.episode(), old.observation_by_field() if i == 0 else None)
         self._moving = after
         return after
 
@@ -303,10 +303,10 @@ class Lanes:
         if self._moving and not isinstance(self._moving[0], ModelStepper):
             before, self._moving = self._moving, self._by_functions()
             for old, new in zip(before, self._moving, strict=True):
-                new.load(old.episode(), old.shown().copy() if self._averaged else None)
+                new.load(old.episode(), old.observation_by_field().copy() if self._averaged else None)
 
     @property
-    def begun(self) -> bool:
+    def has_episodes(self) -> bool:
         """Whether there are episodes."""
         return bool(self._moving)
 
@@ -334,7 +334,7 @@ class Lanes:
         self._settle()
         beyond = numpy.zeros(count - self.width, dtype=numpy.int64)
         index = self.task.xp.asarray(numpy.append(numpy.arange(self.width), beyond), device=self.task.device)
-        parts = mapped(lambda values: self.task.xp.take(values, index, axis=-1), self._episodes())
+        parts = map_arrays(lambda values: self.task.xp.take(values, index, axis=-1), self._episodes())
         added = count - self.count
         self.decisions = numpy.append(self.decisions, numpy.zeros(added, dtype=numpy.int64))
         self._lengths = numpy.append(self._lengths, numpy.full(added, self.decisions_per_episode))
@@ -347,7 +347,7 @@ class Lanes:
 
     def _episodes(self) -> tuple[Any, ...]:
         """Episodes of every task with what is shown of them; the arrays never change."""
-        return tuple((stepper.episode(), stepper.computed_observation()) for stepper in self._moving)
+        return tuple((stepper.episode(), stepper.observation_if_computed()) for stepper in self._moving)
 
     def _load(self, episodes: tuple[Any, ...]) -> None:
         for stepper, (episode, shown) in zip(self._moving, episodes, strict=True):
@@ -355,7 +355,7 @@ class Lanes:
 
     def detach(self) -> None:
         """Cut the gradient: what follows no longer remembers how it came about (torch only)."""
-        self._load(mapped(lambda tensor: tensor.detach(), self._episodes()))
+        self._load(map_arrays(lambda tensor: tensor.detach(), self._episodes()))
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the coming steps depend on; :meth:`restore` goes back to it, as often as one likes."""
@@ -381,7 +381,7 @@ class Lanes:
         self.decisions[list(lanes)] = numpy.minimum(decisions, self._lengths[list(lanes)] - 1)
 
     @property
-    def finished(self) -> numpy.ndarray:
+    def done(self) -> numpy.ndarray:
         """Lanes whose episode is over, ``(count,)`` booleans."""
         return self.decisions >= self._lengths
 

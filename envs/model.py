@@ -183,17 +183,17 @@ class Model:
         """What a track is drawn from: ``truth`` (where it is known) and ``estimate`` ``(C, N)``, ``covariance``
         ``(C, C, N)``, and every array of the measurement, named ``measurement_NAME``.
         """
-        said = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
-        return {**self._estimated(episode), **said}
+        measured = {f"measurement_{name}": values for name, values in named_arrays(episode.measurement)}
+        return {**self._truth_and_estimate(episode), **measured}
 
-    def drawn(self, episode: Episode) -> dict[str, Array]:
-        """What a picture of a track shows: as :meth:`track`, but of the measurement what is ``seen`` of the components
-        ``(C, N)``, where anything is; NaN where it says nothing.
+    def picture_track(self, episode: Episode) -> dict[str, Array]:
+        """Arrays that a picture of a track shows: as :meth:`track`, but of the measurement only ``seen``, the readings
+        of the components ``(C, N)``, if the world has any; NaN where a component was not measured.
         """
-        seen = self.task.world.seen(episode.measurement)
-        return {**self._estimated(episode), **({} if seen is None else {"seen": seen})}
+        seen = self.task.world.component_readings(episode.measurement)
+        return {**self._truth_and_estimate(episode), **({} if seen is None else {"seen": seen})}
 
-    def _estimated(self, episode: Episode) -> dict[str, Array]:
+    def _truth_and_estimate(self, episode: Episode) -> dict[str, Array]:
         true = {"truth": self.task.world.state(episode.truth)} if self.task.has_truth else {}
         return {**true, "estimate": self.mean(episode), "covariance": self.covariance(episode)}
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy
 
-from ..compiler.functions import address_of, padded_width
+from ..compiler.functions import address_of, round_up_lanes
 from .observation import Array
 from .task import Task
 
@@ -38,7 +38,7 @@ class NoiseRing:
 
     def __init__(self, task: Task, count: int) -> None:
         self.task, self._layout = task, task.noise
-        self._width = padded_width(count)
+        self._width = round_up_lanes(count)
         self.generators: list[numpy.random.Generator] = []
         self._children: list[numpy.random.Generator | None] = [None] * count
         rows = task.horizon + 1

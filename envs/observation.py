@@ -39,33 +39,31 @@ class Compression(NamedTuple):
     """From what is shown to the value; None where they are the same."""
 
 
-def signed_logarithm(value: Array, xp: ModuleType) -> Array:
+def symlog(value: Array, xp: ModuleType) -> Array:
     """Compress large values invertibly: ``sign(x) log(1 + |x|)``, close to x near zero."""
     return xp.sign(value) * xp.log1p(xp.abs(value))
 
 
-def signed_exponential(value: Array, xp: ModuleType) -> Array:
-    """Inverse of :func:`signed_logarithm`."""
+def symexp(value: Array, xp: ModuleType) -> Array:
+    """Inverse of :func:`symlog`."""
     return xp.sign(value) * xp.expm1(xp.abs(value))
 
 
 PLAIN = Compression("", None, None)
-SIGNED_LOG = Compression(
-    "sign(x) log(1 + |x|) of ", signed_logarithm, lambda shown: signed_exponential(shown, numpy)
-)
+SIGNED_LOG = Compression("sign(x) log(1 + |x|) of ", symlog, lambda shown: symexp(shown, numpy))
 LIMIT = 8.0
 """What a bounded logarithm stays below."""
 
 
 def bounded_logarithm(value: Array, xp: ModuleType) -> Array:
     """``y / (1 + |y| / 8)`` of the signed logarithm y: close to x near zero, below 8 for the largest of numbers."""
-    logarithm = signed_logarithm(value, xp)
+    logarithm = symlog(value, xp)
     return logarithm / (1.0 + (1.0 / LIMIT) * xp.abs(logarithm))
 
 
 def bounded_exponential(shown: numpy.ndarray) -> numpy.ndarray:
     """Inverse of :func:`bounded_logarithm`."""
-    return signed_exponential(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
+    return symexp(shown / (1.0 - numpy.abs(shown) / LIMIT), numpy)
 
 
 BOUNDED_LOG = Compression(
@@ -79,7 +77,7 @@ KEPT_AS_LOG = Compression("log of ", None, numpy.exp)
 """The block's function returns the logarithm already; reading gives the value."""
 
 
-def scaled(factor: float, offset: float = 0.0) -> Compression:
+def linear_scale(factor: float, offset: float = 0.0) -> Compression:
     """``factor (x - offset)``, where the unit of the field says what is left to say."""
     return Compression("", lambda value, xp: factor * (value - offset), lambda shown: shown / factor + offset)
 

@@ -59,8 +59,8 @@ class TaskParameters:
             ValueError: with the name of the field, its value and what was expected.
         """
         cls: Any = type(self)
-        for name, (hint, limits) in declared(cls).items():
-            value = frozen(getattr(self, name))
+        for name, (hint, limits) in field_limits(cls).items():
+            value = freeze(getattr(self, name))
             object.__setattr__(self, name, value)
             check(name, value, hint, limits)
         if self.horizon % self.decision_interval:
@@ -75,17 +75,17 @@ class TaskParameters:
 
 
 @cache
-def declared(cls: type) -> dict[str, tuple[Any, Limits]]:
+def field_limits(cls: type) -> dict[str, tuple[Any, Limits]]:
     """Type and limits of every field of a parameters' dataclass."""
     hints = typing.get_type_hints(cls)
     return {f.name: (hints[f.name], f.metadata.get("limits", Limits())) for f in dataclasses.fields(cls)}
 
 
-def frozen(value: Any) -> Any:
+def freeze(value: Any) -> Any:
     """Turn lists and arrays into tuples, all the way down, so that parameters from JSON equal those from Python."""
     if isinstance(value, numpy.ndarray | numpy.generic):
         value = value.tolist()
-    return tuple(frozen(item) for item in value) if isinstance(value, list | tuple) else value
+    return tuple(freeze(item) for item in value) if isinstance(value, list | tuple) else value
 
 
 def check(name: str, value: Any, hint: Any, limits: Limits) -> None:
@@ -153,7 +153,7 @@ def check_integer(name: str, value: Any, at_least: int) -> int:
     Raises:
         ValueError: with the name, the value and what was expected.
     """
-    value = frozen(value)
+    value = freeze(value)
     _integer(name, value, Limits(at_least=at_least))
     return int(value)
 
@@ -183,7 +183,7 @@ def _sequence(name: str, value: Any, of: tuple[Any, ...], limits: Limits) -> Non
         raise ValueError(f"{name} must sum to 1, got {value!r} with sum {sum(value):.12g}")
 
 
-def sized(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
+def check_length(name: str, value: Sequence[Any], count: int, what: str = "numbers") -> None:
     """Check the length of a sequence that depends on other parameters."""
     if len(value) != count:
         raise ValueError(f"{name} must be {count} {what}, got {value!r}")
@@ -194,4 +194,4 @@ def square_matrix(name: str, rows: Sequence[Sequence[float]], size: int) -> None
     if len(rows) != size:
         raise ValueError(f"{name} must have {size} rows (row = from, column = to), got {rows!r}")
     for i, row in enumerate(rows):
-        sized(f"{name}[{i}]", row, size)
+        check_length(f"{name}[{i}]", row, size)

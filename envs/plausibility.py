@@ -163,7 +163,7 @@ def check_interval(step: float, longest: float) -> None:
         )
 
 
-def isolated(
+def find_outliers(
     time: numpy.ndarray, position: numpy.ndarray, reach: Callable[[numpy.ndarray], Any]
 ) -> numpy.ndarray:
     """Return which positions lie off the track: too far from the one before and the next, which agree, ``(n,)``.
@@ -193,7 +193,7 @@ def _deviations(time: numpy.ndarray, values: numpy.ndarray) -> numpy.ndarray:
     return numpy.asarray((values[1:-1] - line) / numpy.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
 
 
-def ignored_columns(names: Iterable[str], known: Iterable[str]) -> list[str]:
+def unknown_column_notes(names: Iterable[str], known: Iterable[str]) -> list[str]:
     """Return the notes on columns of a table that nobody reads.
 
     Args:
@@ -354,7 +354,7 @@ def _notes(
             5.0 * usual * (elapsed / step).clip(1.0) + 20.0 * error + 0.5 * HARDEST * elapsed**2
         )
 
-    alone = isolated(time, position, reach)
+    alone = find_outliers(time, position, reach)
     if alone.any():
         farthest = float(_length(_deviations(time, position)).max())
         notes.append(

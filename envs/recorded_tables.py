@@ -13,7 +13,7 @@ import numpy
 
 from .flight_tables import FLIGHT_SUFFIXES, numbers, read_table, seconds
 from .log_format import TrackLog
-from .plausibility import check_interval, ignored_columns
+from .plausibility import check_interval, unknown_column_notes
 from .recording import Recording, measure_once, side_by_side
 from .task import Task
 
@@ -207,7 +207,7 @@ def _side_by_side(
     first, known = parts[0][0], parts[0][1].parameters
     task = cls(cls.Parameters(**{**known, **keywords}))
     true = [TRUTH + component.name for component in task.components]
-    notes = tuple(ignored_columns(names, [*TIME, RECORDING, *columns, *true]))
+    notes = tuple(unknown_column_notes(names, [*TIME, RECORDING, *columns, *true]))
     with_truth = first.has(*true)
     if first.true and not with_truth:
         raise ValueError(f"truth needs every component of {cls.id}: {', '.join(true)}")

@@ -23,7 +23,7 @@ import numpy
 from .draws import Draws
 from .model import Model
 from .observation import Array
-from .parameters import check, declared, frozen
+from .parameters import check, field_limits, freeze
 from .task import Scenario, Task, named_arrays
 from .world import World
 
@@ -170,8 +170,8 @@ class Recording:
                 f"recording {self.name!r} sets {unknown[0]!r}, which is no parameter of {cls.id}"
             )
         named = {**self.parameters, **keywords}
-        interval = frozen(named.get("decision_interval", 1))
-        check("decision_interval", interval, *declared(cls.Parameters)["decision_interval"])
+        interval = freeze(named.get("decision_interval", 1))
+        check("decision_interval", interval, *field_limits(cls.Parameters)["decision_interval"])
         longest, shortest = int(self.lengths.max()), int(self.lengths.min())
         if shortest < interval:
             raise ValueError(
@@ -442,9 +442,9 @@ class RecordedWorld(World[Task, Replayed, Any]):
         truth = truth._replace(count=truth.count + 1.0)
         return truth, self._filled(self._measurement, self.tables.measurements, self._column(truth))
 
-    def received(self, measurement: Any) -> Any:
+    def mask_missing(self, measurement: Any) -> Any:
         """Return a measurement with NaN in place of what was not received, as the task's own world does."""
-        return self.simulated.received(measurement)
+        return self.simulated.mask_missing(measurement)
 
     def all_observations(self) -> tuple[Array | None, Array | None]:
         """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
@@ -452,7 +452,9 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
         measurement = self._filled(self._measurement, self.tables.measurements, columns)
-        return self.simulated.seen(measurement), self.simulated.stated_deviation(measurement)
+        return self.simulated.component_readings(measurement), self.simulated.component_deviations(
+            measurement
+        )
 
     def _column(self, truth: Replayed) -> Array:
         """Of the measurement at hand."""

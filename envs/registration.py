@@ -8,7 +8,7 @@ from typing import Any, ClassVar, get_origin
 import gymnasium
 import numpy
 
-from .catalogue import ADDED, catalogue, nearest, register
+from .catalogue import USER_TASKS, catalogue, nearest, register
 from .failures import explain_errors
 from .model import Episode, Model
 from .task import Task
@@ -29,13 +29,13 @@ def add_task(cls: type[Task]) -> None:
         ValueError: if it does not keep the contract, or another environment has its id.
     """
     _check_contract(cls)
-    if ADDED.get(cls.id) is cls:
+    if USER_TASKS.get(cls.id) is cls:
         return
     if cls.id in catalogue():
         raise ValueError(
             f"environment {cls.id!r} is there already, from {catalogue()[cls.id].__module__}: choose another id"
         )
-    ADDED[cls.id] = cls
+    USER_TASKS[cls.id] = cls
     register()
 
 

@@ -26,7 +26,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ..compiler.functions import mapped, padded_width
+from ..compiler.functions import map_arrays, round_up_lanes
 from .backend import host_array
 from .lanes import Lanes
 from .model import Model
@@ -48,7 +48,7 @@ DOTS_PER_INCH = 80.0
 """960 by 608 pixels: multiples of 16, as video encoders like them."""
 BAND_SIGMAS = 2.0
 """Half the width of the shaded band, reported standard deviations."""
-DRAWN = 4
+MAX_PICTURES = 4
 """Sub-environments of a vector that are drawn."""
 MOST_COMPONENTS = 8
 """Error components that the general picture has room for."""
@@ -155,7 +155,7 @@ class Picture:
     def begin(self, state: Any) -> None:
         """Take note of a new episode, from its state after the first measurement."""
 
-    def shaded(self) -> Sequence[tuple[float, float]]:
+    def shading(self) -> Sequence[tuple[float, float]]:
         """Measurements, from and to, that every strip marks with a grey ground."""
         return ()
 
@@ -439,7 +439,7 @@ class EpisodePicture:
         for panel in self._panels:
             panel.axes.set_xlim(0.5, self.model.task.horizon + 0.5)
             panel.axes.set_ylim(*panel.strip.limits)
-            for first, last in self.picture.shaded():
+            for first, last in self.picture.shading():
                 self._shades.append(panel.axes.axvspan(first, last, color=PALE, linewidth=0.0, zorder=0))
         self.picture.arrange()
 
@@ -519,7 +519,8 @@ class EpisodePictures:
         if model.backend == "torch":
             model = model.on_numpy()
         self.pictures = [
-            EpisodePicture(model, scenario, "rgb_array", frames_per_second) for _ in range(min(count, DRAWN))
+            EpisodePicture(model, scenario, "rgb_array", frames_per_second)
+            for _ in range(min(count, MAX_PICTURES))
         ]
         for i, picture in enumerate(self.pictures):
             picture.caption = f"sub-environment {i}"
@@ -554,7 +555,7 @@ class EpisodePictures:
 
 def _alone(state: Any, lane: int) -> Any:
     """Episode in one lane as a picture takes it: on the host, padded with itself."""
-    return mapped(lambda values: host_array(values)[..., [lane] * padded_width(1)], state)
+    return map_arrays(lambda values: host_array(values)[..., [lane] * round_up_lanes(1)], state)
 
 
 def _moving(axes: Axes) -> list[Artist]:

@@ -11,12 +11,12 @@ from typing import Any
 import numpy
 
 from ..compiler import namespace as traced
-from ..compiler.functions import Specialised, address_of, empty_lanes, leaves, mapped
+from ..compiler.functions import Specialised, address_of, empty_lanes, leaves, map_arrays
 from ..compiler.gradients import pullback
-from .compiled import Programs, stepped
+from .compiled import Programs, step_episodes
 from .model import Episode
 
-AIMED = slice(1, 7, 2)
+ADDRESS_SLOTS = slice(1, 7, 2)
 """Where the table of a :class:`~..compiler.functions.Call` holds the addresses of episodes, action and noise."""
 
 
@@ -30,7 +30,7 @@ def _unpack(like: Episode, state: Any) -> Episode:
         first, row = row, row + int(numpy.prod(shape))
         return traced.astype(traced.reshape(state[first:row], shape), array.dtype)
 
-    unpacked: Episode = mapped(leaf, like)
+    unpacked: Episode = map_arrays(leaf, like)
     return unpacked
 
 
@@ -42,7 +42,7 @@ def _pack(episode: Episode) -> Any:
 def _forward(programs: Programs, kind: str, state: Any, action: Any, noise: Any) -> Any:
     """Episodes at the next measurement, reward, and observation."""
     episode = _unpack(programs.later.episode, state)
-    episode, reward, shown = stepped(kind, programs.traced, episode, action, noise)
+    episode, reward, shown = step_episodes(kind, programs.traced, episode, action, noise)
     return _pack(episode), reward, shown
 
 
@@ -124,7 +124,7 @@ class Rollout:
     def forward(self) -> None:
         """Fly one measurement."""
         here = self._flown
-        self._forward.table[AIMED] = self._places[here]
+        self._forward.table[ADDRESS_SLOTS] = self._places[here]
         self._forward(0, self._width)
         # The code writes a row here and a row there, which is slow outside the cache.
         self._states[here + 1][...] = self._next
@@ -137,6 +137,6 @@ class Rollout:
     def backward(self, measurement: int) -> None:
         """Go back over a measurement, the last one first."""
         backward = self._backward[0]
-        backward.table[AIMED] = self._places[measurement]
+        backward.table[ADDRESS_SLOTS] = self._places[measurement]
         backward(0, self._width)
         self._backward.reverse()

@@ -13,7 +13,7 @@ from .recording import Recording
 from .trajectory import Trajectory
 
 
-def told(spec: EnvSpec, decisions: int) -> EnvSpec:
+def with_episode_length(spec: EnvSpec, decisions: int) -> EnvSpec:
     """Return a spec that knows how long an episode is, and whose keywords go through JSON.
 
     Gymnasium registers one length for an id; here it follows from scenario and parameters. Only who asks is told:

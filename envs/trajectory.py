@@ -76,7 +76,7 @@ class Trajectory:
             )
         return int(count)
 
-    def resampled(self, interval: float, count: int) -> numpy.ndarray:
+    def resample(self, interval: float, count: int) -> numpy.ndarray:
         """State at ``count`` times from the start, ``interval`` apart, straight on beyond the end.
 
         Between the given times a cubic runs through positions and velocities (Hermite), or, without

@@ -68,7 +68,7 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         state: Array = truth.state  # type: ignore[attr-defined]
         return state
 
-    def received(self, measurement: Measurement) -> Measurement:
+    def mask_missing(self, measurement: Measurement) -> Measurement:
         """Return a measurement as an estimator is given it: NaN in place of every value that was not received.
 
         The filters of a bank weigh a value by its availability, so its number does not matter to them. An estimator
@@ -85,15 +85,17 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         replaced: Measurement = there._replace(**{self.received_field: values})
         return replaced
 
-    def seen(self, measurement: Measurement) -> Array | None:
-        """What the sensors say of the task's components themselves, ``(C, N)`` in their units, for pictures.
+    def component_readings(self, measurement: Measurement) -> Array | None:
+        """Readings of the task's components, ``(C, N)`` in their units, for pictures.
 
         NaN where they say nothing; None, as here, where what is measured is no component at all.
         """
         return None
 
-    def stated_deviation(self, measurement: Measurement) -> Array | None:
-        """Standard deviations that are stated for the errors of what is :meth:`seen`, alike; None where it is None."""
+    def component_deviations(self, measurement: Measurement) -> Array | None:
+        """Standard deviations that are stated for the errors of :meth:`component_readings`, in the same form; None
+        where that is None.
+        """
         return None
 
     def error_cost(self, error: Array) -> Array:

@@ -91,11 +91,11 @@ class SingleTrackEstimator(ABC):
         """Begin the tracks; see :meth:`.Estimator.start`."""
         tracks = []
         for lane in range(N):
-            told = select_lanes(initial, lane)
+            own = select_lanes(initial, lane)
             mean, covariance = numpy.zeros(len(self.state)), numpy.zeros((len(self.state),) * 2)
-            mean[self._places] = told.mean
-            covariance[numpy.ix_(self._places, self._places)] = told.covariance
-            tracks.append(self.begin(told._replace(mean=mean, covariance=covariance)))
+            mean[self._places] = own.mean
+            covariance[numpy.ix_(self._places, self._places)] = own.covariance
+            tracks.append(self.begin(own._replace(mean=mean, covariance=covariance)))
             self._components(tracks[-1])
         return tracks
 

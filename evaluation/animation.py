@@ -6,10 +6,10 @@ from typing import Any
 import numpy
 from PIL import Image
 
-from ..envs.catalogue import task_class
 from ..envs.environment import TaskEnv
 from ..envs.parameters import check_integer
-from .competitors import kind_of, made
+from ..envs.task import Task
+from .competitors import kind_of, make_competitor
 from .evaluate import control_of
 from .files import whole_file
 from .stepping import SteppingPolicy
@@ -19,12 +19,18 @@ SHADES = 7
 
 
 def episode_frames(
-    env: str, name: str, policy: Any, scenario: Any = None, seed: int = 0, every: int = 2, **keywords: Any
+    task: type[Task],
+    name: str,
+    policy: Any,
+    scenario: Any = None,
+    seed: int = 0,
+    every: int = 2,
+    **keywords: Any,
 ) -> list[Image.Image]:
     """Play an episode and draw it.
 
     Args:
-        env: environment id.
+        task: class of the environment's.
         name: of the policy, for the title.
         policy: what makes it for a model, or an object with a ``predict`` method.
         scenario: name of a scenario, or a trajectory.
@@ -38,13 +44,12 @@ def episode_frames(
     every = check_integer("every", every, 1)
     if kind_of(policy) != "policy":
         raise ValueError(f"{name!r} is no policy: it does not act in the environment")
-    cls = task_class(env)
-    control = control_of(policy, "policy", None, cls, name)
+    control = control_of(policy, "policy", None, task, name)
     keywords = {**getattr(policy, "task_keywords", {}), **keywords}
-    world = TaskEnv(cls.id, control, scenario, render_mode="rgb_array", **keywords)
+    world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
-    actor = SteppingPolicy(world.model, made(policy, world.model))
+    actor = SteppingPolicy(world.model, make_competitor(policy, world.model))
     observation, _ = world.reset(seed=seed)
     frames, memory, finished = [Image.fromarray(_frame(world))], actor.begin([seed]), False
     taken = 0

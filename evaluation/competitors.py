@@ -39,7 +39,7 @@ def _has(found: Any, *methods: str) -> bool:
     return all(callable(getattr(found, method, None)) for method in methods)
 
 
-def made(maker: Any, problem: Task | Model) -> Any:
+def make_competitor(maker: Any, problem: Task | Model) -> Any:
     """Make a competitor for a problem.
 
     Args:
@@ -243,11 +243,11 @@ class Likelihood(NamedTuple):
     """Numbers of the measurement that it counts, ``(N,)``; likewise."""
 
     @classmethod
-    def of(cls, told: Any) -> "Likelihood":
+    def of(cls, values: Any) -> "Likelihood":
         """Take a log-likelihood alone for one."""
-        return cls(*told) if isinstance(told, tuple) else cls(told)
+        return cls(*values) if isinstance(values, tuple) else cls(values)
 
-    def filled(self) -> "Likelihood":
+    def fill_unknown(self) -> "Likelihood":
         """Put NaN in place of what is not known."""
         none = math.nan + 0.0 * self.log_likelihood
         return Likelihood(*(none if values is None else values for values in self))

@@ -17,10 +17,10 @@ from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
     chi_square_band,
+    components_and_groups,
     consistency_degrees,
     consistency_metrics,
     mean_over_time,
-    reported_components,
     squared_errors,
 )
 from .statistics import ALL, Key, Statistic, reduce_run
@@ -30,7 +30,7 @@ SHARES = numpy.geomspace(1e-4, 1.0, 121)
 """At which the distribution of errors is told: thirty to a decade."""
 BAND_RESAMPLES = 200
 """Of the bootstrap of curves: their bands need fewer than intervals of numbers."""
-DISTRIBUTED = 2**21
+DISTRIBUTION_LIMIT = 2**21
 """Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
 PERCENTILES = (10.0, 90.0)
 """Of actions and gains over episodes."""
@@ -68,11 +68,11 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           gains that a bank records, likewise;
         * ``mean_cost`` (policy): over episodes.
 
-        Errors exceeded, actions and gains are those of the first ``DISTRIBUTED`` measurements, or of the first 256
-        episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every quantity
-        (the groups of components where there are any, else the first three components), ``elapsed`` (s) of every
-        measurement, where they come regularly, and windows as the dataset has them. Attributes environment, scenario,
-        split, seed, episodes, paper, reference, cost, truth and recorded.
+        Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
+        256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every
+        quantity (the groups of components where there are any, else the first three components), ``elapsed`` (s) of
+        every measurement, where they come regularly, and windows as the dataset has them. Attributes environment,
+        scenario, split, seed, episodes, paper, reference, cost, truth and recorded.
     """
     bootstrap = bootstrap_of(dataset, resamples)
     declare = functools.partial(curve_statistics, episodes=bootstrap.episodes, resamples=resamples)
@@ -102,7 +102,7 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
     """Return the groups of components, where there are any, else the first three components."""
-    return list(groups_of(dataset)) or list(reported_components(dataset))[:3]
+    return list(groups_of(dataset)) or list(components_and_groups(dataset))[:3]
 
 
 def curve_statistics(
@@ -116,7 +116,7 @@ def curve_statistics(
         resamples: of the bands.
     """
     times = run.sizes["time"]
-    distributed = max(block_of(times), DISTRIBUTED // times)
+    distributed = max(block_of(times), DISTRIBUTION_LIMIT // times)
     if run.attrs["truth"]:
         groups = groups_of(run)
         squares = numpy.stack([squared_errors(run, name, groups) for name in select_quantities(run)], axis=-1)
@@ -169,7 +169,7 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
         dataset: the evaluation, of whose variables none is needed.
         episodes: of which the curves are.
     """
-    units, shown = reported_components(dataset), select_quantities(dataset)
+    units, shown = components_and_groups(dataset), select_quantities(dataset)
     names = {
         "action_name": list(dict.fromkeys(name for each in found for name in each.actions)),
         "gain_name": list(dict.fromkeys(name for each in found for name in each.gains)),

@@ -1,10 +1,10 @@
 """Monte Carlo evaluation: every policy, estimator, smoother, reference and bound on identical noise.
 
-The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`evaluate`.
+The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import cloudpickle
@@ -13,7 +13,7 @@ import numpy
 import xarray
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, importable_name, nearest, opened, task_class
+from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, read_files, task_class
 from ..envs.compiled import Report
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
@@ -22,16 +22,16 @@ from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .competitors import TOLD_MORE, Kind, kind_of
-from .dataset import group_of_each, keywords_as_text, whole_number, with_windows
+from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers, check_workers
-from .rollout import Progress, run_competitor
+from .rollout import Progress, Series, rollout
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
-DRAWN = "drawn_"
+DRAWN_PREFIX = "drawn_"
 """Begins the names of what is kept of the first episodes only."""
 
 
@@ -115,7 +115,10 @@ def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
     kept = (
         _measurement_report(model, episode) if model.task.has_truth else _expectation_report(model, episode)
     )
-    return {**kept, **{f"{DRAWN}{name}": values for name, values in model.drawn(episode).items()}}
+    return {
+        **kept,
+        **{f"{DRAWN_PREFIX}{name}": values for name, values in model.picture_track(episode).items()},
+    }
 
 
 def _limits(model: Model, episode: Episode) -> dict[str, Any]:
@@ -132,51 +135,87 @@ def _report(model: Model, tracks: bool, drawn: bool) -> Report:
     return _expectation_and_track if tracks else _expectation_report
 
 
-def evaluate(
-    env: str,
+OPTIONS = (
+    "scenario", "episodes", "seed", "split", "control", "tracks", "drawn_episodes", "backend", "threads", "strict",
+)  # fmt: skip
+"""Fields of an experiment that a user names side by side with parameters of the task."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """Over which episodes of which environment competitors are run, and how.
+
+    Plain data for any process; the environment goes to another process by its name.
+    """
+
+    task: type[Task]
+    """Class of the environment's task."""
+    scenario: Any = None
+    """Name of a scenario, a trajectory, a set of flights, or a recording; None: the training distribution."""
+    episodes: int = 500
+    """Monte Carlo runs M. Every flight of a set gets as many, so they may be rounded up. Of a recording every episode
+    is replayed once, whatever is asked for."""
+    seed: int = 0
+    """Number of the experiment."""
+    split: str = "test"
+    """One of "test", "validation" and "train", which share no episode."""
+    control: str | None = None
+    """Demand this control; None: every policy runs in its own."""
+    tracks: bool = False
+    """Keep what a track is drawn from, see :meth:`.Task.track`; it takes memory."""
+    drawn_episodes: int = 0
+    """Of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate`` and so on over
+    policy, drawn_episode and time; not beside ``tracks``."""
+    paper: str = ""
+    """Name of the paper's algorithm, whose score is 0; kept in the attributes of the evaluation."""
+    reference: str = ""
+    """Name of the competitor whose score is 1; kept likewise."""
+    backend: str = "auto"
+    """What computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`."""
+    threads: int = 1
+    """How many share the episodes, of the compiled backend."""
+    strict: bool = False
+    """Raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`."""
+    keywords: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters of the task."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        others = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "task"}
+        return _experiment_on, (importable_name(self.task), others)
+
+    def make_task(self) -> Task:
+        """Make the task, with its scenario and the parameters."""
+        return make_task(self.task, self.scenario, **self.keywords)
+
+    def make_model(self, maker: Any, control: str) -> Model:
+        """Make the model that a competitor acts in; the experiment's keywords win over those tuned with it."""
+        keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
+        return make_model(
+            self.task, control, self.scenario, backend=self.backend, threads=self.threads, **keywords
+        )
+
+
+def _experiment_on(name: str, others: Mapping[str, Any]) -> Experiment:
+    """Return the experiment that another process has sent, on the environment of this name."""
+    return Experiment(task_class(name), **others)
+
+
+@one_thread()
+def run_experiment(
+    experiment: Experiment,
     competitors: Mapping[str, Any],
-    scenario: Any = None,
-    episodes: int = 500,
-    seed: int = 0,
-    split: str = "test",
-    control: str | None = None,
     progress: Progress | None = None,
-    *,
-    tracks: bool = False,
-    drawn_episodes: int = 0,
-    paper: str = "",
-    reference: str = "",
-    backend: str = "auto",
-    threads: int = 1,
     workers: Workers | None = None,
-    strict: bool = False,
-    **keywords: Any,
 ) -> xarray.Dataset:
     """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
-        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        experiment: which episodes, and how.
         competitors: by the name that stands in the tables: each a class or function that makes it,
             or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother
             with ``smooth``, too.
-        scenario: name of a scenario, a trajectory, a set of flights, or a recording; default: the environment's
-            training distribution.
-        episodes: Monte Carlo runs M; every flight of a set gets as many, so they may be rounded up. Of a recording
-            every episode is replayed once, whatever is asked for.
-        seed: number of the experiment.
-        split: "test" (default), "validation" or "train"; splits share no episode.
-        control: demand this control; by default every policy runs in its own.
         progress: called with the number of measurements done, now and then.
-        tracks: keep what a track is drawn from, see :meth:`.Task.track`; it takes memory.
-        drawn_episodes: of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate``
-            and so on over policy, drawn_episode and time; not beside ``tracks``.
-        paper: name of the paper's algorithm, whose score is 0; kept in the attributes.
-        reference: name of the competitor whose score is 1; kept likewise.
-        backend: what computes the steps, "auto", "compiled" or "numpy"; see :func:`~.envs.backend.task_on`.
-        threads: how many share the episodes, of the compiled backend.
         workers: who runs competitors and chunks of episodes; default: this process, one after the other.
-        strict: raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`.
-        **keywords: parameters of the task.
 
     Returns:
         Variables over the dimensions policy, episode and time: ``error`` (also over component; estimate minus
@@ -193,65 +232,9 @@ def evaluate(
         groups and keywords out of it.
 
     Raises:
-        ValueError: for an unknown environment, scenario, control or keyword, or a policy that does not fit
+        ValueError: for an unknown scenario, control or keyword, or a policy that does not fit
             the control.
     """
-    experiment = Experiment(
-        env,
-        scenario,
-        episodes,
-        seed,
-        split,
-        control,
-        tracks,
-        drawn_episodes,
-        paper,
-        reference,
-        backend,
-        threads,
-        strict,
-        keywords,
-    )
-    return run_experiment(experiment, competitors, progress, workers)
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """Over which episodes competitors are run, and how: plain data for any process.
-
-    Fields as the arguments of :func:`evaluate`.
-    """
-
-    environment: str
-    scenario: Any = None
-    episodes: int = 500
-    seed: int = 0
-    split: str = "test"
-    control: str | None = None
-    tracks: bool = False
-    drawn_episodes: int = 0
-    paper: str = ""
-    reference: str = ""
-    backend: str = "auto"
-    threads: int = 1
-    strict: bool = False
-    keywords: Mapping[str, Any] = field(default_factory=dict)
-
-    def make_model(self, maker: Any, control: str) -> Model:
-        """Make the model that a competitor acts in; the experiment's keywords win over those tuned with it."""
-        keywords = {**getattr(maker, "task_keywords", {}), **self.keywords}
-        cls = task_class(self.environment)
-        return make_model(cls, control, self.scenario, backend=self.backend, threads=self.threads, **keywords)
-
-
-@one_thread()
-def run_experiment(
-    experiment: Experiment,
-    competitors: Mapping[str, Any],
-    progress: Progress | None = None,
-    workers: Workers | None = None,
-) -> xarray.Dataset:
-    """Run competitors over the episodes of an experiment; arguments, result and refusals as of :func:`evaluate`."""
     plan = plan_of(experiment, competitors)
     workers = check_workers(workers)
     block = block_of(next(iter(plan.models.values())).task.horizon)
@@ -261,7 +244,7 @@ def run_experiment(
         for first in range(0, len(plan.seeds), block)
     ]
     if not workers.alone:
-        check_sendable(plan.experiment.environment, competitors)
+        check_sendable(experiment.task, competitors)
     sizes = [piece.measurements for piece in pieces]
     chunks = workers.results(run_piece, pieces, sizes, progress)
     per_policy: dict[str, dict[str, numpy.ndarray]] = {}
@@ -293,25 +276,61 @@ class Piece(NamedTuple):
         return len(self.seeds) * self.horizon
 
 
+LIKELIHOOD = ("log_likelihood", "nis", "nis_degrees")
+"""What few estimators and references say: how likely a measurement was."""
+
+
 def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
-    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``."""
-    experiment = piece.experiment
+    """Run some episodes of one competitor; return what is kept of every measurement, ``(episodes, time, ...)``.
+
+    Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
+    """
+    experiment, kind, count = piece.experiment, piece.kind, len(piece.seeds)
     model = piece.model or experiment.make_model(piece.maker, piece.control)
     drawn = experiment.drawn_episodes - piece.first
-    found: dict[str, numpy.ndarray] = run_competitor(
-        model,
-        piece.maker,
-        piece.kind,
-        piece.seeds,
-        _limits if piece.kind == "bound" else _report(model, experiment.tracks, drawn > 0),
-        tick,
-        piece.name,
-        piece.first,
-        actions=True,
-        only={DRAWN: drawn},
-        strict=experiment.strict,
-    )
-    return found
+    report = _limits if kind == "bound" else _report(model, experiment.tracks, drawn > 0)
+    boxed = kind == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
+    series = Series(count, {DRAWN_PREFIX: drawn})
+    steps = rollout(model, piece.maker, piece.seeds, report, kind=kind, name=piece.name)
+    for step, (found, action) in enumerate(steps, 1):
+        if kind == "policy":
+            _check_reserved(model, found)
+        if experiment.strict and "lost" in found:
+            _refuse_losses(piece, found["lost"][:count], step)
+        series.add(found)
+        if boxed:
+            series.add({"action": _applied(model.action_space, action, count)})
+        tick(count)
+    arrays = series.arrays()
+    if kind in ("estimator", "smoother", "reference"):
+        for name in LIKELIHOOD:
+            if name in arrays and numpy.isnan(arrays[name]).all():
+                del arrays[name]
+    return arrays
+
+
+def _applied(box: Any, action: Any, count: int) -> numpy.ndarray:
+    """Return the actions that are applied, within the limits of their box, ``(A, count)``."""
+    bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
+    return bounded.reshape(count, -1).T
+
+
+def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
+    """Raise ValueError if a task records something under a name that the evaluation of a policy needs."""
+    for taken in {"action", "lost"} & found.keys():
+        raise ValueError(
+            f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
+            "which actions were applied or episodes lost: call it something else"
+        )
+
+
+def _refuse_losses(piece: Piece, faults: numpy.ndarray, step: int) -> None:
+    """Raise ValueError if an episode is lost at a measurement."""
+    if faults.any():
+        i = int(numpy.argmax(faults > 0.0))
+        raise ValueError(
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i]) - 1]} in episode {piece.first + i} at measurement {step}"
+        )
 
 
 def _in_one(chunks: list[dict[str, numpy.ndarray]]) -> dict[str, numpy.ndarray]:
@@ -328,7 +347,7 @@ class Plan(NamedTuple):
     """An evaluation before its episodes are run; everything that can be wrong with it is refused by then."""
 
     experiment: Experiment
-    """Its environment with the module that registers it, where that is a user's; its scenario opened."""
+    """Its scenario opened."""
     competitors: Mapping[str, Any]
     kinds: dict[str, Kind]
     controls: dict[str, str]
@@ -382,12 +401,11 @@ class Plan(NamedTuple):
 
 
 def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
-    """Return the plan of an evaluation; refusals as of :func:`evaluate`."""
-    cls = task_class(experiment.environment)
+    """Return the plan of an evaluation; refusals as of :func:`run_experiment`."""
+    cls = experiment.task
     experiment = replace(
         experiment,
-        environment=importable_name(cls),
-        scenario=opened(cls, experiment.scenario),
+        scenario=read_files(cls, experiment.scenario),
         drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
     )
     if experiment.tracks and experiment.drawn_episodes:
@@ -417,7 +435,7 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         [c.name for c in first.task.components], first.task.groups
     )  # refused now, not when all is done
     if chosen.recording is not None:
-        _check_known_truth(kinds, chosen.name)
+        _check_truth_available(kinds, chosen.name)
         episodes = len(first.task.flights)  # nothing is random: each once
     flown, lengths = None, None
     if first.task.flights:
@@ -428,16 +446,16 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
     return Plan(experiment, competitors, kinds, controls, models, chosen, seeds, flown, lengths)
 
 
-def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
+def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
     """Raise ValueError for what another process cannot be given, or would not find.
 
     Args:
-        environment: id, with the module that registers it where that is a user's.
+        task: class of the environment's.
         competitors: by their names.
     """
-    if environment.startswith("__main__:"):
+    if importable_name(task).startswith("__main__:"):
         raise ValueError(
-            f"{environment.removeprefix('__main__:')} is registered by the program that runs, which other processes do "
+            f"{task.id} is registered by the program that runs, which other processes do "
             "not run: register it in a module of its own, or leave out jobs and cluster"
         )
     for name, maker in competitors.items():
@@ -449,7 +467,7 @@ def check_sendable(environment: str, competitors: Mapping[str, Any]) -> None:
             ) from error
 
 
-def _check_known_truth(kinds: Mapping[str, Kind], name: str) -> None:
+def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
     """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
         if kind in TOLD_MORE:
@@ -490,7 +508,7 @@ def _further_dimensions(key: str, count: int) -> list[str]:
     """Names of a variable's dimensions beside policy, episode and time; ``count`` of them follow the first."""
     if count < 0:
         return []
-    key = key.removeprefix(DRAWN)
+    key = key.removeprefix(DRAWN_PREFIX)
     if key == "covariance":
         return ["component", "other_component"]
     if key in ("error", "mean_square", "truth", "estimate", "seen"):
@@ -563,7 +581,7 @@ def _dataset(
         for i, name in enumerate(names):
             if key in per_policy[name]:
                 stacked[i] = per_policy[name].pop(key)  # so that little is held twice
-        dims = ["policy", "drawn_episode" if key.startswith(DRAWN) else "episode", "time"]
+        dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)
     dataset = xarray.Dataset(

@@ -13,8 +13,9 @@ import numpy
 import xarray
 
 from .dataset import windows_of
-from .looks import GREY, joined, looks, merged, styles, told_apart
+from .looks import GREY, distinguish_lines, group_equal_lines, join_names, looks, styles
 from .print_layout import (
+    add_title,
     direct_labels,
     figure_with_axes,
     in_print,
@@ -22,8 +23,7 @@ from .print_layout import (
     positive,
     room_for_labels,
     sensible_limits,
-    titled,
-    wrapped,
+    wrap_label,
 )
 
 
@@ -108,8 +108,8 @@ def _over_time(
     values = {
         name: numpy.concatenate([panel.values.sel(policy=name).values for panel in panels]) for name in there
     }
-    told, others = told_apart(look, values)
-    beside = room_for_labels(told.values(), columns)
+    distinct, others = distinguish_lines(look, values)
+    beside = room_for_labels(distinct.values(), columns)
     figure, axes = figure_with_axes(len(panels), columns)
     x = _abscissa(curves)
     wide = False
@@ -121,12 +121,16 @@ def _over_time(
             axis.plot(x, panel.values.sel(policy=name), color=GREY, linewidth=0.6, zorder=1.5)
         ends = {}
         shown = {
-            name: line for name in told if not numpy.isnan(line := panel.values.sel(policy=name).values).all()
+            name: line
+            for name in distinct
+            if not numpy.isnan(line := panel.values.sel(policy=name).values).all()
         }
-        here = merged(shown, shown)  # some quantity may be the same for those whose other ones differ
+        here = group_equal_lines(
+            shown, shown
+        )  # some quantity may be the same for those whose other ones differ
         for name, same in here.items():
             line = shown[name]
-            label = told[name] if len(same) == 1 else joined(same, most=1 if columns == 1 else 2)
+            label = distinct[name] if len(same) == 1 else join_names(same, most=1 if columns == 1 else 2)
             axis.plot(x, line, label=label, **look[name])
             last = int(numpy.flatnonzero(numpy.isfinite(line))[-1])
             ends[label] = (x[last], line[last], look[name]["color"])
@@ -142,16 +146,16 @@ def _over_time(
     _name_abscissa(curves, axes)
     handles = [Line2D([], [], color=GREY, linewidth=0.6, label="others")] if others else []
     if not beside:
-        handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()] + handles
+        handles = [Line2D([], [], label=label, **look[name]) for name, label in distinct.items()] + handles
     elif others:
         # One word needs no legend of its own.
         title += "; grey: others"
         handles = []
-    return titled(figure, title, handles)
+    return add_title(figure, title, handles)
 
 
 def _draw_bands(
-    axis: Any, x: numpy.ndarray, panel: Panel, told: Iterable[str], look: Mapping[str, Mapping[str, Any]]
+    axis: Any, x: numpy.ndarray, panel: Panel, distinct: Iterable[str], look: Mapping[str, Mapping[str, Any]]
 ) -> bool:
     """Draw the bands about lines, and return whether some were left out: those that on average fill a third of the
     axis, where they hide all lines and say only that there are too few episodes.
@@ -161,7 +165,7 @@ def _draw_bands(
         return left_out
     to_fraction = axis.transData + axis.transAxes.inverted()
     drawn: list[numpy.ndarray] = []
-    for name in told:
+    for name in distinct:
         line = panel.values.sel(policy=name).values
         # Bands of lines that can hardly be told apart would add up to a dark one.
         if any(numpy.allclose(line, other, rtol=0.01, atol=0.0, equal_nan=True) for other in drawn):
@@ -204,7 +208,7 @@ def draw_error_over_time(
     look = looks(curves) if look is None else look
     panels = [
         Panel(
-            wrapped(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
+            wrap_label(f"RMSE of {name.replace('_', ' ')}, {unit}", columns),
             *(curves[f"rmse{ending}"].sel(quantity=name) for ending in ("", "_low", "_high")),
         )
         for name, unit in zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True)
@@ -266,36 +270,36 @@ def draw_error_distribution(
     exceeded, shares = curves["error_exceeded"], curves["share"].values
     there = [n for n in curves["policy"].values.tolist() if not numpy.isnan(exceeded.sel(policy=n)).all()]
     values = {name: exceeded.sel(policy=name).values for name in there}
-    told, others = told_apart(look, values)
+    distinct, others = distinguish_lines(look, values)
     figure, axes = figure_with_axes(curves.sizes["quantity"], columns)
     units = dict(zip(curves["quantity"].values.tolist(), curves["unit"].values.tolist(), strict=True))
     supported = shares[~numpy.isnan(exceeded.values).all(axis=(0, 1))]
     for axis, (quantity, unit) in zip(axes, units.items(), strict=True):
-        for name in [*told, *others]:
-            style = look[name] if name in told else {"color": GREY, "linewidth": 0.6, "zorder": 1.5}
+        for name in [*distinct, *others]:
+            style = look[name] if name in distinct else {"color": GREY, "linewidth": 0.6, "zorder": 1.5}
             axis.plot(exceeded.sel(policy=name, quantity=quantity), shares, **style)
         axis.set_yscale("log")
         axis.set_ylim(min(max(float(supported.min()), 1e-4), 0.5), 1.0)
         axis.set_xlabel(f"error of {quantity.replace('_', ' ')}, {unit}")
         axis.set_ylabel("share of\nmeasurements above")
         axis.grid(alpha=0.25, which="both", lw=0.4)
-        told_values = exceeded.sel(policy=list(told or there), quantity=quantity).values
-        if not len(positive(told_values)):
+        distinct_values = exceeded.sel(policy=list(distinct or there), quantity=quantity).values
+        if not len(positive(distinct_values)):
             continue
         axis.set_xscale("log")
         # From what nine of ten measurements exceed to the largest errors, of which one line's are not all there is.
         most = int(numpy.argmin(numpy.abs(shares - 0.9)))
-        smallest = positive(told_values[:, most])
-        largest = positive(numpy.nanmax(told_values, axis=1))
+        smallest = positive(distinct_values[:, most])
+        largest = positive(numpy.nanmax(distinct_values, axis=1))
         if len(smallest) and len(largest):
             high = min(largest.max(), 10.0 * numpy.median(largest))
             low = numpy.median(smallest) / 2.0
             axis.set_xlim(low, max(high, 4.0 * low) * 1.05)
         logarithmic(axis.xaxis)
-    handles = [Line2D([], [], label=label, **look[name]) for name, label in told.items()]
+    handles = [Line2D([], [], label=label, **look[name]) for name, label in distinct.items()]
     if others:
         handles.append(Line2D([], [], color=GREY, linewidth=0.6, label="others"))
-    return titled(figure, f"{_title(curves)}, distribution of errors", handles)
+    return add_title(figure, f"{_title(curves)}, distribution of errors", handles)
 
 
 def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, list[str]]:
@@ -307,7 +311,7 @@ def varying_modes(curves: xarray.Dataset, names: Iterable[str]) -> dict[str, lis
         if not numpy.isnan(values).all()
         and (numpy.nanmax(values, axis=-1) - numpy.nanmin(values, axis=-1)).max() > 0.02
     }
-    return merged(found, found)
+    return group_equal_lines(found, found)
 
 
 @in_print
@@ -345,13 +349,13 @@ def draw_mode_probabilities(
                 ends[named[mode]] = (x[present[-1]], line[present[-1]], style["color"])
         axis.set_ylim(-0.02, 1.02)
         _bound_abscissa(axis, x)
-        axis.set_ylabel("\n".join(["probability", *textwrap.wrap(joined(same), 24)]))
+        axis.set_ylabel("\n".join(["probability", *textwrap.wrap(join_names(same), 24)]))
         axis.grid(alpha=0.25, lw=0.4)
         if beside:
             direct_labels(figure, axis, ends, len(groups))
     _name_abscissa(curves, axes)
     title = f"{_title(curves)}, mode probabilities, 95 % bands"
-    return titled(figure, title, [] if beside else None)
+    return add_title(figure, title, [] if beside else None)
 
 
 @in_print
@@ -383,7 +387,7 @@ def evaluation_figures(
     Args:
         curves: of an evaluation, from :func:`.curves.curves_of`.
         columns: of a paper, 1 or 2, as wide as which they are.
-        highlight: names of the lines that are told apart, at most six; default: see :func:`highlighted`.
+        highlight: names of the lines that are told apart, at most six; default: see :func:`choose_highlights`.
         learned: names of what has been learned.
 
     Raises:

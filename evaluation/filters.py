@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
-from ..compiler.functions import mapped
+from ..compiler.functions import map_arrays
 from ..compiler.namespace import NotTraceable
 from ..envs.compiled import warn_of
 from ..envs.failures import explain_errors
@@ -20,7 +20,7 @@ from ..envs.model import Model
 from ..envs.observation import Array
 from ..envs.task import Task, named_arrays
 from ..filters.small_matrices import cholesky
-from .competitors import Kind, Likelihood, check_competitor, made
+from .competitors import Kind, Likelihood, check_competitor, make_competitor
 from .dataset import FAULTS
 
 UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
@@ -31,7 +31,7 @@ def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
     entry, without that axis.
     """
-    return mapped(lambda values: values[..., lanes], part)
+    return map_arrays(lambda values: values[..., lanes], part)
 
 
 class Estimated(NamedTuple):
@@ -67,21 +67,21 @@ class ReferenceFilter(Filter[Task, Any, Estimated]):
 
     def begin(self, given: Input) -> Estimated:
         """Start where everyone starts, with the truth."""
-        return self._started(given.measurement, self.own.start(given.measurement, given.truth))
+        return self._start_state(given.measurement, self.own.start(given.measurement, given.truth))
 
     def start(self, initial: Any) -> Estimated:
         """Start without the truth."""
         return self.begin(Input(initial))
 
-    def _started(self, initial: Any, memory: Any) -> Estimated:
+    def _start_state(self, initial: Any, memory: Any) -> Estimated:
         zero = 0.0 * initial.mean[0]
-        nothing = Likelihood(zero + math.nan).filled()
+        nothing = Likelihood(zero + math.nan).fill_unknown()
         return Estimated(initial.mean, initial.covariance, memory, nothing, zero, zero)
 
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Take its answer as it is."""
-        mean, covariance, memory, *told = self.own.update(given.measurement, given.truth, state.memory)
-        likelihood = Likelihood.of(*told).filled() if told else state.likelihood
+        mean, covariance, memory, *reported = self.own.update(given.measurement, given.truth, state.memory)
+        likelihood = Likelihood.of(*reported).fill_unknown() if reported else state.likelihood
         return state._replace(mean=mean, covariance=covariance, memory=memory, likelihood=likelihood)
 
     def records(self, state: Estimated, measurement: Any) -> dict[str, Array]:
@@ -104,12 +104,12 @@ class EstimatorFilter(ReferenceFilter):
     def begin(self, given: Input) -> Estimated:
         """Start where everyone starts."""
         initial = given.measurement
-        return self._started(initial, self.own.start(initial, initial.mean.shape[-1]))
+        return self._start_state(initial, self.own.start(initial, initial.mean.shape[-1]))
 
     def update(self, state: Estimated, given: Input) -> Estimated:
         """Check its answer, and keep the last valid one."""
-        received = self.task.world.received(given.measurement)
-        mean, covariance, memory, *told = self.own.update(received, state.memory)
+        received = self.task.world.mask_missing(given.measurement)
+        mean, covariance, memory, *reported = self.own.update(received, state.memory)
         missed = self.xp.where(is_lacking(received, self.xp), 1.0, state.missed)
         fault = find_fault(mean, covariance, state.fault, missed, self.xp)
         lost = fault > 0.0
@@ -117,7 +117,7 @@ class EstimatorFilter(ReferenceFilter):
             self._held(lost, state.mean, mean),
             self._held(lost, state.covariance, covariance),
             memory,
-            Likelihood.of(*told).filled() if told else state.likelihood,
+            Likelihood.of(*reported).fill_unknown() if reported else state.likelihood,
             fault,
             missed,
         )
@@ -315,37 +315,37 @@ class _CheckedInPython(_InPython):
         super().__init__(own, task, name)
         self.count = count
 
-    def _filled(self, part: Any) -> Any:
+    def _repeat_last(self, part: Any) -> Any:
         width = part[0].shape[-1]
         return select_lanes(part, numpy.minimum(numpy.arange(width), self.count - 1))
 
     def start(self, initial: Any, second: Any) -> None:
         """Keep the memory; an array of the initial estimate may be changed in place."""
-        super().start(self._filled(initial), second)
+        super().start(self._repeat_last(initial), second)
 
     def update(self, *given: Any) -> Any:
         """Answer, without the memory."""
         self.step += 1
         width = given[0][0].shape[-1]
         with explain_errors(f"{self.name} failed at measurement {self.step}"):
-            answer = self.own.update(self._filled(given[0]), self.memory)
+            answer = self.own.update(self._repeat_last(given[0]), self.memory)
             if not isinstance(answer, tuple | list) or len(answer) not in (3, 4):
                 count = f" of {len(answer)}" if isinstance(answer, tuple | list) else ""
                 raise TypeError(
                     "update must return mean, covariance and memory, and may return the log-likelihood, not "
                     f"{type(answer).__name__}{count}"
                 )
-            mean, covariance, self.memory, *told = answer
-            likelihood = [Likelihood.of(*told)] if told else []
+            mean, covariance, self.memory, *reported = answer
+            likelihood = [Likelihood.of(*reported)] if reported else []
         C = len(self.task.components)
         # Copies: the estimator may go on in its own arrays. In their layout, by which matrix products round.
         mean = numpy.copy(self._numbers("mean", mean, (C, width)), order="K")
         covariance = numpy.copy(self._numbers("covariance", covariance, (C, C, width)), order="K")
         checked = [
             Likelihood(
-                *(v if v is None else self._numbers(n, v, (width,)) for n, v in said._asdict().items())
+                *(v if v is None else self._numbers(n, v, (width,)) for n, v in stated._asdict().items())
             )
-            for said in likelihood
+            for stated in likelihood
         ]
         return (mean, covariance, None, *checked)
 
@@ -375,7 +375,7 @@ class _Maker:
 
     def __call__(self, model: Model) -> Filter:
         """Make it, on any arrays."""
-        own = None if self.maker is None else made(self.maker, model.task)
+        own = None if self.maker is None else make_competitor(self.maker, model.task)
         return make_filter(self.kind, model, own, self.maker is None)
 
 
@@ -403,7 +403,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
         ValueError: if it cannot be made, or has not the methods of its kind.
     """
     with explain_errors(f"{kind} {name!r} cannot be made"):
-        own = made(competitor, model.task)
+        own = make_competitor(competitor, model.task)
     check_competitor(name, own, kind)
     if _can_be_traced(competitor, own):
         try:

@@ -42,7 +42,7 @@ def by_cost(curves: xarray.Dataset) -> list[str]:
     return sorted(names, key=lambda name: (numpy.isnan(each[name]), each[name]))
 
 
-def highlighted(
+def choose_highlights(
     curves: xarray.Dataset, highlight: Sequence[str] | None = None, learned: Sequence[str] = ()
 ) -> list[str]:
     """Names of the lines that are told apart, the most important first; of those that are the same, the first.
@@ -99,10 +99,10 @@ def looks(
 
     Args:
         curves: of an evaluation.
-        highlight: as of :func:`highlighted`.
+        highlight: as of :func:`choose_highlights`.
         learned: likewise; their lines are thicker.
     """
-    chosen = highlighted(curves, highlight, learned)
+    chosen = choose_highlights(curves, highlight, learned)
     kinds = {name: str(curves["kind"].sel(policy=name).values) for name in chosen}
     colours = {name: COLOURS[6] for name in chosen if kinds[name] not in RANKED}
     if curves.attrs["paper"] in chosen:
@@ -131,7 +131,7 @@ def looks(
     }
 
 
-def merged(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
+def group_equal_lines(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[str, list[str]]:
     """Names whose lines lie on each other, by the first of them, in the order of ``names``."""
     found: dict[str, list[str]] = {}
     for name in names:
@@ -140,7 +140,9 @@ def merged(names: Iterable[str], values: Mapping[str, numpy.ndarray]) -> dict[st
     return found
 
 
-def told_apart(look: Iterable[str], values: Mapping[str, numpy.ndarray]) -> tuple[dict[str, str], list[str]]:
+def distinguish_lines(
+    look: Iterable[str], values: Mapping[str, numpy.ndarray]
+) -> tuple[dict[str, str], list[str]]:
     """Lines that are told apart, with their labels, and the others; whoever lies on one of them is named with it.
 
     Args:
@@ -148,12 +150,14 @@ def told_apart(look: Iterable[str], values: Mapping[str, numpy.ndarray]) -> tupl
         values: line of each name.
     """
     chosen = list(look)
-    groups = merged([*(n for n in chosen if n in values), *(n for n in values if n not in chosen)], values)
-    told = {first: joined(same) for first, same in groups.items() if first in chosen}
-    return told, [first for first in groups if first not in chosen]
+    groups = group_equal_lines(
+        [*(n for n in chosen if n in values), *(n for n in values if n not in chosen)], values
+    )
+    labels = {first: join_names(same) for first, same in groups.items() if first in chosen}
+    return labels, [first for first in groups if first not in chosen]
 
 
-def joined(names: Sequence[str], most: int = 2) -> str:
+def join_names(names: Sequence[str], most: int = 2) -> str:
     """Name of a line that several share: ``imm = hard-imm``, or of more than ``most`` ``imm = hard-imm = 3 more``."""
     few = len(names) <= most
     return " = ".join(names if few else [*names[:most], f"{len(names) - most} more"])

@@ -65,7 +65,7 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
     return (run["error"].sel(component=parts) ** 2).sum("component", skipna=False).values
 
 
-def reported_components(dataset: xarray.Dataset) -> dict[str, str]:
+def components_and_groups(dataset: xarray.Dataset) -> dict[str, str]:
     """Components and groups of components, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     return units | {name: units[parts[0]] for name, parts in groups_of(dataset).items()}
@@ -128,7 +128,7 @@ def record_statistics(
             mean = mean_over_time(run, values[:, times])
             yield Statistic(("record", metric, component, window, unit), mean, function)
 
-    for component, unit in reported_components(run).items() if judged else ():
+    for component, unit in components_and_groups(run).items() if judged else ():
         squares = squared_errors(run, component, groups)
         yield from means("rmse", component, unit, squares, numpy.sqrt)
         yield Statistic(("record", "peak_rmse", component, "all", unit), squares, _peak)
@@ -144,9 +144,9 @@ def record_statistics(
     says = "log_likelihood" in run and not numpy.isnan(run["log_likelihood"].values).all()
     if says or not judged:  # there is nothing else of an estimator of one's own then
         shape = (run.sizes["episode"], run.sizes["time"])
-        said = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
+        log_likelihood = run["log_likelihood"].values if says else numpy.full(shape, math.nan)
         for window, times in slices.items():
-            yield _mean_of_present("log_likelihood", "measurement", window, "nat", said[:, times])
+            yield _mean_of_present("log_likelihood", "measurement", window, "nat", log_likelihood[:, times])
     if not is_bound and judged:
         yield from means("cost", "", "1", run["cost"].values)
         charge = run["charge"].values

@@ -31,9 +31,9 @@ from .threads import one_thread
 
 RETRIES = 10
 """How often Ray begins a piece again whose process it has lost; Dask has a setting of its own, three times."""
-GUESSED = 16
+CLUSTER_PROCESSES = 16
 """Processes that a cluster elsewhere is thought to have, where work is cut for it."""
-UNSERVED: dict[str, Any] = {
+NO_HTTP_ROUTES: dict[str, Any] = {
     f"distributed.{role}.http.routes": [] for role in ("scheduler", "worker", "nanny")
 }
 """Dask's web servers tell whoever asks of the work, and have no authentication: nothing is served."""
@@ -170,7 +170,7 @@ class Workers:
         if self.alone:
             return 1
         if self.cluster is not None and "://" in self.cluster:
-            return GUESSED
+            return CLUSTER_PROCESSES
         return self._cores
 
     @property
@@ -222,13 +222,13 @@ class Workers:
         packed = cloudpickle.dumps(function)
         calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
-        told: set[tuple[str, type[Warning]]] = set()
+        shown_warnings: set[tuple[str, type[Warning]]] = set()
         # Processes that begin do not search the working directory for libraries; :func:`_done` tells them the paths.
         with _environment(PYTHONSAFEPATH="1"):
             for outcome in spread(calls):
                 for text, category in outcome.warnings:
-                    if (text, category) not in told:
-                        told.add((text, category))
+                    if (text, category) not in shown_warnings:
+                        shown_warnings.add((text, category))
                         warnings.warn(text, category, stacklevel=2)
                 if outcome.error is not None:
                     raise outcome.error from Elsewhere(outcome.traceback)
@@ -288,7 +288,7 @@ class Workers:
             where: Any = self.cluster
             try:
                 if begin:
-                    with dask.config.set(UNSERVED):
+                    with dask.config.set(NO_HTTP_ROUTES):
                         where = LocalCluster(
                             n_workers=self._cores,
                             threads_per_worker=1,
@@ -351,8 +351,8 @@ class Workers:
                 try:
                     yield from ray.get(ready)
                 except ray.exceptions.RayError as error:
-                    said = str(error).strip().splitlines()[0]
-                    raise ValueError(f"the cluster has lost a piece of work for good: {said}") from error
+                    reason = str(error).strip().splitlines()[0]
+                    raise ValueError(f"the cluster has lost a piece of work for good: {reason}") from error
 
     def _begin_ray(self, ray: Any) -> None:
         quiet = {"log_to_driver": False, "logging_level": "error"}

@@ -41,7 +41,7 @@ def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
     """Draw with the sizes of print, whatever matplotlib has been told elsewhere."""
 
     @wraps(draw)
-    def drawn(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
+    def draw_in_print(*arguments: Any, columns: int = 2, **keywords: Any) -> Any:
         from matplotlib import rc_context
 
         size = FONT_SIZES[check_columns(columns)]
@@ -61,7 +61,7 @@ def in_print(draw: Callable[..., Any]) -> Callable[..., Any]:
         with rc_context(settings):
             return draw(*arguments, columns=columns, **keywords)
 
-    return drawn
+    return draw_in_print
 
 
 def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = None) -> Any:
@@ -76,7 +76,7 @@ def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = Non
     return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
 
 
-def titled(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
+def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
     """Return the figure with its title, and a legend, of the first axes or of handles: beside it where there is room,
     else below.
     """
@@ -208,7 +208,7 @@ def room_for_labels(labels: Iterable[str], columns: int) -> bool:
     return width <= 0.3 * WIDTHS[columns] and len(labels) <= MOST_BESIDE
 
 
-def wrapped(label: str, columns: int) -> str:
+def wrap_label(label: str, columns: int) -> str:
     """Break the name of an ordinate that is longer than a low panel is high."""
     return "\n".join(textwrap.wrap(label, 26 if columns == 1 else 32))
 

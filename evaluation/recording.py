@@ -6,12 +6,13 @@ from typing import Any
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, import_task, make_task, opened
+from ..envs.catalogue import find_scenario, make_task, read_files
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
 from ..envs.recording_files import differing
 from ..envs.task import Task, named_arrays
+from .evaluate import Experiment
 from .rollout import Progress, start_lanes
 from .seeds import episode_seeds
 
@@ -35,58 +36,37 @@ def _no_filter(model: Model) -> NoFilter:
     return NoFilter(model.task)
 
 
-def record(
-    env: str,
-    scenario: Any = None,
-    episodes: int = 10,
-    seed: int = 0,
-    split: str = "test",
-    progress: Progress | None = None,
-    *,
-    backend: str = "auto",
-    **keywords: Any,
-) -> Recording:
-    """Record what the sensors say in episodes of the simulation, and the truth.
+def record_experiment(experiment: Experiment, progress: Progress | None = None) -> Recording:
+    """Record what the sensors say in the episodes of an experiment, and the truth.
 
-    They are the episodes that an evaluation of the same scenario, seed and split flies. Replayed on the same backend,
-    observations, estimates and costs are the same, bit for bit.
+    They are the episodes that an evaluation of the experiment flies. Replayed on the same backend, observations,
+    estimates and costs are the same, bit for bit.
 
     Args:
-        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
-        scenario: name of a scenario, a trajectory, or flights; default: the environment's training distribution.
-        episodes: how many.
-        seed: number of the experiment.
-        split: "test" (default), "validation" or "train".
+        experiment: whose episodes these are; no policy runs, and of its fields only those are used that say which
+            episodes, with which parameters and on what backend.
         progress: called with the number of measurements done, now and then.
-        backend: what computes the steps, "auto", "compiled" or "numpy".
-        **keywords: parameters of the task.
 
     Raises:
         ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
     """
-    cls = import_task(env)
+    cls, split, seed, episodes = experiment.task, experiment.split, experiment.seed, experiment.episodes
     seeds = episode_seeds(split, seed, episodes)
-    chosen = find_scenario(cls, opened(cls, scenario), keywords)
-    plain = make_task(cls, chosen, **keywords)
+    chosen = find_scenario(cls, read_files(cls, experiment.scenario), experiment.keywords)
     if chosen.recording is not None:
         raise ValueError(f"{chosen.name!r} is a recording already: name a scenario of the simulation")
-    arrays = dict(named_arrays(measure_once(plain)[1]))
-    row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(plain.components) + 1
-    if row * episodes * (plain.horizon + 1) > MOST_NUMBERS:
-        raise ValueError(
-            f"{episodes:,} episodes of {plain.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
-            "that a recording may hold: record fewer"
-        )
-    model = make_model(cls, scenario=chosen, backend=backend, **keywords).with_filter(_no_filter)
+    plain = make_task(cls, chosen, **experiment.keywords)
+    _check_size(plain, episodes)
+    model = make_model(cls, scenario=chosen, backend=experiment.backend, **experiment.keywords)
+    model = model.with_filter(_no_filter)
     chunks = [
         _record(model, seeds[i : i + CHUNK], progress or (lambda _: None)) for i in range(0, episodes, CHUNK)
     ]
-    joined = [
+    measurements, initial = (
         {name: numpy.concatenate([part[name] for part in parts]) for name in parts[0]}
         for parts in zip(*chunks, strict=True)
-    ]
-    measurements, initial_arrays = joined
-    truth, lengths = measurements.pop("truth"), initial_arrays.pop("length")
+    )
+    truth, lengths = measurements.pop("truth"), initial.pop("length")
     if "interval" in measurements:
         times = numpy.cumsum(measurements["interval"], axis=1)
     else:
@@ -97,11 +77,11 @@ def record(
         parameters.pop(name, None)
     names = [str(i) for i in range(episodes)]
     if plain.flights:
-        names = [f"{chosen.flights[number]} {i}" for i, number in enumerate(initial_arrays.pop("flight"))]
+        names = [f"{chosen.flights[number]} {i}" for i, number in enumerate(initial.pop("flight"))]
     return Recording(
         environment=cls.id,
         measurements=measurements,
-        initial=initial_arrays,
+        initial=initial,
         seconds=numpy.where(there, times, numpy.nan),
         lengths=lengths,
         truth=truth,
@@ -110,6 +90,17 @@ def record(
         name=f"{chosen.name} recorded",
         source=f"filtergym record {cls.id}, scenario {chosen.name}, {split} split, seed {seed}",
     )
+
+
+def _check_size(task: Task, episodes: int) -> None:
+    """Raise ValueError if episodes are more than a recording may hold, or the loop is closed."""
+    arrays = dict(named_arrays(measure_once(task)[1]))
+    row = sum(int(numpy.prod(values.shape[:-1])) for values in arrays.values()) + len(task.components) + 1
+    if row * episodes * (task.horizon + 1) > MOST_NUMBERS:
+        raise ValueError(
+            f"{episodes:,} episodes of {task.horizon:,} measurements are more than the {MOST_NUMBERS:,} numbers "
+            "that a recording may hold: record fewer"
+        )
 
 
 def times_there(lengths: numpy.ndarray, rows: int) -> numpy.ndarray:
@@ -128,7 +119,7 @@ def _record(
     def first(values: numpy.ndarray) -> numpy.ndarray:
         return numpy.moveaxis(values[..., :count], -1, 0).copy()
 
-    def begun(episode: Episode) -> None:
+    def keep_start(episode: Episode) -> None:
         initial.update({name: first(values) for name, values in named_arrays(episode.measurement)})
 
     def keep(episode: Episode) -> None:
@@ -136,7 +127,7 @@ def _record(
             series.setdefault(name, []).append(first(values))
         series.setdefault("truth", []).append(first(model.task.world.state(episode.truth)))
 
-    lanes, nothing = start_lanes(model, seeds, begun), numpy.zeros(count, dtype=numpy.int64)
+    lanes, nothing = start_lanes(model, seeds, keep_start), numpy.zeros(count, dtype=numpy.int64)
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(nothing):
             keep(episode)

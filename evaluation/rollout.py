@@ -3,33 +3,33 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import gymnasium
 import numpy
 
-from ..compiler.functions import padded_width
+from ..compiler.functions import round_up_lanes
 from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Kind, check_competitor, kind_of, made
-from .dataset import FAULTS
+from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .filters import put_in_loop
-from .smoothers import Smoothed, check_open_loop, run_forward
+from .smoothers import SmoothedTrack, check_open_loop, run_forward
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
 """Called with the number of measurements just done."""
 
 
-def start_lanes(model: Model, seeds: Sequence[int], begun: Callable[[Episode], None] | None = None) -> Lanes:
+def start_lanes(
+    model: Model, seeds: Sequence[int], on_start: Callable[[Episode], None] | None = None
+) -> Lanes:
     """Return one episode for each seed, side by side, with its first measurement made.
 
     Args:
         model: task with a bank.
         seeds: of the episodes.
-        begun: called with the episodes at the start of the track.
+        on_start: called with the episodes at the start of the track.
     """
-    lanes = Lanes(model, len(seeds), begun=begun)
+    lanes = Lanes(model, len(seeds), on_start=on_start)
     for lane, seed in enumerate(seeds):
         lanes.seed(lane, numpy.random.default_rng(seed))
     lanes.restart()
@@ -63,7 +63,7 @@ def rollout(
     kind = kind or kind_of(competitor)
     if kind == "smoother":
         check_open_loop(model, name)
-        competitor, kind = Smoothed(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
+        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
     if kind != "policy":
         model = put_in_loop(model, competitor, kind, name, len(seeds))
         lanes, action = start_lanes(model, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
@@ -72,7 +72,7 @@ def rollout(
                 yield found, action
         return
     lanes = start_lanes(model, seeds)
-    policy = SteppingPolicy(model, check_competitor(name, made(competitor, model), kind))
+    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), kind))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         action, memory = policy.predict(lanes.observe(), memory)
@@ -90,7 +90,7 @@ def _smoothed_estimates(
     task = model.task
     noise = [numpy.random.default_rng(seed).random((task.noise.uniforms, 1)) for seed in seeds]
     lengths = task.lengths(numpy.concatenate(noise, axis=1))
-    K, C, width = task.horizon, len(task.components), padded_width(len(seeds))
+    K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
     means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
     for length in numpy.unique(lengths).tolist():
         lanes = numpy.flatnonzero(lengths == length)
@@ -104,18 +104,38 @@ def _smoothed_estimates(
     return means[..., last], covariances[..., last]
 
 
+class Series:
+    """What is kept of every measurement of episodes that run side by side.
+
+    Args:
+        episodes: how many run.
+        fewer: beginning of names -> of how many of the first episodes these are kept; everything else of all.
+    """
+
+    def __init__(self, episodes: int, fewer: Mapping[str, int] | None = None) -> None:
+        self.episodes, self.fewer = episodes, fewer or {}
+        self._counts: dict[str, int] = {}
+        self._values: dict[str, list[numpy.ndarray]] = {}
+
+    def add(self, found: Mapping[str, Any]) -> None:
+        """Keep what is there after a measurement, arrays ``(..., N)`` by name, padding beyond the episodes."""
+        for name, values in found.items():
+            if name not in self._values:
+                counts = [count for beginning, count in self.fewer.items() if name.startswith(beginning)]
+                self._counts[name], self._values[name] = min([self.episodes, *counts]), []
+            count = self._counts[name]
+            kept = values[..., :count]
+            # A view of a few episodes would keep the numbers of all.
+            kept = kept.copy() if count < self.episodes else kept
+            self._values[name].append(numpy.moveaxis(kept, -1, 0))
+
+    def arrays(self) -> dict[str, numpy.ndarray]:
+        """Return what was kept, ``(episodes, time, ...)`` by name."""
+        return {name: numpy.stack(values, axis=1) for name, values in self._values.items()}
+
+
 def run_competitor(
-    model: Model,
-    competitor: Any,
-    kind: Kind,
-    seeds: Sequence[int],
-    report: Report,
-    tick: Progress = lambda measurements: None,
-    name: str = "competitor",
-    first_episode: int = 0,
-    actions: bool = False,
-    only: Mapping[str, int] | None = None,
-    strict: bool = False,
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
 ) -> dict[str, numpy.ndarray]:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -125,58 +145,11 @@ def run_competitor(
         kind: likewise.
         seeds: likewise.
         report: of arrays ``(..., N)`` by name.
-        tick: called with the number of measurements just done.
-        name: of the competitor, in errors.
-        first_episode: number of the first episode, in errors.
-        actions: of a policy whose action is a box, report too what was applied: ``action``, ``(episodes, time, A)``,
-            within the limits of the box, as every bank takes it.
-        only: beginning of names -> of how many of the first episodes these are kept.
-        strict: raise where an estimator would lose an episode, see :class:`.filters.EstimatorFilter`.
 
     Returns:
         Arrays ``(episodes, time, ...)`` by name.
     """
-    series: dict[str, list[numpy.ndarray]] = {}
-    fewer, space = dict(only or {}), model.action_space
-    counts: dict[str, int] = {}
-
-    def keep(name: str, values: numpy.ndarray) -> None:
-        if name not in series:
-            most = [count for beginning, count in fewer.items() if name.startswith(beginning)]
-            counts[name], series[name] = min(len(seeds), *most) if most else len(seeds), []
-        kept = values[..., : counts[name]]
-        # A view of a few episodes would keep the numbers of all.
-        series[name].append(numpy.moveaxis(kept.copy() if counts[name] < len(seeds) else kept, -1, 0))
-
-    boxed = actions and kind == "policy" and isinstance(space, gymnasium.spaces.Box)
-    reserved = {"action", "lost"} if kind == "policy" and actions else set()
-    for step, (found, action) in enumerate(
-        rollout(model, competitor, seeds, report, kind=kind, name=name), 1
-    ):
-        for taken in reserved & found.keys():
-            raise ValueError(
-                f"{model.task.id} records something under the name {taken!r}, under which an evaluation keeps "
-                "which actions were applied or episodes lost: call it something else"
-            )
-        if strict and "lost" in found:
-            _refuse_losses(found["lost"][: len(seeds)], name, first_episode, step)
-        for each, values in found.items():
-            keep(each, values)
-        if boxed:
-            bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), space.low, space.high)  # type: ignore
-            keep("action", bounded.reshape(len(seeds), -1).T)
-        tick(len(seeds))
-    if kind in ("estimator", "smoother", "reference"):  # few say how likely a measurement was
-        for each in ("log_likelihood", "nis", "nis_degrees"):
-            if each in series and all(numpy.isnan(values).all() for values in series[each]):
-                del series[each]
-    return {each: numpy.stack(values, axis=1) for each, values in series.items()}
-
-
-def _refuse_losses(faults: numpy.ndarray, name: str, first_episode: int, step: int) -> None:
-    """Raise ValueError if an episode is lost."""
-    if faults.any():
-        i = int(numpy.argmax(faults > 0.0))
-        raise ValueError(
-            f"estimator {name!r}: {FAULTS[int(faults[i]) - 1]} in episode {first_episode + i} at measurement {step}"
-        )
+    series = Series(len(seeds))
+    for found, _ in rollout(model, competitor, seeds, report, kind=kind):
+        series.add(found)
+    return series.arrays()

@@ -12,7 +12,7 @@ from ..envs.model import Model
 from ..envs.observation import Array
 
 
-class Smoothed:
+class SmoothedTrack:
     """An estimator that answers what a smoother has found before; its memory counts the measurements.
 
     Args:
@@ -76,19 +76,19 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
     action = numpy.zeros(lanes.count, dtype=numpy.int64)
     while len(measurements) < length:
         for episode, _ in lanes.decide(action, whole_episode):
-            measurements.append(looped.task.world.received(episode.measurement))
+            measurements.append(looped.task.world.mask_missing(episode.measurement))
             memories.append(memory_in(episode))
     own = looped.filter.own.own if python else looped.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
     C = len(looped.task.components)
     return (
-        _checked("means", means, (C, length, lanes.width), name),
-        _checked("covariances", covariances, (C, C, length, lanes.width), name),
+        _check_shape("means", means, (C, length, lanes.width), name),
+        _check_shape("covariances", covariances, (C, C, length, lanes.width), name),
     )
 
 
-def _checked(word: str, values: Any, shape: Sequence[int], name: str) -> numpy.ndarray:
+def _check_shape(word: str, values: Any, shape: Sequence[int], name: str) -> numpy.ndarray:
     array = numpy.asarray(values, dtype=numpy.float64)
     if array.shape != tuple(shape):
         raise ValueError(

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..compiler.functions import padded_width
+from ..compiler.functions import round_up_lanes
 from ..envs.environment import check_action
 from ..envs.model import Model
 from .competitors import Policy
@@ -108,7 +108,7 @@ class SteppingPolicy(Policy):
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
         """Episodes that each call of the policy is shown."""
-        rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else padded_width(count)
+        rows = MODEL_ROWS if hasattr(self.policy, "observation_space") else round_up_lanes(count)
         return [
             numpy.minimum(numpy.arange(first, first + rows), count - 1) for first in range(0, count, rows)
         ]

@@ -24,7 +24,7 @@ def read_json(path: Path) -> Any:
         raise ValueError(f"cannot read {path}: {error}") from error
 
 
-def restored(cls: type[Stored], values: Any) -> Stored:
+def restore(cls: type[Stored], values: Any) -> Stored:
     """Make a dataclass or named tuple from its fields.
 
     Raises:

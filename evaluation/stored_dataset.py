@@ -21,7 +21,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
         otherwise: of all others.
     """
 
-    def said(name: str, values: numpy.ndarray) -> Any:
+    def as_json(name: str, values: numpy.ndarray) -> Any:
         if values.dtype.kind != "f":
             return values.tolist()
         words = numpy.char.mod(f"%.{digits.get(name, otherwise)}g", values.ravel()).tolist()
@@ -29,7 +29,7 @@ def dataset_as_json(dataset: xarray.Dataset, digits: Mapping[str, int], otherwis
         return {"shape": list(values.shape), "numbers": numbers}
 
     def part(variables: Any) -> dict[str, Any]:
-        return {str(name): [list(v.dims), said(str(name), v.values)] for name, v in variables.items()}
+        return {str(name): [list(v.dims), as_json(str(name), v.values)] for name, v in variables.items()}
 
     return {
         "coords": part(dataset.coords),

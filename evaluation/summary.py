@@ -13,7 +13,7 @@ import xarray
 
 from .bootstrap import BLOCK, RESAMPLES, Bootstrap, block_of
 from .curves import CompetitorCurves, competitor_curves, curve_statistics, stack_curves
-from .evaluate import DRAWN, Experiment, check_sendable, plan_of, run_piece
+from .evaluate import DRAWN_PREFIX, Experiment, check_sendable, plan_of, run_piece
 from .metrics import Contender, Record, contender_of, record_statistics, records_of
 from .own_metrics import OwnMetrics
 from .parallel import Workers
@@ -125,7 +125,7 @@ def reduce_episodes(
         tick: told of measurements done.
 
     Raises:
-        ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.evaluate`.
+        ValueError: for flights and recordings, whose episodes belong together; and as :func:`.evaluate.run_experiment`.
     """
     plan = plan_of(asked.experiment, {asked.name: asked.maker})
     if plan.flown is not None:
@@ -145,7 +145,7 @@ def reduce_episodes(
 
 def _head(run: xarray.Dataset) -> xarray.Dataset:
     """Return an evaluation without what was kept of every episode; of the first, its seed."""
-    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN)]
+    others = [str(name) for name in run.data_vars if not str(name).startswith(DRAWN_PREFIX)]
     return run.drop_vars(others).isel(episode=0).drop_vars(["episode", "action_name"], errors="ignore")
 
 
@@ -170,7 +170,7 @@ def summaries(
 
     Raises:
         ValueError: if a competitor cannot be sent to another process, or a file not be written; and as
-            :func:`.evaluate.evaluate`.
+            :func:`.evaluate.run_experiment`.
     """
     store = store or Store()
     keys = list(work) or [None] * len(asked)
@@ -193,7 +193,7 @@ def _summarise(
 ) -> Iterator[tuple[int, Summary]]:
     if not workers.alone:
         for i in missing:
-            check_sendable(asked[i].experiment.environment, {asked[i].name: asked[i].maker})
+            check_sendable(asked[i].experiment.task, {asked[i].name: asked[i].maker})
     pieces = [(i, piece) for i in missing for piece in asked[i].pieces()]
     work = [piece for _, piece in pieces]
     waiting: dict[int, dict[int, tuple[Part, int]]] = {}

@@ -60,7 +60,7 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
     if baselines is not None:
         if baselines.environment != task.id:
             raise ValueError(f"the baselines are of {baselines.environment!r}, not of {task.id!r}")
-        add_baselines(baselines)
+        add_baselines(task, baselines)
 
 
 def __getattr__(name: str) -> Any:

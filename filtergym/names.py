@@ -7,17 +7,19 @@ from typing import Any
 import gymnasium
 import xarray
 
-from .agents.gate import gated
-from .agents.named_policies import learned_policy, shipped_agents, with_normalisation
+from .agents.gate import add_gate
+from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
-from .envs.catalogue import imported, make_task, nearest
+from .envs.catalogue import import_task, import_user_module, nearest
 from .envs.environment import TaskEnv, TaskVectorEnv
+from .envs.model import Model
+from .envs.recording import Recording
 from .evaluation import metrics
-from .evaluation.competitors import check_competitor, kind_of, made
+from .evaluation.competitors import check_competitor, kind_of, make_competitor
 from .evaluation.evaluate import Experiment, check_observation, control_of
 from .evaluation.metrics import Record
-from .evaluation.recording import record as record
+from .evaluation.recording import record_experiment
 from .evaluation.rollout import Progress
 from .evaluation.stepping import SteppingPolicy
 from .evaluation.summary import EvaluationRequest
@@ -46,7 +48,7 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
     """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
     if isinstance(name, Path):
-        found = learned_policy(problem.task, str(name.absolute()), trust)
+        found = find_learned_policy(problem.task, str(name.absolute()), trust)
         if found is None:
             raise ValueError(
                 f"cannot load policy {str(name)!r}: it is neither a .safetensors, a .zip, nor a folder"
@@ -54,18 +56,18 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
         return found
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
-        return gated(inner, find_competitor(problem, inner, trust))
-    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned):
+        return add_gate(inner, find_competitor(problem, inner, trust))
+    if name in problem.baselines.names or (name.endswith("-tuned") and name in problem.tuned_policies):
         return problem.competitor(name)
-    learned = learned_policy(problem.task, name, trust)
+    learned = find_learned_policy(problem.task, name, trust)
     if learned is not None:
         return learned
     if name.endswith("-tuned"):
         return problem.competitor(name)  # says why there is none
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise nearest("policy", name, [*problem.names, *shipped_agents(problem.id)])
-    holder = imported(module, f"cannot load policy {name!r}")
+        raise nearest("policy", name, [*problem.names, *pretrained_agents(problem.id)])
+    holder = import_user_module(module, f"cannot load policy {name!r}")
     if not hasattr(holder, attribute):
         raise ValueError(f"cannot load policy {name!r}: {holder} has no {attribute!r}")
     return check_competitor(name, getattr(holder, attribute))
@@ -76,7 +78,7 @@ def is_learned(problem: Problem, name: str) -> bool:
     inner = name.removeprefix(GATED)
     if inner in problem.names:
         return False
-    return inner in shipped_agents(problem.id) or ":" not in inner
+    return inner in pretrained_agents(problem.id) or ":" not in inner
 
 
 def evaluate(
@@ -109,11 +111,11 @@ def evaluate(
         progress: called with the number of measurements done, now and then.
         trust: load models' zips, which can execute code.
         **keywords: parameters of the task; also ``backend``, ``threads``, ``tracks``, ``drawn_episodes``, ``strict``
-            and ``workers``, see :func:`.evaluation.evaluate.evaluate`.
+            of :class:`.evaluation.evaluate.Experiment`, and ``workers`` of :func:`.evaluation.evaluate.run_experiment`.
 
     Returns:
         Errors, costs and records over the dimensions policy, episode and time; see
-        :func:`.evaluation.evaluate.evaluate`.
+        :func:`.evaluation.evaluate.run_experiment`.
 
     Raises:
         ValueError: for unknown names, a name of one's own that is taken, a policy that does not fit the control, or
@@ -121,7 +123,42 @@ def evaluate(
     """
     problem = import_problem(env)
     objects = competitors_of(problem, competitors, trust)
-    return problem.evaluate(objects, scenario, episodes, seed, split, control, progress, **keywords)
+    return problem.evaluate(objects, scenario, episodes, seed, split, control, progress=progress, **keywords)
+
+
+def record(
+    env: str,
+    scenario: Any = None,
+    episodes: int = 10,
+    seed: int = 0,
+    split: str = "test",
+    progress: Progress | None = None,
+    *,
+    backend: str = "auto",
+    **keywords: Any,
+) -> Recording:
+    """Record what the sensors say in episodes of the simulation, and the truth.
+
+    They are the episodes that an evaluation of the same scenario, seed and split flies. Replayed on the same backend,
+    observations, estimates and costs are the same, bit for bit.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        scenario: name of a scenario, a trajectory, or flights; default: the environment's training distribution.
+        episodes: how many.
+        seed: number of the experiment.
+        split: "test" (default), "validation" or "train".
+        progress: called with the number of measurements done, now and then.
+        backend: what computes the steps, "auto", "compiled" or "numpy".
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, a closed loop, or more measurements than a recording may hold.
+    """
+    task = import_task(env)
+    return record_experiment(
+        Experiment(task, scenario, episodes, seed, split, backend=backend, keywords=keywords), progress
+    )
 
 
 def competitors_of(
@@ -152,7 +189,7 @@ def competitors_of(
 
 def _is_competitor(problem: Problem, name: str) -> bool:
     """Whether a name is that of a competitor of the environment."""
-    return name in problem.names or name in shipped_agents(problem.id)
+    return name in problem.names or name in pretrained_agents(problem.id)
 
 
 def evaluation_requests(
@@ -173,9 +210,8 @@ def evaluation_requests(
         ValueError: for unknown names.
     """
     makers = competitors_of(problem, competitors, trust)
-    task = make_task(problem.task, experiment.scenario, **experiment.keywords)
-    own = problem.baselines.metrics
-    return [EvaluationRequest(experiment, name, maker, own, task.horizon) for name, maker in makers.items()]
+    own, horizon = problem.baselines.metrics, experiment.make_task().horizon
+    return [EvaluationRequest(experiment, name, maker, own, horizon) for name, maker in makers.items()]
 
 
 def make_policy(
@@ -205,33 +241,65 @@ def make_policy(
         ValueError: for unknown names, what is no policy, and a policy that does not fit the environment.
     """
     if isinstance(env, str):
-        problem, model = import_problem(env), None
+        problem = import_problem(env)
+        return find_policy(
+            problem, policy, problem.experiment(scenario, control=control, keywords=keywords), trust
+        )
+    model = _model_of(env)
+    problem = Problem.of(type(model.task))
+    if control is not None or scenario is not None or keywords:
+        raise ValueError("control, scenario and parameters are the environment's own: leave them out")
+    name, maker = _named_policy(problem, policy, trust)
+    control_of(maker, "policy", model.control, problem.task, name)
+    keywords = getattr(maker, "task_keywords", {})
+    for parameter, value in keywords.items():
+        own = getattr(model.task.parameters, parameter)
+        if own != value:
+            raise ValueError(
+                f"policy {name!r} acts in an environment with {parameter}={value!r}, and this one has {own!r}: "
+                "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
+            )
+    return _stepping(name, maker, model, None, keywords)
+
+
+def find_policy(problem: Problem, policy: Any, experiment: Experiment, trust: bool = False) -> SteppingPolicy:
+    """Make a policy to step the environment of an experiment with, and that environment's model.
+
+    Args:
+        problem: whose policy it is.
+        policy: as of :func:`make_policy`, likewise what is refused.
+        experiment: whose control, scenario and parameters the environment has.
+        trust: likewise.
+    """
+    name, maker = _named_policy(problem, policy, trust)
+    control = control_of(maker, "policy", experiment.control, problem.task, name)
+    keywords = {**getattr(maker, "task_keywords", {}), **experiment.keywords}
+    model = make_model(problem.task, control, experiment.scenario, **keywords)
+    return _stepping(name, maker, model, experiment.scenario, keywords)
+
+
+def _named_policy(problem: Problem, policy: Any, trust: bool) -> tuple[str, Any]:
+    """Return the name of a policy in errors, and what makes it.
+
+    Raises:
+        ValueError: for what does not act.
+    """
+    if isinstance(policy, str | Path):
+        name, maker = str(policy), find_competitor(problem, policy, trust)
     else:
-        model = _model_of(env)
-        problem = Problem.of(type(model.task))
-        if control is not None or scenario is not None or keywords:
-            raise ValueError("control, scenario and parameters are the environment's own: leave them out")
-        control = model.control
-    name = str(policy) if isinstance(policy, str | Path) else type(policy).__name__
-    named = isinstance(policy, str | Path)
-    maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
+        name, maker = type(policy).__name__, with_normalisation(policy)
     kind = kind_of(maker)
     if kind != "policy":
         raise ValueError(f"{name!r} does not act: of kind {kind}, it can be evaluated only")
-    control = control_of(maker, kind, control, problem.task, name)
-    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
-    if model is None:
-        model = make_model(problem.task, control, scenario, **keywords)
-    else:
-        for parameter, value in keywords.items():
-            own = getattr(model.task.parameters, parameter)
-            if own != value:
-                raise ValueError(
-                    f"policy {name!r} acts in an environment with {parameter}={value!r}, and this one has {own!r}: "
-                    "make it by gymnasium.make(id, **filtergym.make_policy(id, policy).keywords)"
-                )
+    return name, maker
+
+
+def _stepping(
+    name: str, maker: Any, model: Model, scenario: Any, keywords: Mapping[str, Any]
+) -> SteppingPolicy:
     check_observation(model, maker, name)
-    return SteppingPolicy(model, check_competitor(name, made(maker, model), kind), scenario, keywords)
+    policy = check_competitor(name, make_competitor(maker, model), "policy")
+    return SteppingPolicy(model, policy, scenario, keywords)
 
 
 def _model_of(env: Any) -> Any:
@@ -251,7 +319,7 @@ def _model_of(env: Any) -> Any:
             "this environment shows what no policy may know: make it without observation='asymmetric', or show "
             "a policy of your own observation['observation']"
         )
-    if inner.fleet.mixed:
+    if inner.fleet.mixes_scenarios:
         raise ValueError(
             "a policy is made for the parameters of one scenario, and this environment flies several: make it with one"
         )

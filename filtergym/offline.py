@@ -10,6 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,14 +19,15 @@ import numpy
 
 from . import __version__
 from .agents.training_run import training_scenarios
-from .baselines.problem import import_problem
-from .envs.catalogue import check_names, find_scenario, import_task
+from .baselines.problem import Problem, import_problem
+from .envs.catalogue import check_names, find_scenario
+from .evaluation.evaluate import Experiment
 from .evaluation.files import whole_files
 from .evaluation.rollout import Progress
 from .evaluation.seeds import episode_seeds
 from .evaluation.stepping import SteppingPolicy
 from .evaluation.transitions import Transitions, transitions_of
-from .names import competitor, make_policy
+from .names import find_competitor, find_policy
 
 CHUNK = 256
 """Episodes flown side by side, and held in memory until they are written."""
@@ -48,14 +50,13 @@ class Written(NamedTuple):
     """Mean over the episodes of the sum of their rewards."""
 
 
-def default_policies(env: str, control: str | None = None) -> list[str]:
+def default_policies(problem: Problem, control: str | None = None) -> list[str]:
     """Return the names of the paper's policy, of the tuned one that costs least, and of random actions.
 
     Args:
-        env: environment id.
+        problem: whose policies they are.
         control: leave out those that do not act in it.
     """
-    problem = import_problem(env)
     paper = problem.baselines.score_paper
     names = [paper, problem.tuned_values.best_policy(control), RANDOM]
     own = getattr(problem.competitor(paper), "control", None) if paper else None
@@ -108,64 +109,115 @@ def write_datasets(
         ValueError: for unknown names, what does not act, a scenario that is held out, a data set that is there already,
             a folder that cannot be written to, or without Minari. Then nothing is written.
     """
+    problem = import_problem(env)
+    experiment = problem.experiment(scenario, episodes, seed, split, control, keywords=keywords)
+    return plan_datasets(problem, experiment, policies, trust).write(folder, namespace, progress)
+
+
+class DatasetPlan(NamedTuple):
+    """Data sets before they are written; all that can be wrong with them but their place is refused by then."""
+
+    experiment: Experiment
+    """Whose episodes they hold."""
+    seeds: list[int]
+    """Of the episodes."""
+    policies: list[SteppingPolicy]
+    """Each of a data set."""
+    names: list[str]
+    """Of the policies."""
+    of_the_face: dict[str, Any]
+    """Keywords of ``gymnasium.make`` beside those of the policies."""
+
+    @property
+    def decisions(self) -> int:
+        """How many there are in all data sets."""
+        tasks = [policy.model.task for policy in self.policies]
+        return len(self.seeds) * sum(task.horizon // task.decision_interval for task in tasks)
+
+    def write(
+        self, folder: Path | None = None, namespace: str | None = None, progress: Progress | None = None
+    ) -> list[Written]:
+        """Write the data sets; arguments, result and refusals as of :func:`write_datasets`."""
+        from minari.storage import get_dataset_path
+
+        root = Path(folder) if folder is not None else get_dataset_path()
+        names = _names(self.experiment.task.id, self.names, namespace, root)
+        with whole_files(root) as waiting, _datasets_in(waiting):
+            found = [self._write_one(i, name, progress or (lambda _: None)) for i, name in enumerate(names)]
+            written = [entry for entry, _ in found]
+            _tell_scores(written, [dataset for _, dataset in found])
+            for space in waiting.rglob("namespace_metadata.json"):
+                if (root / space.relative_to(waiting)).exists():  # it may say what the user has written there
+                    space.unlink()
+        return written
+
+    def _write_one(self, i: int, name: str, progress: Progress) -> tuple[Written, Any]:
+        """Write the data set of a policy; return what was written, and the data set."""
+        policy, stepping, id = self.names[i], self.policies[i], self.experiment.task.id
+        made_with = {**stepping.keywords, **self.of_the_face}
+        dataset: Any = None
+        returns: list[float] = []
+        for first in range(0, len(self.seeds), CHUNK):
+            seeds = self.seeds[first : first + CHUNK]
+            part = transitions_of(id, stepping, seeds, progress, **self.of_the_face)
+            returns += [float(episode.rewards.sum()) for episode in part]
+            if dataset is None:
+                about = self._description(policy, stepping.control)
+                dataset = _create(name, part, gymnasium.make(id, **made_with), policy, about)
+            else:
+                dataset.update_dataset_from_buffer(_buffers(part))
+        mean = sum(returns) / len(returns)
+        return Written(name, policy, made_with, len(returns), dataset.total_steps, mean), dataset
+
+    def _description(self, policy: str, control: str) -> str:
+        asked = self.experiment
+        return (
+            f"{asked.episodes} episodes of policy {policy}, control {control}, scenario "
+            f"{find_scenario(asked.task, asked.scenario).name}, {asked.split} split, seed {asked.seed}; filtergym "
+            f"{__version__}"
+        )
+
+
+def plan_datasets(
+    problem: Problem,
+    experiment: Experiment,
+    policies: Sequence[str | Path] | None = None,
+    trust: bool = False,
+) -> DatasetPlan:
+    """Return the plan of data sets.
+
+    Args:
+        problem: whose policies these are.
+        experiment: on it; its keywords may hold ``reward`` and ``dtype`` of ``gymnasium.make``, too.
+        policies: as of :func:`write_datasets`, likewise what is refused.
+        trust: likewise.
+    """
     try:
         import h5py  # noqa: F401  (Minari says what it lacks only when it writes)
-        from minari.storage import get_dataset_path
+        import minari.storage  # noqa: F401
     except ImportError as error:
         raise ValueError(
             f"Minari data sets need more packages: pip install 'filtergym[offline]' ({error})"
         ) from error
-    cls = import_task(env)
-    asked = list(policies or default_policies(cls.id, control))
-    chosen = [str(policy) for policy in asked]
-    seeds = episode_seeds(split, seed, episodes)
-    if split != "test":
+    cls, scenario, control = experiment.task, experiment.scenario, experiment.control
+    seeds = episode_seeds(experiment.split, experiment.seed, experiment.episodes)
+    if experiment.split != "test":
         try:
             training_scenarios(cls, cls.default_scenario if scenario is None else scenario)
         except ValueError as error:
             raise ValueError(f"{error}, or take the split test for data to be judged on") from error
-    of_the_face = {name: keywords.pop(name) for name in OF_THE_FACE if name in keywords}
-    check_names(cls, keywords, OF_THE_FACE)
-    root = Path(folder) if folder is not None else get_dataset_path()
-    names = _names(cls.id, chosen, namespace, root)
+    parameters = dict(experiment.keywords)
+    of_the_face = {name: parameters.pop(name) for name in OF_THE_FACE if name in parameters}
+    check_names(cls, parameters, OF_THE_FACE)
+    chosen = list(policies or default_policies(problem, control))
     acting: list[SteppingPolicy] = []
-    for policy in asked:
-        before = acting[-1] if acting and _suits_any(competitor(cls.id, policy, trust=trust)) else None
+    for policy in chosen:
+        before = acting[-1] if acting and _suits_any(find_competitor(problem, policy, trust)) else None
         own = before.control if before is not None and control is None else control
         theirs = {} if before is None else before.task_keywords
-        acting.append(make_policy(cls.id, policy, own, scenario, trust=trust, **{**theirs, **keywords}))
-    story = (
-        f"scenario {find_scenario(cls, scenario).name}, {split} split, seed {seed}; filtergym {__version__}"
-    )
-    with whole_files(root) as waiting, _datasets_in(waiting):
-        written: list[Written] = []
-        stored: list[Any] = []
-        for name, policy, stepping in zip(names, chosen, acting, strict=True):
-            made_with = {**stepping.keywords, **of_the_face}
-            dataset: Any = None
-            returns: list[float] = []
-            for first in range(0, episodes, CHUNK):
-                part = transitions_of(
-                    cls.id,
-                    stepping,
-                    seeds[first : first + CHUNK],
-                    progress or (lambda _: None),
-                    **of_the_face,
-                )
-                returns += [float(episode.rewards.sum()) for episode in part]
-                if dataset is None:
-                    about = f"{episodes} episodes of policy {policy}, control {stepping.control}, {story}"
-                    dataset = _create(name, part, gymnasium.make(cls.id, **made_with), policy, about)
-                else:
-                    dataset.update_dataset_from_buffer(_buffers(part))
-            mean = sum(returns) / episodes
-            written.append(Written(name, policy, made_with, episodes, dataset.total_steps, mean))
-            stored.append(dataset)
-        _tell_scores(written, stored)
-        for space in waiting.rglob("namespace_metadata.json"):
-            if (root / space.relative_to(waiting)).exists():  # it may say what the user has written there
-                space.unlink()
-    return written
+        fitting = replace(experiment, control=own, keywords={**theirs, **parameters})
+        acting.append(find_policy(problem, policy, fitting, trust))
+    return DatasetPlan(experiment, seeds, acting, [str(policy) for policy in chosen], of_the_face)
 
 
 def _suits_any(maker: Any) -> bool:

@@ -12,7 +12,7 @@ from .kalman import Update, update
 from .small_matrices import product, transpose
 
 
-def predicted_bound(P: Array, F: Array, Q: Array | float = 0.0) -> Array:
+def predict_bound(P: Array, F: Array, Q: Array | float = 0.0) -> Array:
     """Bound before the measurement, ``F P F^T + Q``.
 
     Args:

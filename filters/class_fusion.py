@@ -143,13 +143,13 @@ def _solve_upper(L: list[list[Array]], B: Array) -> Array:
 class Channels(NamedTuple):
     """What a bank of constant classes can know before any data, for scans 0 to K."""
 
-    gain: numpy.ndarray
+    gain: Array
     """Kalman gains, ``(n, m, M, K + 1)``; zero at scan 0, where the track starts."""
-    covariance: numpy.ndarray
+    covariance: Array
     """Covariances after the update, ``(n, n, M, K + 1)``."""
-    whitening: numpy.ndarray
+    whitening: Array
     """Inverse Cholesky factors of Theta, lower triangular, ``(m, m, M, K + 1)``; zero at scan 0."""
-    log_normaliser: numpy.ndarray
+    log_normaliser: Array
     """``-1/2 log det(2 pi Theta)``, ``(M, K + 1)``; zero at scan 0."""
 
 
@@ -195,25 +195,21 @@ class ChannelUpdate(NamedTuple):
     """``(M, N)``."""
 
 
-def update_channels(
-    mean: Array, z: Array, Phi: Array, H: Array, gain: Array, whitening: Array, log_normaliser: Array
-) -> ChannelUpdate:
+def update_channels(mean: Array, z: Array, models: Models, channels: Channels) -> ChannelUpdate:
     """Step 1 of the recursion for filters whose gains are known.
 
     Args:
         mean: x(s), ``(n, M, N)``.
         z: radar measurement, ``(m, N)``.
-        Phi: ``(n, n, M)``.
-        H: ``(m, n)``.
-        gain: of this scan, ``(n, m, M, N)``.
-        whitening: ``(m, m, M, N)``.
-        log_normaliser: ``(M, N)``.
+        models: of the classes.
+        channels: design of the filters, in place of K + 1 scans that of the scan of each episode, ``(..., N)``.
     """
-    predicted = apply(Phi[..., None], mean)
-    innovation = z[:, None] - apply(H[..., None, None], predicted)
-    whitened = apply(whitening, innovation)
+    predicted = apply(models.Phi[..., None], mean)
+    innovation = z[:, None] - apply(models.H[..., None, None], predicted)
+    whitened = apply(channels.whitening, innovation)
     squared = ordered_sum(whitened * whitened)
-    return ChannelUpdate(predicted + apply(gain, innovation), whitened, log_normaliser - 0.5 * squared)
+    updated = predicted + apply(channels.gain, innovation)
+    return ChannelUpdate(updated, whitened, channels.log_normaliser - 0.5 * squared)
 
 
 def channel_error_covariance(
@@ -274,7 +270,7 @@ def information_per_decision(probabilities: numpy.ndarray) -> numpy.ndarray:
     return numpy.sum(probabilities[:, None] * (logarithm[:, None] - logarithm[None]), axis=-1)
 
 
-def fixed_type_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
+def constant_class_log_likelihood(counts: Array, log_confusion: Array, log_composition: Array) -> Array:
     """Log-likelihood of the classes when all decisions are about one unchanging type, ``(M, N)``.
 
     (8) multiplies pi(rho | s) at every decision, which is Bayes' rule only if the type is drawn anew each

@@ -40,7 +40,7 @@ def _sine_ratio_derivative(angle: Array, cosine: Array, ratio: Array) -> Array:
     return xp.where(small, series, (cosine - ratio) / xp.where(small, 1.0, angle))
 
 
-def turned(state: Array, T: float | Array) -> Array:
+def propagate(state: Array, T: float | Array) -> Array:
     """State after an interval at constant turn rate.
 
     Args:
@@ -64,7 +64,7 @@ def turned(state: Array, T: float | Array) -> Array:
 
 
 def jacobian(state: Array, T: float | Array) -> Array:
-    """Derivative of :func:`turned` with respect to the state, ``(5, 5, ...)``; arguments as there."""
+    """Derivative of :func:`propagate` with respect to the state, ``(5, 5, ...)``; arguments as there."""
     xp = namespace(state)
     vx, vy, omega = state[2], state[3], state[4]
     angle = T * omega
@@ -105,10 +105,10 @@ def predict(mean: Array, covariance: Array, T: float | Array, Q: Array) -> tuple
         Q: covariance of the process noise, ``(5, 5, 1)`` or ``(5, 5, N)``.
     """
     F = jacobian(mean, T)
-    return turned(mean, T), product(product(F, covariance), transpose(F)) + Q
+    return propagate(mean, T), product(product(F, covariance), transpose(F)) + Q
 
 
-def augmented(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
+def augment_turn_rate(mean: Array, covariance: Array, variance: float) -> tuple[Array, Array]:
     """Estimate of position and velocity with an independent turn rate of mean zero as fifth state.
 
     Args:

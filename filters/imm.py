@@ -93,7 +93,7 @@ def log_probabilities(probabilities: Array) -> Array:
     return xp.where(possible, xp.log(xp.where(possible, probabilities, 1.0)), math.log(1e-300))
 
 
-def normalised_exponential(logarithms: Array) -> Array:
+def softmax(logarithms: Array) -> Array:
     """Probabilities from logarithms known up to a constant, normalised over the first axis, ``(M, N)``."""
     xp = namespace(logarithms)
     scaled = xp.exp(logarithms - xp.max(logarithms, axis=0))
@@ -122,4 +122,4 @@ def mode_posterior(log_predicted: Array, log_likelihood: Array) -> Array:
         log_predicted: logarithm of the predicted probabilities, ``(M, N)``.
         log_likelihood: ``log Lambda_j`` (11), ``(M, N)``.
     """
-    return normalised_exponential(log_predicted + log_likelihood)
+    return softmax(log_predicted + log_likelihood)

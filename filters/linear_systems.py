@@ -147,7 +147,7 @@ def spectral_radius(F: Matrix) -> float:
     return float(numpy.max(numpy.abs(numpy.linalg.eigvals(F))))
 
 
-def unobserved_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[complex]:
+def unobservable_modes(F: Matrix, H: Matrix, continuous: bool = False) -> list[complex]:
     """Eigenvalues on or beyond the limit of stability that no measurement shows.
 
     Popov-Belevitch-Hautus test: the rank of ``[F - lambda I; H]``. The pair is detectable when the list is
@@ -187,7 +187,7 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
     """Refuse what has no stabilising solution, with the reason."""
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the measurement noise must be positive definite, got R = {R.tolist()}")
-    hidden = unobserved_modes(F, H, continuous)
+    hidden = unobservable_modes(F, H, continuous)
     if hidden:
         raise ValueError(
             f"the sensors cannot detect the state: the modes with eigenvalues {_list(hidden)} do not decay "
@@ -196,7 +196,7 @@ def _check_filter(F: Matrix, H: Matrix, Q: Matrix, R: Matrix, continuous: bool) 
     limit = 0.0 if continuous else 1.0
     quiet = [
         value
-        for value in unobserved_modes(F.T, noise_factor(Q).T, continuous)
+        for value in unobservable_modes(F.T, noise_factor(Q).T, continuous)
         if abs((value.real if continuous else abs(value)) - limit) < 1e-6
     ]
     if quiet:
@@ -270,13 +270,15 @@ def steady_kalman_bucy(A: ArrayLike, H: ArrayLike, intensity: ArrayLike, R: Arra
 def _check_regulator(F: Matrix, B: Matrix, weight: Matrix, R: Matrix) -> None:
     if numpy.min(numpy.linalg.eigvalsh(R)) <= 0.0:
         raise ValueError(f"the weight of the control must be positive definite, got {R.tolist()}")
-    fixed = unobserved_modes(F.T, B.T)
+    fixed = unobservable_modes(F.T, B.T)
     if fixed:
         raise ValueError(
             f"the control cannot stabilise the plant: the modes with eigenvalues {_list(fixed)} do not decay "
             "and the control does not reach them"
         )
-    ignored = [value for value in unobserved_modes(F, noise_factor(weight).T) if abs(abs(value) - 1.0) < 1e-6]
+    ignored = [
+        value for value in unobservable_modes(F, noise_factor(weight).T) if abs(abs(value) - 1.0) < 1e-6
+    ]
     if ignored:
         raise ValueError(
             f"the weights ignore the integrating modes with eigenvalues {_list(ignored)}: the Riccati "

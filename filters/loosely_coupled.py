@@ -79,7 +79,7 @@ def sampling(correlation_time: float, step: float) -> Sampling:
     )
 
 
-def settled_gain(growth: Array, R: Array) -> Array:
+def steady_state_gain(growth: Array, R: Array) -> Array:
     """Gain at which the sampled plain scheme settles, ``P / (P + R)`` with the settled prediction P.
 
     ``P = q / 2 + sqrt(q^2 / 4 + q R)``; the gain is ``sqrt(Ge / N) step`` at first order in the step.

@@ -51,7 +51,7 @@ class Level(NamedTuple):
     """Samples that have not been forgotten, more than zero; one at the start gives equation (4)."""
 
 
-def faded(level: Level, sample: Array, forgetting: float, available: Array | float = 1.0) -> Level:
+def fading_mean(level: Level, sample: Array, forgetting: float, available: Array | float = 1.0) -> Level:
     """Mean of all samples with those of k measurements ago weighing ``forgetting^k``: equation (4).
 
     Args:
@@ -82,7 +82,7 @@ def sage_husa(
         least: smallest variance.
         available: whether there is a measurement.
     """
-    after = faded(level, innovation**2 - predicted, forgetting, available)
+    after = fading_mean(level, innovation**2 - predicted, forgetting, available)
     return after._replace(value=namespace(after.value).clip(after.value, least, None))
 
 
@@ -98,14 +98,14 @@ def sage_husa_positive(
         forgetting: b.
         available: whether there is a measurement.
     """
-    return faded(level, residual**2 + updated, forgetting, available)
+    return fading_mean(level, residual**2 + updated, forgetting, available)
 
 
 def process_noise_factor(correction: Array, updated: Array, carried: Array, unit: Array) -> Array:
     """Sample of the factor on the process noise: the diagonal of equation (3) over that of the unit noise.
 
     Its mean is the true factor where the filter believes the right one. Without a measurement it is the factor
-    that the filter believes. Single samples are often negative: average them with :func:`faded`, hold the average
+    that the filter believes. Single samples are often negative: average them with :func:`fading_mean`, hold the average
     above a least one.
 
     Args:

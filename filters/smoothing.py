@@ -83,7 +83,7 @@ def rauch_tung_striebel_step(filtered: Estimate, motion: Motion, later: Estimate
     rest = _identity(filtered.mean) - product(gain, F)
     return Estimate(
         filtered.mean + apply(gain, later.mean - motion.predicted),
-        _symmetric(_congruent(rest, filtered.covariance) + _congruent(gain, later.covariance + Q)),
+        _symmetrize(_congruence(rest, filtered.covariance) + _congruence(gain, later.covariance + Q)),
     )
 
 
@@ -102,7 +102,7 @@ def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estima
     Raises:
         ValueError: for a negative lag.
     """
-    return backward(rauch_tung_striebel_step, (but_last(filtered), motion), filtered, lag)
+    return backward(rauch_tung_striebel_step, (drop_last(filtered), motion), filtered, lag)
 
 
 # --- several models
@@ -165,22 +165,22 @@ def imm_step(filtered: Bank, arrival: Arrival, next_scan: SmoothedBank, transiti
     xp = namespace(filtered.mean)
     prediction = imm.predict_mode_probabilities(transition, filtered.probabilities)
     mixed, _ = imm.mix(filtered.mean, filtered.covariance, prediction.mixing)
-    seen_from_here = _pulled_back(_with_measurement(next_scan.later, arrival), arrival.motion, mixed)
+    seen_from_here = _pull_back(_add_measurement(next_scan.later, arrival), arrival.motion, mixed)
     # Pairs [j, i]: mode i at this scan, then mode j. Errors are counted in standard deviations of the filter,
     # x = mean + root e with e ~ N(0, I), in which nothing needs an inverse of the covariance.
     root = semidefinite_root(filtered.covariance)
-    pairs = Likelihood(*(_with_axis(part, -2) for part in seen_from_here))
-    pairs = _about(pairs, filtered.mean[:, None])
+    pairs = Likelihood(*(_insert_axis(part, -2) for part in seen_from_here))
+    pairs = _expand_about(pairs, filtered.mean[:, None])
     errors, log_evidence = _posterior(pairs, root[:, :, None])
     log_weights = imm.log_probabilities(transition.T)[:, :, None] + log_evidence
     of_mode = imm.log_mixture_density(0.0 * log_weights, log_weights)
     error = Estimate(*imm.combine(*errors, xp.exp(log_weights - of_mode)))
     bank = Bank(
         filtered.mean + apply(root, error.mean),
-        _symmetric(_congruent(root, error.covariance)),
-        imm.normalised_exponential(imm.log_probabilities(filtered.probabilities) + of_mode),
+        _symmetrize(_congruence(root, error.covariance)),
+        imm.softmax(imm.log_probabilities(filtered.probabilities) + of_mode),
     )
-    return SmoothedBank(bank, _likelihood_between(filtered.mean, root, error, of_mode))
+    return SmoothedBank(bank, _likelihood_from_moments(filtered.mean, root, error, of_mode))
 
 
 def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | None = None) -> Bank:
@@ -202,7 +202,7 @@ def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | N
         filtered.mean, 0.0 * filtered.probabilities, 0.0 * filtered.mean, 0.0 * filtered.covariance
     )
     step = functools.partial(imm_step, transition=transition)
-    return backward(step, (but_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
+    return backward(step, (drop_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
 
 
 # --- the recursion over time
@@ -229,18 +229,18 @@ def backward(
     if lag is not None and lag < 0:
         raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
     K, N = _arrays_of(nothing_later)[0].shape[-2:]
-    given = [_mapped(lambda values: _broadcast(values, (K - 1, N)), part) for part in given]
+    given = [_map_arrays(lambda values: _broadcast_scans(values, (K - 1, N)), part) for part in given]
     if lag is None or lag >= K - 1:
-        found = [_mapped(lambda values: values[..., K - 1, :], nothing_later)]
+        found = [_map_arrays(lambda values: values[..., K - 1, :], nothing_later)]
         for k in reversed(range(K - 1)):
             found.append(
-                step(*(_mapped(lambda values, k=k: values[..., k, :], part) for part in given), found[-1])
+                step(*(_map_arrays(lambda values, k=k: values[..., k, :], part) for part in given), found[-1])
             )
-        return stacked(found[::-1])
+        return stack_scans(found[::-1])
     carried = nothing_later
     for _ in range(lag):
-        stepped = over_time(step, *given, _mapped(lambda values: values[..., 1:, :], carried))
-        carried = _mapped(
+        stepped = over_time(step, *given, _map_arrays(lambda values: values[..., 1:, :], carried))
+        carried = _map_arrays(
             lambda early, last: namespace(last).concat([early, last[..., K - 1 :, :]], axis=-2),
             stepped,
             nothing_later,
@@ -260,25 +260,25 @@ def over_time(function: Callable[..., Any], *parts: Any) -> Any:
     """
     first = _arrays_of(parts)[0]
     last = first.shape[-2:]
-    found = function(*_mapped(_without_time, parts))
-    return _mapped(lambda values: namespace(values).reshape(values, (*values.shape[:-1], *last)), found)
+    found = function(*_map_arrays(_flatten_time, parts))
+    return _map_arrays(lambda values: namespace(values).reshape(values, (*values.shape[:-1], *last)), found)
 
 
-def stacked(scans: Sequence[Any]) -> Any:
+def stack_scans(scans: Sequence[Any]) -> Any:
     """Put a time axis into nested tuples of arrays ``(..., N)``, one for each scan: ``(..., K, N)``."""
-    return _mapped(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
+    return _map_arrays(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
 
 
-def but_last(part: Any) -> Any:
+def drop_last(part: Any) -> Any:
     """Return nested tuples of arrays ``(..., K, N)`` without the last scan."""
-    return _mapped(lambda values: values[..., :-1, :], part)
+    return _map_arrays(lambda values: values[..., :-1, :], part)
 
 
-def _mapped(function: Callable[..., Array], *parts: Any) -> Any:
+def _map_arrays(function: Callable[..., Array], *parts: Any) -> Any:
     """Apply a function to the arrays of nested tuples."""
     first = parts[0]
     if isinstance(first, tuple):
-        answers = [_mapped(function, *each) for each in zip(*parts, strict=True)]
+        answers = [_map_arrays(function, *each) for each in zip(*parts, strict=True)]
         return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
     return function(*parts)
 
@@ -287,11 +287,11 @@ def _arrays_of(part: Any) -> list[Array]:
     return [array for each in part for array in _arrays_of(each)] if isinstance(part, tuple) else [part]
 
 
-def _broadcast(values: Array, last: tuple[int, int]) -> Array:
+def _broadcast_scans(values: Array, last: tuple[int, int]) -> Array:
     return namespace(values).broadcast_to(values, (*values.shape[:-2], *last))
 
 
-def _without_time(values: Array) -> Array:
+def _flatten_time(values: Array) -> Array:
     """Scans side by side in the batch."""
     return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
 
@@ -299,7 +299,7 @@ def _without_time(values: Array) -> Array:
 # --- likelihoods as quadratic forms
 
 
-def _about(likelihood: Likelihood, centre: Array) -> Likelihood:
+def _expand_about(likelihood: Likelihood, centre: Array) -> Likelihood:
     """Write a likelihood about another centre."""
     step = centre - likelihood.centre
     bent = apply(likelihood.curvature, step)
@@ -307,12 +307,12 @@ def _about(likelihood: Likelihood, centre: Array) -> Likelihood:
     return Likelihood(centre, value, likelihood.gradient - bent, likelihood.curvature)
 
 
-def _with_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
+def _add_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
     """Add what is measured at a scan to what follows it, about the predicted means."""
-    likelihood = _about(later, arrival.motion.predicted)
-    H, precision = (_with_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
+    likelihood = _expand_about(later, arrival.motion.predicted)
+    H, precision = (_insert_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
     weighted = product(transpose(H), precision)
-    residual = _with_axis(arrival.position, -2) - apply(H, likelihood.centre)
+    residual = _insert_axis(arrival.position, -2) - apply(H, likelihood.centre)
     return likelihood._replace(
         value=likelihood.value - 0.5 * _dot(residual, apply(precision, residual)),
         gradient=likelihood.gradient + apply(weighted, residual),
@@ -320,7 +320,7 @@ def _with_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
     )
 
 
-def _pulled_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelihood:
+def _pull_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelihood:
     """Integrate over the process noise: the likelihood of a state one scan before, about ``centre``, from which the
     centre of the given one is predicted.
     """
@@ -330,13 +330,13 @@ def _pulled_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likel
     error = apply(transpose(root), likelihood.gradient)
     gain = transpose(_solve(inner, transpose(bent)))
     rest = _identity(centre) - product(gain, transpose(root))
-    curvature = _congruent(rest, likelihood.curvature) + product(gain, transpose(gain))
+    curvature = _congruence(rest, likelihood.curvature) + product(gain, transpose(gain))
     back = transpose(motion.F)
     return Likelihood(
         centre,
         likelihood.value + 0.5 * _dot(error, _solve(inner, error)) - _log_diagonal(inner),
         apply(back, likelihood.gradient - apply(gain, error)),
-        _symmetric(_congruent(back, curvature)),
+        _symmetrize(_congruence(back, curvature)),
     )
 
 
@@ -347,15 +347,15 @@ def _posterior(likelihood: Likelihood, root: Array) -> tuple[Estimate, Array]:
         Mean and covariance of e, and the logarithm of the evidence.
     """
     back = transpose(root)
-    inner = semidefinite_root(_identity(likelihood.centre) + _congruent(back, likelihood.curvature))
+    inner = semidefinite_root(_identity(likelihood.centre) + _congruence(back, likelihood.curvature))
     pull = apply(back, likelihood.gradient)
     mean = _solve(inner, pull)
     covariance = _solve(inner, _identity(likelihood.centre) + 0.0 * inner)
     evidence = likelihood.value + 0.5 * _dot(pull, mean) - _log_diagonal(inner)
-    return Estimate(mean, _symmetric(covariance)), evidence
+    return Estimate(mean, _symmetrize(covariance)), evidence
 
 
-def _likelihood_between(centre: Array, root: Array, error: Estimate, log_evidence: Array) -> Likelihood:
+def _likelihood_from_moments(centre: Array, root: Array, error: Estimate, log_evidence: Array) -> Likelihood:
     """Likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre + root e``.
 
     In a direction in which the variance is not below one it says nothing.
@@ -376,7 +376,7 @@ def _likelihood_between(centre: Array, root: Array, error: Estimate, log_evidenc
         centre,
         log_evidence - 0.5 * ordered_sum(along**2 / variances + xp.log(variances)),
         apply(directions, along / variances),
-        _symmetric(product(directions * curvature[None], transpose(directions))),
+        _symmetrize(product(directions * curvature[None], transpose(directions))),
     )
 
 
@@ -412,7 +412,7 @@ def _solve_lower(L: Array, b: Array) -> Array:
         entry = b[i]
         for j in range(i):
             entry = entry - L[i, j] * y[j]
-        y.append(_divided(entry, L[i, i]))
+        y.append(_divide(entry, L[i, i]))
     return xp.stack(y)
 
 
@@ -424,11 +424,11 @@ def _solve_upper(L: Array, b: Array) -> Array:
         entry = b[i]
         for j in range(i + 1, n):
             entry = entry - L[j, i] * x[j]
-        x[i] = _divided(entry, L[i, i])
+        x[i] = _divide(entry, L[i, i])
     return namespace(b).stack(x)
 
 
-def _divided(entry: Array, pivot: Array) -> Array:
+def _divide(entry: Array, pivot: Array) -> Array:
     xp = namespace(entry)
     positive = pivot != 0.0
     return xp.where(positive, entry / xp.where(positive, pivot, 1.0), entry * 0.0)
@@ -445,12 +445,12 @@ def _log_diagonal(L: Array) -> Array:
     return ordered_sum([xp.log(L[i, i]) for i in range(L.shape[0])])
 
 
-def _congruent(A: Array, P: Array) -> Array:
+def _congruence(A: Array, P: Array) -> Array:
     """``A P A^T``."""
     return product(product(A, P), transpose(A))
 
 
-def _symmetric(P: Array) -> Array:
+def _symmetrize(P: Array) -> Array:
     """Without the asymmetry that rounding leaves."""
     return 0.5 * (P + transpose(P))
 
@@ -466,6 +466,6 @@ def _dot(a: Array, b: Array) -> Array:
     return ordered_sum([a[i] * b[i] for i in range(a.shape[0])])
 
 
-def _with_axis(values: Array, axis: int) -> Array:
+def _insert_axis(values: Array, axis: int) -> Array:
     """Put an axis of one before the batch."""
     return namespace(values).expand_dims(values, axis=axis)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
 
@@ -42,12 +42,12 @@ def check_source_distribution(archive: Path, source: Path) -> None:
 def check_installed() -> None:
     """Environments are made and stepped; shipped agents and tuned values are found and play, without torch."""
     assert importlib.util.find_spec("torch") is None
-    assert any(map(shipped_agents, catalogue()))
+    assert any(map(pretrained_agents, catalogue()))
     for id in catalogue():
         env = gymnasium.make(id)
         env.reset(seed=0)
         assert numpy.isfinite(env.step(env.action_space.sample())[1]), id
-        agents, tuned = shipped_agents(id), problem_of(id).tuned
+        agents, tuned = pretrained_agents(id), problem_of(id).tuned_policies
         results = filtergym.evaluate(id, [*agents, *tuned], episodes=2)
         assert numpy.isfinite(results["error"]).all(), id
 

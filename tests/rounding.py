@@ -14,7 +14,7 @@ from operations that are exact and stay.
 import dataclasses
 
 import numpy as np
-from filtergym.compiler.functions import mapped
+from filtergym.compiler.functions import map_arrays
 
 SAFETY = 32.0
 """Eight, because two libraries may be off by four units each in opposite directions, and sums of some ten terms by as
@@ -34,7 +34,7 @@ def moved(part, pattern):
         part: arrays ``(..., N)``.
         pattern: an integer, or one for each lane, ``(N,)``.
     """
-    return mapped(lambda leaf: _moved(leaf, pattern), part)
+    return map_arrays(lambda leaf: _moved(leaf, pattern), part)
 
 
 def _moved(leaf, pattern):

@@ -67,7 +67,7 @@ class OurKalman(KalmanModel):
 
     def update(self, measurement, memory):
         predicted = kalman.predict(*memory, *self.model(measurement.interval))
-        result = self.updated(predicted, measurement)
+        result = self.update_estimate(predicted, measurement)
         return result.mean, result.covariance, (result.mean, result.covariance)
 
 

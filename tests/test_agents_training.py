@@ -548,7 +548,7 @@ def test_a_run_can_be_stopped_by_what_it_tells(tmp_path):
 
     run = train(small_run("bptt", 4000), tmp_path, validate_every=400, validated=validated)
     assert told == [400, 800]
-    assert (run.steps_done, load_run(tmp_path).steps_done, run.finished) == (800, 800, False)
+    assert (run.steps_done, load_run(tmp_path).steps_done, run.is_complete) == (800, 800, False)
 
 
 def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
@@ -561,7 +561,7 @@ def test_the_standing_is_that_of_evaluate(tmp_path, monkeypatch):
         estimators={"kalman-imm": known.estimators["kalman-imm"]},
     )
     tuned = ["adaptive-rearm-tuned", "kalman-imm-tuned"]
-    monkeypatch.setattr(Problem, "tuned", tuned)
+    monkeypatch.setattr(Problem, "tuned_policies", tuned)
     run = train(small_run("bptt", 400), tmp_path)
     run.problem = dataclasses.replace(problem_of(ID), baselines=few)
     opponents = standing.Opponents(run)

@@ -9,7 +9,7 @@ def test_scalar_random_walk_golden():
     one = np.ones((1, 1, 1))
     P = 5.0 * one
     for _ in range(60):
-        prior = bounds.predicted_bound(P, one, one)
+        prior = bounds.predict_bound(P, one, one)
         P = bounds.posterior_cramer_rao_bound(prior, np.ones((1, 1)), np.ones((1, 1)))
     assert P[0, 0, 0] == pytest.approx(0.6180340, abs=5e-8)
     assert prior[0, 0, 0] == pytest.approx(1.6180340, abs=5e-8)
@@ -24,7 +24,7 @@ def test_constant_velocity_golden():
     P = np.diag([5.0, 5.0, 10.0, 10.0])[..., None]
     position = [np.sqrt(P[0, 0, 0] + P[1, 1, 0])]
     for _ in range(20):
-        P = bounds.posterior_cramer_rao_bound(bounds.predicted_bound(P, F, Q), H, R)
+        P = bounds.posterior_cramer_rao_bound(bounds.predict_bound(P, F, Q), H, R)
         position.append(np.sqrt(P[0, 0, 0] + P[1, 1, 0]))
     np.testing.assert_allclose(position[:3], [3.16227766, 2.73899281, 2.70945734], rtol=0, atol=5e-9)
     assert position[20] == pytest.approx(1.89934607, abs=5e-9)
@@ -40,7 +40,7 @@ def test_equals_the_information_form_with_singular_process_noise(seed):
     mine = P[..., None]
     for _ in range(10):
         mine = bounds.posterior_cramer_rao_bound(
-            bounds.predicted_bound(mine, F[..., None], (g @ g.T)[..., None]), H, R
+            bounds.predict_bound(mine, F[..., None], (g @ g.T)[..., None]), H, R
         )
         P = np.linalg.inv(np.linalg.inv(F @ P @ F.T + g @ g.T) + H.T @ np.linalg.inv(R) @ H)
         np.testing.assert_allclose(mine[..., 0], P, rtol=1e-7, atol=1e-9)

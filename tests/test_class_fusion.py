@@ -83,21 +83,13 @@ def test_identity_is_a_bank_of_kalman_filters(seed):
         z = numpy.stack([1e3 + 3000 * rng.standard_normal(N), 20 * rng.standard_normal(N)])
         step = class_fusion.advance(Q, general, general_covariance, z, MODELS, numpy.eye(3))
         general, general_covariance, Q = step.mean, step.covariance, numpy.exp(step.log_predicted)
-        column = numpy.full(N, k)
-        update = class_fusion.update_channels(
-            mean,
-            z,
-            MODELS.Phi,
-            MODELS.H,
-            channels.gain[..., column],
-            channels.whitening[..., column],
-            channels.log_normaliser[..., column],
-        )
+        scan = class_fusion.Channels(*(part[..., numpy.full(N, k)] for part in channels))
+        update = class_fusion.update_channels(mean, z, MODELS, scan)
         mean = update.mean
         P = imm.mode_posterior(imm.log_probabilities(P), update.log_likelihood)
         # The issue of both ways of computing one thing: relative 1e-12 (ranges of kilometres).
         assert general == pytest.approx(mean, rel=1e-12, abs=1e-9)
-        assert general_covariance == pytest.approx(channels.covariance[..., column], rel=1e-11)
+        assert general_covariance == pytest.approx(scan.covariance, rel=1e-11)
         assert pytest.approx(P, abs=1e-12) == Q
         assert step.log_likelihood == pytest.approx(update.log_likelihood, rel=1e-12)
         assert step.innovation == pytest.approx(update.innovation, rel=1e-11, abs=1e-11)
@@ -215,7 +207,7 @@ def test_fixed_type_posterior_sums_over_the_types(seed):
     confusion, composition = rng.dirichlet([1.0] * 4, 4), rng.dirichlet([1.0] * 4, 3)
     decisions = rng.integers(0, 4, (6, 8))
     counts = numpy.stack([(decisions == j).sum(axis=0) for j in range(4)]).astype(float)
-    result = class_fusion.fixed_type_log_likelihood(counts, numpy.log(confusion), numpy.log(composition))
+    result = class_fusion.constant_class_log_likelihood(counts, numpy.log(confusion), numpy.log(composition))
     for n, s in itertools.product(range(8), range(3)):
         likelihood = sum(composition[s, j] * math.prod(confusion[j, decisions[:, n]]) for j in range(4))
         assert result[s, n] == pytest.approx(math.log(likelihood), rel=1e-12)

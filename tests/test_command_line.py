@@ -276,10 +276,10 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     resumed = False
     monkeypatch.setattr(summary, "summarise", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
+        benchmark.run_benchmark(tmp_path / "parts", benchmark.BenchmarkOptions())
     assert not (tmp_path / "parts" / "results.json").exists()
     resumed = True
-    results = benchmark.run_benchmark(tmp_path / "parts", full=False, seed=0)
+    results = benchmark.run_benchmark(tmp_path / "parts", benchmark.BenchmarkOptions())
     assert ran == [(cell.scenario, name) for cell in cells for name in cell.policies]
     assert [result.scenario for result in results] == ["paper", "random"]
     read, settings = read_results(tmp_path / "parts")
@@ -287,7 +287,7 @@ def test_benchmark_goes_on_with_the_missing_competitors(tmp_path, monkeypatch):
     assert settings.command == "filtergym benchmark"
     assert not (tmp_path / "parts" / "unfinished").exists()
     # What a file has kept is what was in memory: the results of one go are the same to the last digit.
-    benchmark.run_benchmark(tmp_path / "whole", full=False, seed=0)
+    benchmark.run_benchmark(tmp_path / "whole", benchmark.BenchmarkOptions())
     assert (tmp_path / "whole" / "results.json").read_bytes() == (
         tmp_path / "parts" / "results.json"
     ).read_bytes()
@@ -303,7 +303,7 @@ def test_benchmark_removes_only_its_own_files(tmp_path, monkeypatch):
     (waiting / "folder").mkdir(parents=True)
     for name in others - {"folder"}:
         (waiting / name).write_text("mine")
-    benchmark.run_benchmark(tmp_path, full=False, seed=0)
+    benchmark.run_benchmark(tmp_path, benchmark.BenchmarkOptions())
     assert (tmp_path / "results.json").exists()
     assert {path.name for path in waiting.iterdir()} == others
 

@@ -3,7 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.agents.residual import ResidualPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.competitors import DRAWN_AT_ONCE, RandomPolicy
@@ -25,7 +25,7 @@ def assert_same(some, more):
 
 
 def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
-    problem, agents = problem_of(env_id), shipped_agents(env_id)
+    problem, agents = problem_of(env_id), pretrained_agents(env_id)
     names = [*problem.names, *agents]
     if env_id == "filtergym/TightlyCoupledNavigation-v0":  # every competitor takes a second to compile
         known = problem.baselines

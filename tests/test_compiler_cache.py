@@ -40,7 +40,7 @@ def loaded(monkeypatch):
     )
 
     def load():
-        monkeypatch.setattr(native, "_LOADED", {})
+        monkeypatch.setattr(native, "_LIBRARIES", {})
         compiled.clear()
         result = Function(lambda x: x * 2.5 + x, Graph())(NUMBERS)
         np.testing.assert_array_equal(result, NUMBERS * 2.5 + NUMBERS)
@@ -231,11 +231,11 @@ def test_the_folder_stays_below_its_limit_and_what_was_used_stays(place, monkeyp
     for age, name in enumerate(("c", "b", "a")):
         cache.keep(name, b"." * 268)  # 300 with its checksum
         os.utime(place / f"{name}{cache.SUFFIX}", (TIME - age, TIME - age))
-    assert cache.kept("a") == b"." * 268  # the oldest, but used: now the youngest
+    assert cache.load("a") == b"." * 268  # the oldest, but used: now the youngest
     (place / "mine.txt").write_bytes(b"." * 5000)
     os.utime(place / "mine.txt", (0, 0))
     cache.keep("d", b"." * 268)
-    assert [name for name in "abcd" if cache.kept(name) is not None] == ["a", "c", "d"]
+    assert [name for name in "abcd" if cache.load(name) is not None] == ["a", "c", "d"]
     # What is not the cache's own does not count and does not go.
     assert (place / "mine.txt").exists()
     cache.keep("e", b"." * 2000)

@@ -257,7 +257,7 @@ def _threads_change_often():
 @pytest.mark.usefixtures("_threads_change_often")
 def test_threads_that_meet_a_function_at_once_all_get_it(monkeypatch):
     for attempt in range(5):
-        monkeypatch.setattr(native, "_LOADED", {})
+        monkeypatch.setattr(native, "_LIBRARIES", {})
         x, start, graph = numbers(3, 24, seed=attempt), threading.Barrier(4), Graph()
         # Two functions, whose expressions meet in one graph.
         both = [Function(lambda x, k=k: ordinary(x) * (k + 1.5) + k, graph) for k in range(2)]
@@ -308,7 +308,7 @@ def test_a_forked_process_goes_on_and_compiles_what_is_new(compiled):
         signal.alarm(60)  # what hangs ends, and fails
         try:
             new = Function(lambda x: ordinary(x) / 7.0, Graph())
-            native._LOADED.clear()
+            native._LIBRARIES.clear()
             os.write(write, compiled(x, threads=2).tobytes() + new(x, threads=2).tobytes())
         finally:
             os._exit(0)

@@ -5,7 +5,7 @@ import subprocess
 import sys
 
 import pytest
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import catalogue
 
@@ -55,7 +55,9 @@ def test_scenarios_of_the_environment(complete):
 
 @pytest.mark.parametrize("command", ["evaluate", "animate", "tune"])
 def test_policies_of_the_environment(complete, command):
-    expected = {name for name in [*problem_of(TARGET).names, *shipped_agents(TARGET)] if name.startswith("k")}
+    expected = {
+        name for name in [*problem_of(TARGET).names, *pretrained_agents(TARGET)] if name.startswith("k")
+    }
     assert set(complete(command, TARGET, "--policy", "k")) == expected
     assert "kalman-imm" in expected
     assert complete(command, "ManeuveringTarget", "--policy", "imm", "--policy", "known-t") == ["known-turn"]

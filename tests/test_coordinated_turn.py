@@ -26,7 +26,7 @@ def rotation(rate):
 
 def test_turn_solves_its_differential_equation():
     before = states()
-    after = coordinated_turn.turned(before, T)
+    after = coordinated_turn.propagate(before, T)
     for b, rate in enumerate(RATES):
         # The exponential rounds, too.
         np.testing.assert_allclose(
@@ -63,7 +63,7 @@ def test_prediction_of_the_covariance_equals_naive_matrices():
     covariance = np.einsum("ijb,kjb->ikb", root, root)
     Q = np.diag([1.0, 2.0, 3.0, 4.0, 5.0])
     moved, P = coordinated_turn.predict(mean, covariance, T, Q[:, :, None])
-    np.testing.assert_array_equal(moved, coordinated_turn.turned(mean, T))
+    np.testing.assert_array_equal(moved, coordinated_turn.propagate(mean, T))
     F = coordinated_turn.jacobian(mean, T)
     for b in range(len(RATES)):
         expected = F[..., b] @ covariance[..., b] @ F[..., b].T + Q
@@ -72,7 +72,7 @@ def test_prediction_of_the_covariance_equals_naive_matrices():
 
 def test_augmented_state_knows_nothing_of_its_turn():
     mean, covariance = np.arange(8.0).reshape(4, 2), np.arange(32.0).reshape(4, 4, 2)
-    mean5, covariance5 = coordinated_turn.augmented(mean, covariance, 0.25)
+    mean5, covariance5 = coordinated_turn.augment_turn_rate(mean, covariance, 0.25)
     for b in range(2):
         np.testing.assert_array_equal(mean5[:, b], [*mean[:, b], 0.0])
         expected = np.zeros((5, 5))

@@ -244,9 +244,9 @@ def test_modelled_error_is_the_filters_own():
     p = make_model(
         "filtergym/LooselyCoupledNavigation-v0", scenario="paper", **{**drive.PARAMETERS, **LEVELS}
     ).task.parameters
-    covariance, expected = p.modelled_prior(np.zeros(())), []
+    covariance, expected = p.prior_covariance(np.zeros(())), []
     for _ in range(81):
-        covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.modelled_growth)
+        covariance = ins_gnss.predict_augmented(covariance, p.sampling, *p.variance_growth)
         expected.append(covariance.position)
     found = drive.modelled(0.25 * np.arange(1, 82), LEVELS)
     np.testing.assert_allclose(np.diag(found), expected, rtol=1e-9)

@@ -29,7 +29,7 @@ def example():
     sys.modules["inverted_pendulum"] = module
     spec.loader.exec_module(module)
     yield module
-    for table in (sys.modules, registration.ADDED, baselines.ADDED, gymnasium.registry):
+    for table in (sys.modules, registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
         table.pop("inverted_pendulum", None)
         table.pop(ID, None)
 

@@ -9,7 +9,15 @@ import pytest
 import xarray
 from filtergym.evaluation.curves import curves_of
 from filtergym.evaluation.figures import draw_error_over_time, evaluation_figures
-from filtergym.evaluation.looks import COLOURS, MOST_HIGHLIGHTED, by_cost, highlighted, joined, looks, merged
+from filtergym.evaluation.looks import (
+    COLOURS,
+    MOST_HIGHLIGHTED,
+    by_cost,
+    choose_highlights,
+    group_equal_lines,
+    join_names,
+    looks,
+)
 from filtergym.evaluation.print_layout import WIDTHS, save, sensible_limits
 from matplotlib.colors import to_hex
 from pictures import draw_differences, draw_learning_curves
@@ -52,7 +60,7 @@ def texts(figure):
 
 
 def test_six_lines_are_told_apart_the_most_important_first(curves):
-    chosen = highlighted(curves, learned=["bptt"])
+    chosen = choose_highlights(curves, learned=["bptt"])
     assert len(chosen) == MOST_HIGHLIGHTED
     assert chosen[:4] == ["imm", "known-turn", "known-input-bound", "bptt"]
     ranked = by_cost(curves)
@@ -80,10 +88,10 @@ def test_lines_that_are_the_same_share_a_name_and_are_drawn_once(curves):
     figure = draw_error_over_time(curves)
     assert "imm = zero" in named(figure.axes[0])
     assert "imm = zero" in texts(figure)
-    assert joined(["a", "b", "c", "d"]) == "a = b = 2 more"
+    assert join_names(["a", "b", "c", "d"]) == "a = b = 2 more"
     nan = np.full(3, np.nan)
     values = {"a": np.ones(3), "b": np.ones(3) * 1.001, "c": np.ones(3), "d": nan, "e": nan}
-    assert merged("abcde", values) == {"a": ["a", "c"], "b": ["b"], "d": ["d"], "e": ["e"]}
+    assert group_equal_lines("abcde", values) == {"a": ["a", "c"], "b": ["b"], "d": ["d"], "e": ["e"]}
 
 
 def test_kinds_always_look_the_same(curves):
@@ -110,11 +118,11 @@ def test_kinds_always_look_the_same(curves):
 
 
 def test_who_is_told_apart_may_be_asked_for(curves):
-    assert highlighted(curves, ["adaptive", "imm"]) == ["adaptive", "imm"]
+    assert choose_highlights(curves, ["adaptive", "imm"]) == ["adaptive", "imm"]
     with pytest.raises(ValueError, match="cannot highlight 'mine': there are fixed-low"):
-        highlighted(curves, ["mine"])
+        choose_highlights(curves, ["mine"])
     with pytest.raises(ValueError, match="at most 6 lines can be told apart, got 7"):
-        highlighted(curves, NAMES[:7])
+        choose_highlights(curves, NAMES[:7])
 
 
 @pytest.mark.parametrize("columns", [1, 2])

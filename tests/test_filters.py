@@ -258,7 +258,7 @@ def test_faults_are_those_of_eigenvalues():
 def test_something_is_lacking_where_a_number_of_a_measurement_is_nan():
     model = make_model(TARGET, scenario="missed-detections", horizon=30)
     for episode, _ in rollout(model, Kalman, range(8)):
-        received = model.task.world.received(episode.measurement)
+        received = model.task.world.mask_missing(episode.measurement)
         np.testing.assert_array_equal(is_lacking(received, np), episode.measurement.available == 0.0)
 
 

@@ -14,7 +14,7 @@ import pymap3d
 import pytest
 import xarray
 from filtergym.envs import flight_tables
-from filtergym.envs.flight_cleaning import smoothed
+from filtergym.envs.flight_cleaning import fit_parabolas
 from filtergym.envs.flights import read_flights
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.metrics import flight_records
@@ -154,10 +154,10 @@ def test_flights_of_one_file_are_told_apart_and_stale_positions_go(tmp_path):
     found = read_flights(file, site=(48.0, 2.0))
     assert [t.name for t in found.trajectories] == ["two:a", "two:b"]
     np.testing.assert_array_equal(found.trajectories[0].time, FIVE[::2])
-    assert found.sources[0].said == ("2 flights", "1 row without position")
+    assert found.sources[0].notes == ("2 flights", "1 row without position")
     alone = table(tmp_path / "one.csv", time=FIVE, latitude=latitude, longitude=longitude, altitude=height)
     found = read_flights(alone, site=(48.0, 2.0))
-    assert found.sources[0].said == ("1 row without position", "1 repeated position")
+    assert found.sources[0].notes == ("1 row without position", "1 repeated position")
     np.testing.assert_array_equal(found.trajectories[0].time, np.delete(FIVE, [7, 9]))
 
 
@@ -168,7 +168,7 @@ def test_rows_of_named_flights_need_no_order_and_those_on_the_ground_are_not_flo
     columns |= {"icao24": np.repeat("a", len(FIVE)), "onground": np.where(FIVE < 20.0, "True", "False")}
     file = table(tmp_path / "one.csv", **{name: values[mixed] for name, values in columns.items()})
     found = read_flights(file, site=(48.0, 2.0))
-    assert found.sources[0].said == ("4 rows on the ground",)
+    assert found.sources[0].notes == ("4 rows on the ground",)
     np.testing.assert_array_equal(found.trajectories[0].time, FIVE[4:])
 
 
@@ -193,7 +193,7 @@ def test_samples_of_a_package_that_is_not_imported(tmp_path, monkeypatch):
     importlib.invalidate_caches()
     found = read_flights("traffic:quickstart")
     site = (round(float(np.median(latitude)), 2), round(float(np.median(longitude)), 2))
-    assert found.sources[0].said == (f"radar at {site[0]:.2f}, {site[1]:.2f}",)
+    assert found.sources[0].notes == (f"radar at {site[0]:.2f}, {site[1]:.2f}",)
     origin = tuple(np.radians(site))
     expected = east_north(np.radians(latitude), np.radians(longitude), height, origin).T
     np.testing.assert_allclose(found.trajectories[0].position, expected, rtol=0, atol=1e-6)
@@ -218,7 +218,7 @@ def test_what_lies_beyond_the_reach_is_taken_out(tmp_path):
     latitude[30:] += 6.0  # degrees: 670 km
     file = table(tmp_path / "far.csv", time=FIVE, latitude=latitude, longitude=longitude)
     found = read_flights(file, site=(48.0, 2.0))
-    assert found.sources[0].said == ("10 rows beyond 500 km",)
+    assert found.sources[0].notes == ("10 rows beyond 500 km",)
     assert len(found.trajectories[0].time) == 30
 
 
@@ -232,7 +232,7 @@ def test_gaps_jumps_and_outliers_by_hand(tmp_path):
     position[30:] += 5e4  # there to stay: a jump
     file = table(tmp_path / "ory_07.csv", time=time, x=position[:, 0], y=position[:, 1])
     found = read_flights(file)
-    assert found.sources[0].said == ("1 outlier over 1000 m/s", "3 gaps over 60 s", "1 jump over 1000 m/s")
+    assert found.sources[0].notes == ("1 outlier over 1000 m/s", "3 gaps over 60 s", "1 jump over 1000 m/s")
     times = [t.time for t in found.trajectories]
     # 400 s stands alone: no piece.
     kept = [np.delete(time[:20], 4), time[20:22], time[23:30], time[30:]]
@@ -246,22 +246,22 @@ def test_smoothing_is_a_parabola_around_each_position(tmp_path):
     rng = np.random.default_rng(0)
     time = np.cumsum(rng.uniform(0.5, 2.0, 60))
     parabola = np.stack([1e4 + 90.0 * time + 0.8 * time**2, 2e4 - 70.0 * time], axis=1)
-    position, velocity = smoothed(time, parabola, 10.0)
+    position, velocity = fit_parabolas(time, parabola, 10.0)
     np.testing.assert_allclose(position, parabola, rtol=0, atol=1e-8)
     np.testing.assert_allclose(
         velocity, np.stack([90.0 + 1.6 * time, -70.0 + 0.0 * time], axis=1), rtol=0, atol=1e-8
     )
     noisy = parabola + rng.normal(0.0, 30.0, parabola.shape)
-    position, velocity = smoothed(time, noisy, 7.0)
+    position, velocity = fit_parabolas(time, noisy, 7.0)
     for i in (0, 1, 30, 59):
         near = np.abs(time - time[i]) <= 7.0
         naive = np.polynomial.polynomial.polyfit(time[near] - time[i], noisy[near], 2)
         np.testing.assert_allclose(position[i], naive[0], rtol=1e-9)
         np.testing.assert_allclose(velocity[i], naive[1], rtol=1e-6, atol=1e-6)
-    few = smoothed(time[::10], parabola[::10], 1.0)[0]
+    few = fit_parabolas(time[::10], parabola[::10], 1.0)[0]
     np.testing.assert_allclose(few, parabola[::10], rtol=0, atol=1e-6)
     (found,) = read_flights(flight_file(tmp_path / "a.csv"), smoothing=20.0).trajectories
-    np.testing.assert_array_equal(found.velocity, smoothed(FIVE, weave(FIVE), 20.0)[1])
+    np.testing.assert_array_equal(found.velocity, fit_parabolas(FIVE, weave(FIVE), 20.0)[1])
 
 
 def test_the_line_about_a_file(tmp_path):

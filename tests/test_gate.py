@@ -235,7 +235,7 @@ def pendulum():
     sys.modules["inverted_pendulum"] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     yield "mine/InvertedPendulum-v0"
-    for table in (sys.modules, registration.ADDED, baselines.ADDED, gymnasium.registry):
+    for table in (sys.modules, registration.USER_TASKS, baselines.USER_BASELINES, gymnasium.registry):
         table.pop("inverted_pendulum", None)
         table.pop("mine/InvertedPendulum-v0", None)
 
@@ -243,7 +243,7 @@ def pendulum():
 def test_an_environment_of_ones_own_has_the_general_alarm_or_brings_one(pendulum):
     model = make_model(pendulum)
     assert type(Gate(model).alarm) is InnovationAlarm
-    baselines.ADDED[pendulum] = dataclasses.replace(baselines_of(pendulum), alarm=Scripted)
+    baselines.USER_BASELINES[pendulum] = dataclasses.replace(baselines_of(pendulum), alarm=Scripted)
     assert type(Gate(model).alarm) is Scripted
     assert Gate(model).window == 3
     assert Gate(model, alarm=InnovationAlarm).window == InnovationAlarm.window

@@ -104,7 +104,7 @@ def test_of_a_radar_any_answer_is_what_the_description_says():
             T, speed = measurement.interval[i], np.hypot(*before.mean[2:, i])
             along, across = before.acceleration[:, i] / np.hypot(speed, radar.LEAST_SPEED)
             turning = np.append(before.mean[:, i], across)
-            moved = coordinated_turn.turned(turning, T)
+            moved = coordinated_turn.propagate(turning, T)
             x = np.append(
                 before.mean[:2, i] + (1.0 + 0.5 * T * along) * (moved[:2] - before.mean[:2, i]),
                 (1.0 + T * along) * moved[2:4],

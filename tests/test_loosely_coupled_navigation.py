@@ -175,7 +175,7 @@ def test_the_plain_scheme_attenuates_a_constant_and_the_augmented_one_removes_it
         run = states(model, numbers(model, runs, 2000, 5), constant(model, action, runs))
         _, state = deque(run, maxlen=1).pop()
         means.append(model.error(state)[0])
-    K = loosely_coupled.settled_gain(0.0036, 2.0)
+    K = loosely_coupled.steady_state_gain(0.0036, 2.0)
     standard_error = [m.std() / math.sqrt(runs) for m in means]
     # The sampled scheme settles at beta step (1 - gain) / gain, close to beta / K = 0.236.
     assert abs(means[0].mean() - 0.01 * (1 - K) / K) < 4 * standard_error[0]
@@ -235,7 +235,7 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
     model = make("random", outage_probability=1.0)
     actions = random_actions(model, lanes, steps, 1)
     Phi, Qd = linear_systems.van_loan(*MODEL[:2], 0.01)
-    settled = loosely_coupled.settled_gain(0.0036, 2.0)
+    settled = loosely_coupled.steady_state_gain(0.0036, 2.0)
     x, v, P = 0.0, 0.0, np.tile(START, (lanes, 1, 1))
     for k, (seen, state) in enumerate(
         states(model, numbers(model, lanes, steps, 1), lambda k, seen: actions[k])
@@ -335,7 +335,7 @@ def test_actions_and_gains_are_inverse():
     assert bank.gain(np.array(-1 + 1e-12)) == pytest.approx(1e-5)
     with pytest.raises(ValueError, match=r"gain must lie in \[0, 1\]"):
         bank.action_for_gain(1.5)
-    settled = loosely_coupled.settled_gain(0.0036, 2.0)
+    settled = loosely_coupled.steady_state_gain(0.0036, 2.0)
     assert bank.gain(np.array(TASK.paper_policy.action[0])) == pytest.approx(settled, rel=1e-12)
     # Where the paper's gain lies at the edge of the range, zero keeps room on both sides.
     for keywords in ({"smallest_gain": 0.5}, {"receiver_intensity": 1e-9}):
@@ -720,7 +720,7 @@ def test_settled_gain_is_the_limit_of_the_recursion():
         P = P + 0.0036
         gain = P / (P + 2.0)
         P = loosely_coupled.update_variance(P, 2.0, gain)
-    assert loosely_coupled.settled_gain(0.0036, 2.0) == pytest.approx(gain, rel=1e-12)
+    assert loosely_coupled.steady_state_gain(0.0036, 2.0) == pytest.approx(gain, rel=1e-12)
     # At first order in the step it is K step with K = sqrt(Ge / N).
-    fine = [loosely_coupled.settled_gain(0.36 * h, 0.02 / h) / h for h in (1e-3, 1e-4)]
+    fine = [loosely_coupled.steady_state_gain(0.36 * h, 0.02 / h) / h for h in (1e-3, 1e-4)]
     np.testing.assert_allclose(fine, math.sqrt(18), rtol=3e-3)

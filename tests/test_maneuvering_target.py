@@ -664,7 +664,7 @@ def test_decision_interval_averages_rewards_over_the_same_noise():
 def test_resampled_trajectory_is_exact_for_cubics_and_goes_straight_on():
     time = np.array([0.0, 3.0, 4.0, 9.0, 15.0])
     cubic = np.stack([0.1 * time**3 - time, 5.0 - time**2], axis=1)
-    states = Trajectory(time, cubic).resampled(2.5, 9)
+    states = Trajectory(time, cubic).resample(2.5, 9)
     wanted = 2.5 * np.arange(9)
     inside = np.minimum(wanted, 15.0)
     rate = np.stack([0.3 * inside**2 - 1.0, -2.0 * inside])
@@ -676,11 +676,11 @@ def test_resampled_trajectory_is_exact_for_cubics_and_goes_straight_on():
 def test_resampled_trajectory_runs_through_positions_and_velocities():
     time, position = np.array([10.0, 12.0, 15.0]), np.array([[0.0, 0.0], [3.0, 1.0], [4.0, 8.0]])
     velocity = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, 3.0]])
-    states = Trajectory(time, position, velocity).resampled(1.0, 7)
+    states = Trajectory(time, position, velocity).resample(1.0, 7)
     np.testing.assert_allclose(states[:2, [0, 2, 5]], position.T, rtol=0, atol=1e-12)
     np.testing.assert_allclose(states[2:, [0, 2, 5]], velocity.T, rtol=0, atol=1e-12)
     np.testing.assert_allclose(states[:2, 6], [4.0, 11.0], rtol=1e-12)
-    two_points = Trajectory(np.array([0.0, 10.0]), np.array([[0.0, 0.0], [100.0, -50.0]])).resampled(5.0, 4)
+    two_points = Trajectory(np.array([0.0, 10.0]), np.array([[0.0, 0.0], [100.0, -50.0]])).resample(5.0, 4)
     np.testing.assert_allclose(two_points[0], [0.0, 50.0, 100.0, 150.0], rtol=1e-12)
     np.testing.assert_allclose(two_points[2:, 0], [10.0, -5.0], rtol=1e-12)
     assert Trajectory(time, position).duration == 5.0

@@ -122,7 +122,7 @@ def naive_imm_turn(accelerations, start_rate, change, stay):
                 else:
                     A = coordinated_turn.jacobian(x, dt)
                     Q = coordinated_turn.process_noise(dt, accelerations[2], math.radians(change) / T)
-                    x, P = coordinated_turn.turned(x, dt), A @ P @ A.T + Q
+                    x, P = coordinated_turn.propagate(x, dt), A @ P @ A.T + Q
                     x, P, likelihood = kalman_update(x, P, z, R, H5)
                 updated.append((x, P))
                 log_weights.append(math.log(predicted[j]) + likelihood)
@@ -190,7 +190,7 @@ def test_unscented_filter_equals_filterpys(model):
     def track(x, P):
         points = filterpy.MerweScaledSigmaPoints(5, alpha=1.0, beta=2.0, kappa=0.0)
         peer = filterpy.UnscentedKalmanFilter(
-            5, 2, T, hx=lambda s: s[:2], fx=coordinated_turn.turned, points=points
+            5, 2, T, hx=lambda s: s[:2], fx=coordinated_turn.propagate, points=points
         )
         peer.x, peer.P = padded(x, P, math.radians(start_rate) ** 2)
         z, R, dt = yield
@@ -287,7 +287,7 @@ def test_untuned_values_are_those_in_force():
 
 
 def test_tuned_imm_with_a_turn_beats_the_others_on_fresh_flights():
-    others = [name for name in problem_of(ID).tuned if name != "kalman-imm-turn-tuned"]
+    others = [name for name in problem_of(ID).tuned_policies if name != "kalman-imm-turn-tuned"]
     cost = evaluate(ID, ["kalman-imm-turn-tuned", *others], "random", episodes=300, seed=1).cost
     costs = cost.mean(("episode", "time")).values
     assert costs[0] < 0.95 * costs[1:].min()

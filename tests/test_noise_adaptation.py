@@ -41,7 +41,7 @@ def test_sage_husa_is_the_weighted_mean_of_the_available_samples(b, positive):
 def test_weight_of_a_new_sample_is_that_of_the_paper():
     b, level = 0.95, adaptation.Level(np.zeros(1), np.ones(1))
     for k in range(1, 30):
-        level = adaptation.faded(level, np.ones(1), b)
+        level = adaptation.fading_mean(level, np.ones(1), b)
         assert 1.0 / level.weight[0] == pytest.approx((1 - b) / (1 - b ** (k + 1)), rel=1e-14)
 
 
@@ -175,7 +175,7 @@ def test_process_noise_factor_has_the_true_mean_and_stands_still_without_a_measu
             x[lane], P[lane], predicted, *_ = kalman_step(x[lane], P[lane], R, z, F, level.value[lane] * Q, H)
             corrections[:, lane], updated[:, lane] = x[lane] - predicted, np.diag(P[lane])
         sample = adaptation.process_noise_factor(corrections, updated, carried, unit)
-        level = adaptation.faded(level, sample, 0.998)
+        level = adaptation.fading_mean(level, sample, 0.998)
         level = level._replace(value=np.maximum(level.value, 0.05))
     # Eight episodes of five hundred remembered measurements.
     assert level.value.mean() == pytest.approx(factor, rel=0.1)

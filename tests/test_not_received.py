@@ -111,7 +111,7 @@ def test_shipped_estimators_never_use_what_was_not_received(id, monkeypatch):
     if id in (RADAR, "filtergym/LooselyCoupledNavigation-v0"):
         names.append("kalman-net")
     found = evaluate(id, names, scenario, episodes=4, horizon=horizon)
-    monkeypatch.setattr(catalogue()[id].World, "received", lambda world, measurement: measurement)
+    monkeypatch.setattr(catalogue()[id].World, "mask_missing", lambda world, measurement: measurement)
     known = evaluate(id, names, scenario, episodes=4, horizon=horizon)
     assert np.isfinite(found["error"].values).all()
     for name in ("error", "nees"):

@@ -13,7 +13,7 @@ from filtergym.envs.observation import (
     Block,
     Blocks,
     Quantity,
-    scaled,
+    linear_scale,
 )
 from models import make_model
 
@@ -22,7 +22,7 @@ BLOCKS = (
     Block("b", lambda state, measurement: state.b + measurement, "one number"),
     Block("c", lambda state, _: state.c, "kept as a logarithm", shown=KEPT_AS_LOG1P),
     Block("d", lambda state, _: state.d, "four numbers in two axes", ("1x", "1y", "2x", "2y"), SIGNED_LOG),
-    Block("e", lambda state, _: state.e, "scaled", shown=scaled(0.1, 45.0), unit="10 dB"),
+    Block("e", lambda state, _: state.e, "scaled", shown=linear_scale(0.1, 45.0), unit="10 dB"),
     Block("f", lambda state, _: state.f, "a square", shown=LOG1P),
 )
 QUANTITIES = (

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines import maneuvering_target, tuning
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.baselines.problem import problem_of
@@ -75,7 +75,14 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
 def test_summaries_tell_what_the_evaluation_does(env):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env)
-    kinds = ([known.score_paper], known.estimators, known.smoothers, known.references, known.bounds, shipped_agents(env))
+    kinds = (
+        [known.score_paper],
+        known.estimators,
+        known.smoothers,
+        known.references,
+        known.bounds,
+        pretrained_agents(env),
+    )
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
@@ -90,8 +97,8 @@ def test_summaries_tell_what_the_evaluation_does(env):
     assert set(curves.variables) == set(expected.variables)
     for name in expected.variables:
         np.testing.assert_array_equal(curves[name].values, expected[name].values, err_msg=name)
-    result = benchmark.result_of(problem_of(env), evaluation, records, curves, shipped_agents(env))
-    whole = benchmark.result_of(problem_of(env), dataset, records, expected, shipped_agents(env))
+    result = benchmark.result_of(problem_of(env), evaluation, records, curves, pretrained_agents(env))
+    whole = benchmark.result_of(problem_of(env), dataset, records, expected, pretrained_agents(env))
     assert result.records == whole.records
     assert set(result.track.variables) == set(whole.track.variables)
     for name in whole.track.variables:
@@ -140,7 +147,7 @@ def test_many_episodes_are_reduced_piece_by_piece_with_the_same_bits_in_any_orde
 
 
 def test_distributions_are_of_so_many_measurements_however_they_come(monkeypatch):
-    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTED", 3000)
+    monkeypatch.setattr("filtergym.evaluation.curves.DISTRIBUTION_LIMIT", 3000)
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)
     names = ["imm"]
     curves = filtergym.evaluation.curves.curves_of(evaluate(ENV, names, episodes=100))
@@ -156,7 +163,7 @@ def test_a_benchmark_has_the_same_bits(two, tmp_path, monkeypatch):
     )]  # fmt: skip
     monkeypatch.setattr(benchmark, "cells", lambda *_: cells)
     for folder, workers in (("one", None), ("two", two)):
-        benchmark.run_benchmark(tmp_path / folder, False, 0, workers=workers)
+        benchmark.run_benchmark(tmp_path / folder, benchmark.BenchmarkOptions(), workers=workers)
     assert (tmp_path / "one/results.json").read_bytes() == (tmp_path / "two/results.json").read_bytes()
 
 
@@ -193,15 +200,15 @@ def test_what_waits_is_made_again_when_it_depends_on_something_else(tmp_path, mo
     store = Store(tmp_path / "unfinished")
 
     def read(other):
-        return store.read(work.work_of(other), Summary)
+        return store.read(work.work_of(problem_of(ENV), other), Summary)
 
-    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(asked)])
+    [(_, found)] = summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)])
     assert read(asked).contender.measures == found.contender.measures
     for changed in ({"keywords": {"horizon": 50}}, {"backend": "numpy"}):
         assert read(asked._replace(experiment=replace(asked.experiment, **changed))) is None
     monkeypatch.setattr(TunedValues, "values", lambda self, name: ({"gain": 1.0}, ""))
     assert read(asked) is None
-    assert work.work_of(asked._replace(name="mine.py:Mine")) is None
+    assert work.work_of(problem_of(ENV), asked._replace(name="mine.py:Mine")) is None
     store.clear()
     assert not (tmp_path / "unfinished").exists()
 
@@ -231,7 +238,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
     """The version stays while one works on a policy, and the old one's numbers must not stand in the table."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     store = Store(tmp_path / "unfinished")
-    list(summaries([asked], Workers(), None, store, [work.work_of(asked)]))
+    list(summaries([asked], Workers(), None, store, [work.work_of(problem_of(ENV), asked)]))
     calls = []
     monkeypatch.setattr(tuning, "mean_cost", lambda *given: calls.append(1) or 1.0)
 
@@ -247,7 +254,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 
     assert (search(), search()) == (1, 1)
     edit(file, " ")
-    assert (store.read(work.work_of(asked), Summary) is not None) is same
+    assert (store.read(work.work_of(problem_of(ENV), asked), Summary) is not None) is same
     assert search() == (1 if same else 2)
 
 
@@ -255,7 +262,7 @@ def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
     monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
-    assert work.work_of(asked) is None
+    assert work.work_of(problem_of(ENV), asked) is None
 
 
 def test_an_error_elsewhere_is_the_same_sentence(two):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from filtergym.envs.catalogue import catalogue, find_scenario
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.parameters import declared
+from filtergym.envs.parameters import field_limits
 from filtergym.envs.reward import REWARDS, paper_model
 from filtergym.envs.step_report import step_report
 from models import make_model
@@ -77,7 +77,7 @@ def table(cls, scenario):
             return parameters.value(name)  # UavAutopilot: the plant's own
         return given
 
-    found = {n: extremes(*declared, value(n)) for n, declared in declared(cls.Parameters).items()}
+    found = {n: extremes(*declared, value(n)) for n, declared in field_limits(cls.Parameters).items()}
     return {name: values for name, values in found.items() if values}
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from filtergym.envs.parameters import TaskParameters, parameter, sized, square_matrix
+from filtergym.envs.parameters import TaskParameters, check_length, parameter, square_matrix
 from models import make_model
 
 from filtergym.commands.terminal import parse_settings
@@ -77,7 +77,7 @@ def test_what_is_taken():
 
 def test_sizes_that_depend_on_others():
     with pytest.raises(ValueError, match="sigmas must be 3 numbers, got"):
-        sized("sigmas", (1.0, 2.0), 3)
+        check_length("sigmas", (1.0, 2.0), 3)
     with pytest.raises(ValueError, match="transition must have 2 rows"):
         square_matrix("transition", ((1.0,),), 2)
 

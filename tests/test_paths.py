@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.agents.learned_policy import pretrained_path
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 
 from filtergym import evaluate, make_policy, read_flights, read_recording, record
 
@@ -53,7 +53,7 @@ def test_recordings(flights, tmp_path):
 
 
 def test_agents(tmp_path, monkeypatch):
-    agent = shipped_agents(ENV)[0]
+    agent = pretrained_agents(ENV)[0]
     shutil.copy(pretrained_path(ENV, agent), tmp_path / "mine.safetensors")
     expected = evaluate(ENV, agent, "paper", 2, horizon=8)
     path = tmp_path / "mine.safetensors"

@@ -245,7 +245,7 @@ def flights(draw):
 @given(flights(), st.integers(0, 50))
 def test_valid_flights_resample_to_finite_states_through_every_row(flight, beyond):
     time, position, velocity, interval, places = flight
-    states = Trajectory(time, position, velocity).resampled(interval, places[-1] + 1 + beyond)
+    states = Trajectory(time, position, velocity).resample(interval, places[-1] + 1 + beyond)
     assert states.shape == (4, places[-1] + 1 + beyond)
     assert np.isfinite(states).all()
     # The terms of a spline are larger than its values by the unevenness of the times.

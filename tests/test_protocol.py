@@ -321,7 +321,7 @@ def test_gradients_flow_through_float32():
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
-    monkeypatch.setattr(rendering, "DRAWN", 2)
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 2)
     count, keywords = 4, {"render_mode": "rgb_array", "horizon": 4, "control": "weights"}
     vector = TaskVectorEnv(ID, count, autoreset_mode=mode, **keywords)
     single = TaskEnv(ID, **keywords)
@@ -352,7 +352,7 @@ def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_drawing_leaves_the_episodes_of_every_environment_alone(env_id, short, backend, monkeypatch):
     pytest.importorskip(NEEDED[backend])
-    monkeypatch.setattr(rendering, "DRAWN", 1)
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
     plain, drawn = (
         gym.make_vec(env_id, num_envs=2, backend=backend, render_mode=mode, **short)
         for mode in (None, "rgb_array")
@@ -424,7 +424,7 @@ def test_copies_are_drawn_alike(env_id, short):
 
 
 def test_copies_of_vectors_are_drawn_alike(monkeypatch):
-    monkeypatch.setattr(rendering, "DRAWN", 1)
+    monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
     env = gym.make_vec(ID, num_envs=2, render_mode="rgb_array", horizon=5)
     again = assert_drawn_alike(env, WAYS["pickle"])
     # Closed and drawn again, it can be copied as before.

@@ -556,7 +556,7 @@ def test_picture_shows_accelerations_decisions_and_the_change():
     assert (numpy.flatnonzero(used | refused) % 4 == 3).all()
     assert (used | refused).any()
     change = int(numpy.flatnonzero(numpy.diff(history["true_class"]))[0]) + 2
-    assert panels.shaded() == [(change - 0.5, 120.5)]
+    assert panels.shading() == [(change - 0.5, 120.5)]
     world.reset(seed=3)
     assert (world.render() != frame).any()
     world.close()

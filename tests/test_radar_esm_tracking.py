@@ -130,10 +130,10 @@ def test_one_type_makes_the_printed_rule_sure_and_wrong_and_the_joint_posterior_
     p = model.task.parameters
     *_, (_, _, state) = roll(model, draw(model, 4000, 7))
     floor = numpy.array(p.composition)
-    joint = class_fusion.fixed_type_log_likelihood(
+    joint = class_fusion.constant_class_log_likelihood(
         state.filter.used_counts, numpy.log(numpy.array(p.recognition)), numpy.log(floor)
     )
-    repaired = imm.normalised_exponential(state.filter.accumulated + joint)
+    repaired = imm.softmax(state.filter.accumulated + joint)
     wrong = state.truth.target_class != numpy.arange(3)[:, None]
 
     def sure_and_wrong(P):

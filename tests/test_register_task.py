@@ -20,6 +20,7 @@ from filtergym.envs.maneuvering_target.task import ManeuveringTarget
 from filtergym.envs.observation import Block, Quantity
 from filtergym.envs.task import Task
 from filtergym.evaluation.competitors import ConstantPolicy
+from filtergym.evaluation.parallel import Workers
 from models import make_model
 
 import filtergym
@@ -72,8 +73,8 @@ def turns():
 
 
 def forget(id):
-    registration.ADDED.pop(id, None)
-    baselines.ADDED.pop(id, None)
+    registration.USER_TASKS.pop(id, None)
+    baselines.USER_BASELINES.pop(id, None)
     gymnasium.registry.pop(id, None)
 
 
@@ -94,7 +95,7 @@ def test_gymnasium_makes_and_renders_it(package):
     vector = gymnasium.make_vec(ID, num_envs=3, control="gain", horizon=5)
     np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
     assert "mine/Turns-v0" in catalogue()
-    assert "mine/Turns-v0" not in filtergym.envs.catalogue._shipped_tasks()
+    assert "mine/Turns-v0" not in filtergym.envs.catalogue._builtin_tasks()
 
 
 def test_a_spawned_process_finds_it(package):
@@ -113,6 +114,28 @@ def test_a_problem_goes_to_another_process_by_its_name(package):
     sys.modules.pop("turns_package")
     forget("mine/Turns-v0")
     assert pickle.loads(packed).id == "mine/Turns-v0"
+
+
+def test_an_experiment_goes_to_another_process_by_the_name_of_its_task(package):
+    experiment = import_problem(ID).experiment("paper", 3, seed=2, keywords={"horizon": 20})
+    assert pickle.loads(pickle.dumps(experiment)) == experiment
+    packed = pickle.dumps(experiment)
+    sys.modules.pop("turns_package")
+    forget("mine/Turns-v0")
+    found = pickle.loads(packed)
+    assert found.task is not experiment.task  # its module was imported anew
+    assert found.task is task_class("mine/Turns-v0")
+    assert replace(found, task=experiment.task) == experiment
+
+
+def test_an_environment_of_the_program_that_runs_is_not_sent(turns):
+    turns.__module__ = "__main__"
+    filtergym.register_task(turns)
+    with (
+        Workers(2) as two,
+        pytest.raises(ValueError, match=r"^mine/Turns-v0 is registered by the program that runs"),
+    ):
+        filtergym.evaluate(turns.id, ["random"], episodes=2, workers=two)
 
 
 def test_evaluation_without_baselines(package):

@@ -9,6 +9,7 @@ import gymnasium
 import numpy
 import pytest
 from filtergym.envs import rendering
+from filtergym.envs.catalogue import task_class
 from filtergym.envs.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
 from filtergym.envs.model import Model
@@ -155,9 +156,9 @@ def test_history_is_what_info_reports():
 
 def test_manoeuvres_are_marked_where_they_are_flown():
     env = played(0, scenario="paper")
-    assert env.picture.picture.shaded() == [(49.5, 55.5)]
+    assert env.picture.picture.shading() == [(49.5, 55.5)]
     straight = played(0, scenario="paper", acceleration=(0.0, 0.0))
-    assert straight.picture.picture.shaded() == []
+    assert straight.picture.picture.shading() == []
 
 
 def test_ellipse_axes_of_a_turned_covariance():
@@ -262,7 +263,9 @@ def test_human_mode_draws_each_step_into_one_window(monkeypatch):
 def test_animation_is_a_small_looping_file(tmp_path):
     from PIL import Image
 
-    frames = episode_frames(ID, "imm", competitor(ID, "imm"), "paper", seed=3, every=5, horizon=21)
+    frames = episode_frames(
+        task_class(ID), "imm", competitor(ID, "imm"), "paper", seed=3, every=5, horizon=21
+    )
     assert len(frames) == 6  # the reset, scans 5, 10, 15, 20, and the last
     path = tmp_path / "new" / "imm.gif"
     write_animation(frames, path)
@@ -272,7 +275,7 @@ def test_animation_is_a_small_looping_file(tmp_path):
         assert image.size == (960, 608)
         assert image.info["loop"] == 0
     with pytest.raises(ValueError, match="does not act"):
-        episode_frames(ID, "known-turn", competitor(ID, "known-turn"))
+        episode_frames(task_class(ID), "known-turn", competitor(ID, "known-turn"))
 
 
 def test_steps_that_nobody_looks_at_are_drawn_when_somebody_does(env_id, short):

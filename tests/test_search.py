@@ -17,7 +17,7 @@ from filtergym.agents.search import (
     read_space,
     run_folder,
     search_hyperparameters,
-    suggested,
+    suggest_hyperparameters,
 )
 from filtergym.agents.training_run import RunOptions, load_run, new_run, save_run
 from filtergym.baselines.problem import problem_of
@@ -154,7 +154,7 @@ def test_shipped_spaces_are_of_settings_that_there_are(algorithm):
         study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
         shown = catalogue().get(id, catalogue()[ID]).id
         for _ in range(4):
-            chosen = suggested(study.ask(), space)
+            chosen = suggest_hyperparameters(study.ask(), space)
             run = new_run(problem_of(shown), RunOptions(algorithm, overrides=chosen))
             rollout = run.envs * chosen.get("n_steps", 0)
             assert rollout % chosen.get("batch_size", 1) == 0

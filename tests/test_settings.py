@@ -22,7 +22,7 @@ from filtergym.agents.adapter import to_sb3
 from filtergym.agents.bptt import train_bptt
 from filtergym.agents.export import export_run
 from filtergym.agents.sb3_training import train_sb3, training_environment
-from filtergym.agents.settings import merged, parse_settings, read_config
+from filtergym.agents.settings import merge_settings, parse_settings, read_config
 from filtergym.agents.training_run import (
     RunOptions,
     Session,
@@ -91,7 +91,7 @@ def test_what_is_no_yaml_is_refused():
 
 
 def test_mappings_are_merged_key_by_key():
-    assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"c": 4}, "d": {"e": 5}}) == {
+    assert merge_settings({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"c": 4}, "d": {"e": 5}}) == {
         "a": {"b": 1, "c": 4},
         "d": {"e": 5},
     }

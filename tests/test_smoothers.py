@@ -28,7 +28,7 @@ from filtergym.reports.benchmark import result_of
 from filtergym.reports.html_report import report_html
 from filtergym.reports.ranking import best_of_origins, ranking, ranking_sentence, verdict
 from filtergym.reports.results import Settings
-from filtergym.reports.tables import ranked, results_tables
+from filtergym.reports.tables import rank_competitors, results_tables
 
 TARGET = "filtergym/ManeuveringTarget-v0"
 SMOOTHERS = baselines_of(TARGET).smoothers
@@ -96,7 +96,7 @@ def test_the_whole_track_is_its_least_squares_solution():
 
 def test_smoothers_are_marked_and_never_ranked():
     names = ["imm", "kalman-imm", "imm-smoother", "imm-lag-5", "known-turn"]
-    found = evaluate(TARGET, names, scenario="paper", episodes=30, paper="imm", reference="known-turn")
+    found = evaluate(TARGET, names, scenario="paper", episodes=30)
     records = tidy_records(found)
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
     assert min(cost, key=cost.get) == "imm-smoother"
@@ -109,7 +109,7 @@ def test_smoothers_are_marked_and_never_ranked():
     assert ranking_sentence(records, "imm").startswith("On `paper` `kalman-imm` (estimator) costs least")
     tables = results_tables(records, problem_of(TARGET).knows, 200)
     assert "Not causal, with later measurements: imm-smoother, imm-lag-5." in tables[-1].caption
-    assert [name for name, *_ in ranked(records)] == [
+    assert [name for name, *_ in rank_competitors(records)] == [
         "kalman-imm",
         "imm",
         "imm-smoother",
@@ -266,9 +266,7 @@ def test_a_table_of_baselines_names_smoothers_as_what_they_are():
 
 def test_reports_mark_smoothers_and_compare_them_with_nobody():
     names = ["imm", "kalman-imm", "imm-smoother", "known-turn"]
-    dataset = evaluate(
-        TARGET, names, scenario="paper", episodes=20, paper="imm", reference="known-turn", drawn_episodes=1
-    )
+    dataset = evaluate(TARGET, names, scenario="paper", episodes=20, drawn_episodes=1)
     found = result_of(problem_of(TARGET), dataset, tidy_records(dataset), curves_of(dataset), [])
     assert [origin for origin, _ in best_of_origins(found)] == ["estimator", "paper", "reference"]
     assert "imm-smoother" not in " ".join(verdict([found]))

@@ -3,10 +3,10 @@
 import numpy
 
 from ...envs.model import Model
-from ...envs.observation import signed_logarithm
+from ...envs.observation import symlog
 from ..alarm import Alarm, innovation_evidence
 
-COMPRESSED = 0.38684360137
+SYMLOG_VARIANCE = 0.38684360137
 """Variance of the signed logarithm of a standard normal number."""
 
 
@@ -30,6 +30,6 @@ class FusionAlarm(Alarm):
         # Shown is the mean over a decision's measurements of the compressed value.
         measurements = self.measurements(before)
         count = numpy.maximum(available * measurements, 1.0)
-        mean = signed_logarithm(innovation, numpy) * measurements / numpy.sqrt(count * COMPRESSED)
+        mean = symlog(innovation, numpy) * measurements / numpy.sqrt(count * SYMLOG_VARIANCE)
         normalised = numpy.where(measurements > 1, mean, innovation)
         return innovation_evidence(normalised, numpy.broadcast_to(available > 0.0, normalised.shape))

@@ -13,7 +13,7 @@ from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigati
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import Array, namespace
 from ...filters.ordered_sums import ordered_sum
-from ..measurement_noise import RULES, MeasurementNoise, chosen
+from ..measurement_noise import RULES, MeasurementNoise, select_memory
 from ..table import Tunable, Variant, tunable
 
 WINDOW = 25.0
@@ -75,12 +75,12 @@ class AugmentedFilter:
             none: zeros, ``(A, N)``.
         """
         p, zero = self.parameters, none[0]
-        return AugmentedMemory(none, none, p.modelled_prior(zero), zero, self.noise.start(zero), zero)
+        return AugmentedMemory(none, none, p.prior_covariance(zero), zero, self.noise.start(zero), zero)
 
     def predict(self, memory: AugmentedMemory) -> tuple[Array, AugmentedMemory]:
         """Displacement that the rate errors make in a step, m, ``(A, N)``, and memory."""
         p, s = self.parameters, self.parameters.sampling
-        P = ins_gnss.predict_augmented(memory.covariance, s, *p.modelled_growth)
+        P = ins_gnss.predict_augmented(memory.covariance, s, *p.variance_growth)
         displacement = s.step * memory.drift + s.drive * memory.coloured
         return displacement, memory._replace(coloured=s.decay * memory.coloured, covariance=P)
 
@@ -96,7 +96,7 @@ class AugmentedFilter:
             available: one where there is a measurement, ``(N,)``.
         """
         xp = namespace(innovation)
-        noise = chosen(reported != memory.reported, self.noise.start(reported), memory.noise)
+        noise = select_memory(reported != memory.reported, self.noise.start(reported), memory.noise)
         size = xp.sqrt(ordered_sum(innovation * innovation) / innovation.shape[0])
         R, noise = self.noise.update(noise, size, memory.covariance.position, reported, available)
         K, P = ins_gnss.update_augmented(memory.covariance, R, available)

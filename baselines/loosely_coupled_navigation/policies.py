@@ -18,7 +18,7 @@ from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, sums_of_present
 from ...evaluation.own_metrics import Gathered, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
-from ..measurement_noise import MeasurementNoise, chosen
+from ..measurement_noise import MeasurementNoise, select_memory
 from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
@@ -55,7 +55,7 @@ class PlainWhite(FixedGain):
     """Settled gain for the white part of the INS noise only, ``Ge = G``."""
 
     def __init__(self, model: Model) -> None:
-        super().__init__(model, model.task.parameters.settled_gains[0])
+        super().__init__(model, model.task.parameters.steady_state_gains[0])
 
 
 class BestConstant(FixedGain):
@@ -67,7 +67,7 @@ class BestConstant(FixedGain):
             levels = (p.drift, p.coloured, p.correlation_time, p.white_intensity, p.receiver_intensity)
             K = ins_gnss.best_constant_gain(*levels)
             growth = K * K * p.receiver_intensity * p.sampling_interval
-            gain = float(ins_gnss.settled_gain(growth, p.receiver_variance))
+            gain = float(ins_gnss.steady_state_gain(growth, p.receiver_variance))
         super().__init__(model, gain)
 
 
@@ -197,7 +197,7 @@ class AugmentedGain(TimeVarying):
         none = numpy.zeros((p.axes, len(observation)))
         memory = _Offset(none, self.filter.start(none))
         if state is not None:
-            memory = chosen(start, memory, state)
+            memory = select_memory(start, memory, state)
         reported = self.reported_variance(observation)[:, 0]
         available = numpy.where(self.available(observation)[:, 0] > 0.5, 1.0, 0.0)
         innovation = self.innovation(observation).T
@@ -216,9 +216,9 @@ class AugmentedGain(TimeVarying):
 
 # --- metrics of one's own
 
-RECOVERED = 0.25
+RECOVERY_ERROR = 0.25
 """Error over the nominal standard deviation of a measurement, for each axis, below which a run has recovered."""
-HELD = 0.1
+HOLD_TIME = 0.1
 """Time for which it must stay below, s: shorter than the memory of any sensible gain, long for noise."""
 LONGEST = 1.0
 """Time after the outage that is looked at, s; a run that has not recovered by then counts with it."""
@@ -262,8 +262,8 @@ def _recoveries(run: xarray.Dataset) -> Gathered:
     scenario = cls.scenarios.get(run.attrs["scenario"])
     parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **keywords_of(run)})
     size = numpy.sqrt((run["error"].values ** 2).sum(axis=-1))
-    limit = RECOVERED * math.sqrt(parameters.receiver_variance * parameters.axes)
-    held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HELD, LONGEST))
+    limit = RECOVERY_ERROR * math.sqrt(parameters.receiver_variance * parameters.axes)
+    held, longest = (max(round(t / parameters.sampling_interval), 1) for t in (HOLD_TIME, LONGEST))
     times = recovery_times(size, run["available"].values, limit, held, longest)
     lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
     found = {"time": times * parameters.sampling_interval, "lost": lost}

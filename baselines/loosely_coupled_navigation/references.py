@@ -51,7 +51,7 @@ class Matched:
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
         return ErrorState(still, still, still, P)
 
-    def filtered(
+    def predict_and_update(
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[ErrorState, Likelihood]:
         """Predict with the true noise levels and update with the true variance of the measurement."""
@@ -75,7 +75,7 @@ class Matched:
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[Array, Array, ErrorState, Likelihood]:
         """Report the INS less its estimated error."""
-        memory, likelihood = self.filtered(measurement, truth, memory)
+        memory, likelihood = self.predict_and_update(measurement, truth, memory)
         return measurement.ins - memory.delta, self.eye * memory.covariance.position, memory, likelihood
 
 
@@ -88,5 +88,5 @@ class MatchedCovariance(Matched):
         self, measurement: Measurement, truth: Truth, memory: ErrorState
     ) -> tuple[Array, ErrorState]:
         """Variance of every axis, ``(A, N)``."""
-        memory, _ = self.filtered(measurement, truth, memory)
+        memory, _ = self.predict_and_update(measurement, truth, memory)
         return memory.covariance.position + 0.0 * memory.delta, memory

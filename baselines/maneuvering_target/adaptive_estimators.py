@@ -53,12 +53,12 @@ class SageHusa(KalmanModel):
         F, unit = self.motion(measurement.interval)
         mean, carried = kalman.predict(memory.mean, memory.covariance, F, 0.0 * unit)
         predicted = carried + unit * memory.level.value
-        result = self.updated((mean, predicted), measurement)
+        result = self.update_estimate((mean, predicted), measurement)
         sample = noise_adaptation.process_noise_factor(
             result.mean - mean,
             *(self.diagonal(P) for P in (result.covariance, carried, unit)),
         )
-        level = noise_adaptation.faded(memory.level, sample, self.forgetting, measurement.available)
+        level = noise_adaptation.fading_mean(memory.level, sample, self.forgetting, measurement.available)
         level = level._replace(value=self.xp.clip(level.value, self.least, None))
         track = ProcessNoiseTrack(result.mean, result.covariance, level)
         return result.mean, result.covariance, track, self.likelihood(measurement, *result[2:])
@@ -117,7 +117,7 @@ class VariationalBayes(KalmanModel):
         predicted = kalman.predict(memory.mean, memory.covariance, F, self.variance * unit)
 
         def update(factor: Array) -> tuple[Array, Array, kalman.Update]:
-            result = self.updated(predicted, measurement._replace(variance=factor * variance))
+            result = self.update_estimate(predicted, measurement._replace(variance=factor * variance))
             updated = xp.stack([result.covariance[0, 0], result.covariance[1, 1]])
             residual = xp.where(available > 0.0, measurement.position - result.mean[:2], 0.0)
             return residual / xp.sqrt(variance), updated / variance, result
@@ -165,6 +165,6 @@ class VariationalBayesPrediction(KalmanModel):
             self.strength,
             self.iterations,
         )
-        estimate = self.seen(measurement, Initial(result.mean, result.covariance), predicted)
-        nominal = self.updated(predicted, measurement)
+        estimate = self.where_detected(measurement, Initial(result.mean, result.covariance), predicted)
+        nominal = self.update_estimate(predicted, measurement)
         return *estimate, estimate, self.likelihood(measurement, *nominal[2:])

@@ -43,18 +43,18 @@ class KalmanModel:
         by_acceleration = self.xp.stack([0.5 * T**2, 0.5 * T**2, T, T])
         return self.unmoved + T * self.moved, self.correlated * outer(by_acceleration, by_acceleration)
 
-    def seen(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
+    def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
         """One of two tuples of arrays where the scan saw the target, the other where it missed it."""
         there = measurement.available > 0.0
         parts = zip(then, otherwise, strict=True)
         return type(then)(*(self.xp.where(there, seen, missed) for seen, missed in parts))
 
-    def updated(self, predicted: tuple[Array, Array], measurement: Measurement) -> kalman.Update:
+    def update_estimate(self, predicted: tuple[Array, Array], measurement: Measurement) -> kalman.Update:
         """Kalman's update of a predicted mean and covariance with the measured position, or these themselves, which say
         nothing of how likely they are.
         """
         result = kalman.update(*predicted, measurement.position, self.H, self.identity * measurement.variance)
-        return self.seen(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
+        return self.where_detected(measurement, result, kalman.Update(*predicted, 0.0, 0.0))
 
     def likelihood(self, measurement: Measurement, log_likelihood: Array, nis: Array) -> Likelihood:
         """How well a scan was predicted; NaN where it missed the target."""
@@ -98,22 +98,26 @@ class KalmanInteractingMultipleModel(KalmanModel):
         lasting = [1.0 / (1.0 - probability) for probability in stay]
         self.probabilities = task.constant([scans / sum(lasting) for scans in lasting])
 
-    def augmented(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Give an estimate of position and velocity the state in which the filters are mixed."""
         return mean, covariance
 
-    def filtered(self, mean: Array, covariance: Array, measurement: Measurement) -> list[kalman.Update]:
+    def predict_and_update(
+        self, mean: Array, covariance: Array, measurement: Measurement
+    ) -> list[kalman.Update]:
         """Predict and update every filter from its mixed state ``(n, M, N)``."""
         F, Q = self.motion(measurement.interval)
         return [
-            self.updated(kalman.predict(mean[:, j], covariance[:, :, j], F, variance * Q), measurement)
+            self.update_estimate(
+                kalman.predict(mean[:, j], covariance[:, :, j], F, variance * Q), measurement
+            )
             for j, variance in enumerate(self.variances)
         ]
 
     def start(self, initial: Initial, N: int) -> KalmanBank:
         """Start all filters where everyone starts."""
         xp, M = self.xp, self.probabilities.shape[0]
-        mean, covariance = self.augmented(initial.mean, initial.covariance)
+        mean, covariance = self.augment(initial.mean, initial.covariance)
         return KalmanBank(
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
@@ -127,7 +131,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         xp = self.xp
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
         mixed = imm.mix(memory.mean, memory.covariance, prediction.mixing)
-        results = self.filtered(*mixed, measurement)
+        results = self.predict_and_update(*mixed, measurement)
         log_likelihood = xp.stack([r.log_likelihood for r in results])
         log_predicted = imm.log_probabilities(prediction.probabilities)
         probabilities = imm.mode_posterior(log_predicted, log_likelihood)
@@ -160,9 +164,9 @@ class TurnModel(KalmanModel):
     def noise(self, T: Array) -> Array:
         """Covariance of the process noise over intervals, s, ``(5, 5, N)``."""
         Q = self.variance * self.motion(T)[1]
-        return coordinated_turn.augmented(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
+        return coordinated_turn.augment_turn_rate(0.0 * Q[0], Q, (T * self.change) ** 2)[1]
 
-    def predicted(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
+    def predict_turn(self, mean: Array, covariance: Array, T: Array) -> tuple[Array, Array]:
         """Time update over intervals, s, by the extended Kalman filter."""
         return coordinated_turn.predict(mean, covariance, T, self.noise(T))
 
@@ -195,18 +199,20 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
         self.turn = TurnModel(task, accelerations[2], turn_rate_change)
         self.turn_variance = math.radians(turn_rate_start) ** 2
 
-    def augmented(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
+    def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Add the turn rate of straight flight."""
-        return coordinated_turn.augmented(mean, covariance, self.turn_variance)
+        return coordinated_turn.augment_turn_rate(mean, covariance, self.turn_variance)
 
-    def filtered(self, mean: Array, covariance: Array, measurement: Measurement) -> list[kalman.Update]:
+    def predict_and_update(
+        self, mean: Array, covariance: Array, measurement: Measurement
+    ) -> list[kalman.Update]:
         """Predict and update every filter from its mixed state ``(5, 3, N)``."""
         results = []
-        for straight in super().filtered(mean[:4], covariance[:4, :4], measurement):
-            mean5, covariance5 = self.augmented(straight.mean, straight.covariance)
+        for straight in super().predict_and_update(mean[:4], covariance[:4, :4], measurement):
+            mean5, covariance5 = self.augment(straight.mean, straight.covariance)
             results.append(straight._replace(mean=mean5, covariance=covariance5))
-        predicted = self.turn.predicted(mean[:, 2], covariance[:, :, 2], measurement.interval)
-        return [*results, self.turn.updated(predicted, measurement)]
+        predicted = self.turn.predict_turn(mean[:, 2], covariance[:, :, 2], measurement.interval)
+        return [*results, self.turn.update_estimate(predicted, measurement)]
 
 
 class UnscentedTurn(TurnModel):
@@ -235,15 +241,17 @@ class UnscentedTurn(TurnModel):
 
     def start(self, initial: Initial, N: int) -> Initial:
         """Start where everyone starts, with a turn rate about zero."""
-        return Initial(*coordinated_turn.augmented(initial.mean, initial.covariance, self.turn_variance))
+        return Initial(
+            *coordinated_turn.augment_turn_rate(initial.mean, initial.covariance, self.turn_variance)
+        )
 
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Carry the sigma points through the turn and update with the measured position."""
         T = measurement.interval
         mean, covariance = unscented.transform(
-            memory.mean, memory.covariance, lambda points: coordinated_turn.turned(points, T)
+            memory.mean, memory.covariance, lambda points: coordinated_turn.propagate(points, T)
         )
-        result = self.updated((mean, covariance + self.noise(T)), measurement)
+        result = self.update_estimate((mean, covariance + self.noise(T)), measurement)
         return (
             result.mean[:4],
             result.covariance[:4, :4],

@@ -140,7 +140,7 @@ def _gains(values: Mapping[str, float]) -> tuple[float, float]:
     return min(values["low"], values["high"]), max(values["low"], values["high"])
 
 
-def _tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+def _make_tuned_imm(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     stay = values["stay_low"], values["stay_high"]
     transition = ((stay[0], 1.0 - stay[0]), (1.0 - stay[1], stay[1]))
     return {"gains": _gains(values), "transition": transition}, InteractingMultipleModel
@@ -159,7 +159,7 @@ _GAINS = {"low": (0.05, 0.3, 0.5), "high": (0.4, 0.7, 0.95)}
 TUNABLE = {
     "imm": tunable(
         InteractingMultipleModel,
-        _tuned_imm,
+        _make_tuned_imm,
         **_GAINS,
         stay_low=(0.5, 0.9, 0.999),
         stay_high=(0.3, 0.9, 0.999),

@@ -43,7 +43,9 @@ class KnownTurn(KalmanModel):
         F, unit = self.motion(T)
         change = (truth.velocity - memory.velocity) / T
         variance = 0.5 * (change[0] ** 2 + change[1] ** 2)
-        result = self.updated(kalman.predict(memory.mean, memory.covariance, F, variance * unit), measurement)
+        result = self.update_estimate(
+            kalman.predict(memory.mean, memory.covariance, F, variance * unit), measurement
+        )
         memory = TurnMemory(result.mean, result.covariance, truth.velocity)
         return result.mean, result.covariance, memory, self.likelihood(measurement, *result[2:])
 
@@ -64,7 +66,7 @@ class KnownInputBound(KalmanModel):
         """
         world, p = self.task.world, self.task.parameters
         assert isinstance(world, RadarWorld)
-        predicted = bounds.predicted_bound(memory, self.motion(measurement.interval)[0])
+        predicted = bounds.predict_bound(memory, self.motion(measurement.interval)[0])
         variance = polar.cartesian_variances(truth.position, p.range_sigma, world.bearing_sigma)
         P = bounds.posterior_cramer_rao_bound(predicted, self.H, self.identity * variance)
         P = self.xp.where(measurement.available > 0.0, P, predicted)

@@ -45,7 +45,7 @@ class ConstantVelocitySmoother(KalmanModel):
     def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
         """Predict and update."""
         F, unit = self.motion(measurement.interval)
-        result = self.updated(kalman.predict(*memory, F, self.variance * unit), measurement)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * unit), measurement)
         filtered = Initial(result.mean, result.covariance)
         return *filtered, filtered, self.likelihood(measurement, *result[2:])
 
@@ -55,9 +55,9 @@ class ConstantVelocitySmoother(KalmanModel):
 
     def smooth(self, measurements: Sequence[Measurement], memories: Sequence[Initial]) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.Estimate(*smoothing.stacked(memories))
+        filtered = smoothing.Estimate(*smoothing.stack_scans(memories))
         motion = smoothing.over_time(
-            self._motion, smoothing.but_last(filtered.mean), smoothing.stacked(measurements)
+            self._motion, smoothing.drop_last(filtered.mean), smoothing.stack_scans(measurements)
         )
         smoothed = smoothing.smooth(filtered, motion, self.lag)
         return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
@@ -108,9 +108,9 @@ class KalmanIMMSmoother(KalmanInteractingMultipleModel):
         self, measurements: Sequence[Measurement], memories: Sequence[KalmanBank]
     ) -> tuple[Array, Array]:
         """Smooth the whole track, or with the lag."""
-        filtered = smoothing.Bank(*smoothing.stacked(memories))
+        filtered = smoothing.Bank(*smoothing.stack_scans(memories))
         arrival = smoothing.over_time(
-            self._arrival, smoothing.but_last(filtered), smoothing.stacked(measurements)
+            self._arrival, smoothing.drop_last(filtered), smoothing.stack_scans(measurements)
         )
         bank = smoothing.smooth_imm(filtered, arrival, self.transition, self.lag)
         mean, covariance = imm.combine(*bank)
@@ -134,9 +134,9 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
         xp = self.xp
         F, unit = self.motion(T)
         nothing = 0.0 * unit[0]
-        straight = coordinated_turn.augmented(nothing, F, 0.0)[1]
+        straight = coordinated_turn.augment_turn_rate(nothing, F, 0.0)[1]
         noises = [
-            coordinated_turn.augmented(nothing, variance * unit, self.turn_variance)[1]
+            coordinated_turn.augment_turn_rate(nothing, variance * unit, self.turn_variance)[1]
             for variance in self.variances
         ]
         turning = coordinated_turn.jacobian(mixed[:, 2], T)
@@ -144,7 +144,7 @@ class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleMode
         return smoothing.Motion(
             xp.stack([straight, straight, turning], axis=2),
             xp.stack([*noises, self.turn.noise(T)], axis=2),
-            xp.stack([*predicted, coordinated_turn.turned(mixed[:, 2], T)], axis=1),
+            xp.stack([*predicted, coordinated_turn.propagate(mixed[:, 2], T)], axis=1),
         )
 
 

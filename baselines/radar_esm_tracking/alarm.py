@@ -9,9 +9,9 @@ from ...envs.radar_esm_tracking.banks import COUNT_SHOWN
 from ...filters import class_fusion, imm
 from ..alarm import Alarm
 
-REFUSED = 0.5
+REFUSAL_SHARE = 0.5
 """Share of decisions that the gate refuses where a second emitter is heard; ours."""
-EXPLAINED = 9.2
+NIS_LIMIT = 9.2
 """Normalised innovation squared of two channels that one scan in a hundred exceeds: beyond it no class explains it."""
 MOST = 2.0
 """Nats that one scan may tell for another class; ours, so that one outlier raises no alarm."""
@@ -48,21 +48,21 @@ class ClassAlarm(Alarm):
         likelihood = numpy.exp(self.log_likelihood(observation))
         expected = (self.last_weight(observation) * likelihood).sum(axis=1)
         another = numpy.log(likelihood.mean(axis=1) / numpy.maximum(expected, LEAST))
-        explained = self.squared(observation).min(axis=1) < EXPLAINED
+        explained = self.squared(observation).min(axis=1) < NIS_LIMIT
         another = numpy.where(explained, numpy.minimum(another, MOST), 0.0)
         used, refused = (numpy.nan_to_num(read(before)) for read in (self.used_count, self.refused_count))
         new_used, new_refused = self.used_count(observation), self.refused_count(observation)
         one_type = self._one_type(new_used) - self._one_type(used)
         refusals = COUNT_SHOWN * (
-            (new_refused - refused).sum(axis=1) * math.log(REFUSED / self.refusal)
-            + (new_used - used).sum(axis=1) * math.log((1.0 - REFUSED) / (1.0 - self.refusal))
+            (new_refused - refused).sum(axis=1) * math.log(REFUSAL_SHARE / self.refusal)
+            + (new_used - used).sum(axis=1) * math.log((1.0 - REFUSAL_SHARE) / (1.0 - self.refusal))
         )
         return numpy.stack([another, one_type, refusals], axis=1)
 
     def _one_type(self, used_count: numpy.ndarray) -> numpy.ndarray:
         """Log-likelihood ratio of one type to types drawn anew, of all decisions so far."""
         counts = COUNT_SHOWN * used_count.T
-        fixed = class_fusion.fixed_type_log_likelihood(counts, self.log_recognition, self.log_composition)
+        fixed = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         redrawn = self.log_esm @ counts
         return numpy.logaddexp.reduce(self.log_prior + fixed) - numpy.logaddexp.reduce(
             self.log_prior + redrawn

@@ -68,7 +68,7 @@ class _Posterior(Policy):
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """State the probabilities as weights."""
-        return imm.normalised_exponential(self.log_posterior(observation)).T, None
+        return imm.softmax(self.log_posterior(observation)).T, None
 
 
 class RadarOnly(_Posterior):
@@ -129,7 +129,7 @@ class JointType(_Posterior):
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Prior, radar, and all decisions as statements about one type."""
         counts = self.esm * self.counts(observation, self.refused)
-        esm = class_fusion.fixed_type_log_likelihood(counts, self.log_recognition, self.log_composition)
+        esm = class_fusion.constant_class_log_likelihood(counts, self.log_recognition, self.log_composition)
         return self.log_prior + self.radar(observation) + esm
 
 
@@ -158,9 +158,7 @@ class ForgettingJointType(JointType):
         joint = class_fusion.change_class_and_type(joint, self.log_composition, self.change)
         new_counts = counts - numpy.where(start, 0.0, last_counts)
         joint = joint + apply(self.log_recognition[..., None], new_counts)
-        weights = (
-            imm.normalised_exponential(joint.reshape(-1, joint.shape[-1])).reshape(joint.shape).sum(axis=1)
-        )
+        weights = imm.softmax(joint.reshape(-1, joint.shape[-1])).reshape(joint.shape).sum(axis=1)
         return weights.T, (joint, radar, counts)
 
 
@@ -193,7 +191,7 @@ class Leaky(_Posterior):
         return imm.log_probabilities(predicted) + self.esm * (self.log_esm @ usable.T)
 
 
-def _fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+def _make_fixed_weights(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     weights = tuple(values[name] for name in ("S0", "S1", "S2"))
     return {}, lambda model: FixedWeights(model, weights)
 
@@ -202,7 +200,7 @@ _COUNTS = {"refused": (0.0, 0.0, 1.0), "esm": (0.0, 1.0, 1.0)}
 
 TUNABLE = {
     "fixed-weights": tunable(
-        FixedWeights, _fixed_weights, S0=(0.0, 1.0, 1.0), S1=(0.0, 1.0, 1.0), S2=(0.0, 1.0, 1.0)
+        FixedWeights, _make_fixed_weights, S0=(0.0, 1.0, 1.0), S1=(0.0, 1.0, 1.0), S2=(0.0, 1.0, 1.0)
     ),
     "leaky": tunable(Leaky, log10_leak=(-6.0, -2.0, -0.5), esm=(0.0, 1.0, 1.0)),
     "joint-type": tunable(JointType, **_COUNTS),

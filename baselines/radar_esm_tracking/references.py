@@ -66,7 +66,7 @@ class KnownClassBound(_KnownClass):
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
         """Bound after this scan: the diagonal of the covariance."""
         models, governed = self.task.models, memory.target_class
-        P = bounds.predicted_bound(
+        P = bounds.predict_bound(
             memory.covariance, self.of(models.Phi, governed), self.of(models.Q, governed)
         )
         P = bounds.posterior_cramer_rao_bound(P, models.H, models.R)

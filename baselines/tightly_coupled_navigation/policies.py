@@ -165,7 +165,7 @@ class StuckCheckFallback(StuckCheck):
 # --- what can be tuned
 
 
-def _fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+def _make_fixed_gain(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     # The other two groups change nothing that can be measured.
     return {}, lambda model: FixedGain(model, tuple(values.get(s.name, 0.0) for s in model.task.sensors))
 
@@ -175,7 +175,9 @@ def _sticky(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any]
 
 
 TUNABLE = {
-    "fixed-gain": tunable(FixedGain, _fixed_gain, rates=(-0.2, 0.0, 0.3), accelerometers=(0.0, 0.8, 1.0)),
+    "fixed-gain": tunable(
+        FixedGain, _make_fixed_gain, rates=(-0.2, 0.0, 0.3), accelerometers=(0.0, 0.8, 1.0)
+    ),
     "nis-adaptive": tunable(
         NisAdaptive,
         threshold=(0.5, 3.0, 10.0),

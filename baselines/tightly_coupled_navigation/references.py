@@ -55,7 +55,7 @@ class _KnownMode:
         """Start where everyone starts."""
         return Track(initial.mean, initial.covariance, truth.mode)
 
-    def forgotten(self, track: Track, lanes: Array, variance: float) -> Track:
+    def reset_acceleration(self, track: Track, lanes: Array, variance: float) -> Track:
         """Track with an unknown acceleration of some variance in some lanes."""
         xp = self.task.xp
         moved = xp.concat(
@@ -65,7 +65,7 @@ class _KnownMode:
             mean=moved, covariance=_replace_acceleration(track.covariance, variance, self.task, lanes)
         )
 
-    def predicted(self, truth: Truth, track: Track, noises: Array, variance: float) -> Track:
+    def predict_track(self, truth: Truth, track: Track, noises: Array, variance: float) -> Track:
         """Prediction to the present measurement.
 
         Args:
@@ -77,7 +77,7 @@ class _KnownMode:
         xp, task = self.task.xp, self.task
         jumped = truth.jumped > 0.0
         at_once = (truth.mode == SINGER) & (track.mode != SINGER) & ~jumped
-        track = self.forgotten(track, at_once, variance)
+        track = self.reset_acceleration(track, at_once, variance)
         # A jump ends a step that was moved by the hypothesis before it.
         moved_by = xp.where(jumped, track.mode, truth.mode)
         axis = xp.take(self.axis, moved_by, axis=-1)[:, :, None]
@@ -91,9 +91,9 @@ class _KnownMode:
             noise,
         )
         track = Track(mean[:, 0], covariance[:, :, 0], truth.mode)
-        return self.forgotten(track, jumped, variance)
+        return self.reset_acceleration(track, jumped, variance)
 
-    def observed(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
+    def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
         """Readings of a state and the rows of their Jacobian there."""
         return gnss_ins.observe(
             state,
@@ -144,8 +144,8 @@ class KnownMode(_KnownMode):
     ) -> tuple[Array, Array, Track, Likelihood]:
         """Predict under the true hypothesis and update with the sensors that work."""
         xp, task = self.task.xp, self.task
-        track = self.predicted(truth, memory, self.noises, task.parameters.singer_sigma**2)
-        expected, rows = self.observed(measurement, track.mean)
+        track = self.predict_track(truth, memory, self.noises, task.parameters.singer_sigma**2)
+        expected, rows = self.readings_and_jacobian(measurement, track.mean)
         residual = measurement.readings - expected
         ranges = task.sensors[0].readings
         residual = xp.concat([residual[ranges] - truth.range_error, residual[ranges.stop :]])
@@ -188,8 +188,8 @@ class KnownModeBound(_KnownMode):
     def update(self, measurement: Measurement, truth: Truth, memory: Track) -> tuple[Array, Track]:
         """Bound after this measurement: the diagonal of the covariance."""
         xp = self.task.xp
-        track = self.predicted(truth, memory, self.noises, 0.0)
-        expected, rows = self.observed(measurement, truth.state)
+        track = self.predict_track(truth, memory, self.noises, 0.0)
+        expected, rows = self.readings_and_jacobian(measurement, truth.state)
         update = extended_kalman.update_one_by_one(
             track.mean, track.covariance, xp.zeros_like(expected), rows, *self.sensors(measurement, truth)
         )

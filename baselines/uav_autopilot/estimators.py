@@ -95,13 +95,13 @@ class AdaptiveKalman:
         )
         self.n = len(model.F)
 
-    def started(self, initial: Initial) -> Filter:
+    def start_filter(self, initial: Initial) -> Filter:
         """Filter where everyone starts, with sensors as stated."""
         zero = 0.0 * initial.mean[0]
         noise = tuple(self.sensor_noise.start(zero + R) for R in self.task.sensor_variances)
         return Filter(initial.mean, packed_covariance.pack(initial.covariance), noise)
 
-    def filtered(self, before: Filter, measurement: Measurement, factor: Array | float) -> Step:
+    def predict_and_update(self, before: Filter, measurement: Measurement, factor: Array | float) -> Step:
         """Predict with a factor on the disturbance's covariance, and take in one sensor after the other."""
         predicted = self.xp.matmul(self.F, before.mean) + self.B * measurement.control
         carried = self.xp.matmul(self.propagator, before.covariance) + self.other
@@ -126,11 +126,11 @@ class AdaptiveKalman:
 
     def start(self, initial: Initial, N: int) -> Any:
         """Start where everyone starts."""
-        return self.started(initial)
+        return self.start_filter(initial)
 
     def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, gusts as designed."""
-        after, log_likelihood, nis, *_ = self.filtered(memory, measurement, 1.0)
+        after, log_likelihood, nis, *_ = self.predict_and_update(memory, measurement, 1.0)
         likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
         return after.mean, packed_covariance.unpack(after.covariance, self.n), after, likelihood
 
@@ -154,17 +154,19 @@ class AdaptiveGusts(AdaptiveKalman):
     def start(self, initial: Initial, N: int) -> tuple[Filter, adaptation.Level]:
         """Start with gusts as designed."""
         one = 0.0 * initial.mean[0] + 1.0
-        return self.started(initial), adaptation.Level(one, self.gust_memory * one)
+        return self.start_filter(initial), adaptation.Level(one, self.gust_memory * one)
 
     def update(self, measurement: Measurement, memory: Any) -> tuple[Array, Array, Any, Likelihood]:
         """One measurement, and the factor for the next."""
         before, level = memory
-        after, log_likelihood, nis, correction, carried = self.filtered(before, measurement, level.value)
+        after, log_likelihood, nis, correction, carried = self.predict_and_update(
+            before, measurement, level.value
+        )
         last = slice(self.last, self.last + 1)
         sample = adaptation.process_noise_factor(
             correction[-1:], after.covariance[last], carried[last], self.scaled[last]
         )
-        level = adaptation.faded(level, sample, self.forgetting)
+        level = adaptation.fading_mean(level, sample, self.forgetting)
         level = level._replace(value=self.xp.clip(level.value, *self.limits))
         likelihood = likelihood_of(measurement, log_likelihood, nis, self.xp)
         return after.mean, packed_covariance.unpack(after.covariance, self.n), (after, level), likelihood
@@ -201,7 +203,7 @@ class GustInteractingMultipleModel(AdaptiveKalman):
     def start(self, initial: Initial, N: int) -> GustModels:
         """Start all where everyone starts, as likely."""
         third = self.xp.stack([0.0 * initial.mean[0] + 1.0 / 3.0] * 3)
-        return GustModels((self.started(initial),) * 3, third)
+        return GustModels((self.start_filter(initial),) * 3, third)
 
     def update(
         self, measurement: Measurement, memory: GustModels
@@ -209,9 +211,9 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         """One IMM cycle; each model keeps its own opinion of the sensors."""
         xp = self.xp
         prediction = imm.predict_mode_probabilities(self.transition, memory.probabilities)
-        mean, covariance = imm.mix(*self.stacked(memory.filters), prediction.mixing)
+        mean, covariance = imm.mix(*self.stack_filters(memory.filters), prediction.mixing)
         steps = [
-            self.filtered(
+            self.predict_and_update(
                 Filter(mean[:, j], packed_covariance.pack(covariance[:, :, j]), memory.filters[j].noise),
                 measurement,
                 level**2,
@@ -225,9 +227,9 @@ class GustInteractingMultipleModel(AdaptiveKalman):
         nis = weighted_sum(probabilities, xp.stack([step.nis for step in steps]))
         density = imm.log_mixture_density(log_predicted, likelihoods)
         likelihood = likelihood_of(measurement, density, nis, xp)
-        return *imm.combine(*self.stacked(after.filters), probabilities), after, likelihood
+        return *imm.combine(*self.stack_filters(after.filters), probabilities), after, likelihood
 
-    def stacked(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
+    def stack_filters(self, filters: tuple[Filter, ...]) -> tuple[Array, Array]:
         """Means ``(n, 3, N)`` and covariances ``(n, n, 3, N)``."""
         xp = self.xp
         covariances = [packed_covariance.unpack(f.covariance, self.n) for f in filters]

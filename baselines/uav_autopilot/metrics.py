@@ -49,12 +49,12 @@ def gather(run: xarray.Dataset) -> Gathered:
     if "steady" in slices:
         each["settled"] = output[:, slices["steady"]].mean(axis=1)
     if "innovation" in run and not numpy.isnan(run["innovation"].values).all():
-        parts = [_lagged_products(run["innovation"].values[:, times]) for times in slices.values()]
+        parts = [_lag_products(run["innovation"].values[:, times]) for times in slices.values()]
         each["innovation"] = numpy.stack(parts, axis=1)
     return Gathered(each, averaged)
 
 
-def _lagged_products(values: numpy.ndarray) -> numpy.ndarray:
+def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
     """Mean product of neighbours, and mean square, ``(episodes, 2)``; NaN where there are no neighbours."""
     if values.shape[1] < 2:
         return numpy.full((len(values), 2), math.nan)

@@ -85,7 +85,7 @@ class InnovationAdaptive(Policy):
         return numpy.clip(action, -1.0, 1.0)[:, None], mean
 
 
-def _tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
+def _make_tuned_adaptive(values: Mapping[str, float]) -> tuple[dict[str, Any], Callable[[Any], Policy]]:
     weights = tuple(values[name] for name in ("output_weight", "rate_weight", "elevator_weight"))
 
     def make(model: Model) -> Policy:
@@ -105,7 +105,7 @@ TUNABLE = {
     ),
     "innovation-adaptive": tunable(
         InnovationAdaptive,
-        _tuned_adaptive,
+        _make_tuned_adaptive,
         window=(5.0, 50.0, 150.0),
         memory=(0.0, 0.5, 0.95),
         offset=(-1.0, 0.0, 1.0),

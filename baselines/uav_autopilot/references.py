@@ -32,7 +32,7 @@ class TrueState:
         return truth.state, memory, memory
 
 
-class _ToldTheNoise:
+class _KnownNoise:
     """The covariance (12) of a plant with the noise as it is now.
 
     Args:
@@ -59,7 +59,7 @@ class _ToldTheNoise:
             return covariance
         return self.xp.concat([covariance[:-1], covariance[-1:] * truth.level**2])
 
-    def predicted_covariance(self, covariance: Array, truth: Truth) -> Array:
+    def predict_covariance(self, covariance: Array, truth: Truth) -> Array:
         """Packed covariance predicted with the disturbance of the interval before this measurement."""
         return self.xp.matmul(self.propagator, covariance) + (truth.level**2 * self.scaled + self.other)
 
@@ -68,7 +68,7 @@ class _ToldTheNoise:
         return self.variances * truth.sensor_level**2
 
 
-class Matched(_ToldTheNoise):
+class Matched(_KnownNoise):
     """The Kalman filter with the noise as it is now: its Q and R follow every change at once.
 
     It is not told of a slower actuator.
@@ -87,7 +87,7 @@ class Matched(_ToldTheNoise):
     def predict(self, measurement: Measurement, truth: Truth, memory: Initial) -> Initial:
         """Equations (10), (12) with the disturbance as it is; the covariance is packed."""
         mean = self.xp.matmul(self.F, memory.mean) + self.B * measurement.control
-        return Initial(mean, self.predicted_covariance(memory.covariance, truth))
+        return Initial(mean, self.predict_covariance(memory.covariance, truth))
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: Initial
@@ -105,7 +105,7 @@ class Matched(_ToldTheNoise):
         return updated.mean, covariance, Initial(updated.mean, updated.covariance), likelihood
 
 
-class KnownNoiseBound(_ToldTheNoise):
+class KnownNoiseBound(_KnownNoise):
     """Covariance of the best estimate for an estimator that is told plant and noise: the Riccati recursion.
 
     Linear and Gaussian with a known control, so it is the posterior Cramer-Rao bound, it is attained, and it
@@ -126,7 +126,7 @@ class KnownNoiseBound(_ToldTheNoise):
         """Bound after this measurement."""
         after = packed_covariance.update_coordinates(
             self.xp.zeros_like(truth.state),
-            self.predicted_covariance(memory, truth),
+            self.predict_covariance(memory, truth),
             measurement.reading,
             self.task.measured,
             self.sensor_variances(truth),

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem, problem_of
 from filtergym.envs.catalogue import catalogue, nearest
 from filtergym.evaluation.competitors import RANKED
@@ -78,7 +78,7 @@ def compared_policies(problem: Problem, records: Sequence[Record]) -> list[str]:
     tuned = [f"{name}-tuned" for name in (known.score_paper, known.best_constant)]
     present = {record.policy for record in records}
     strongest, paper = classical[:STRONGEST], known.score_paper
-    wanted = dict.fromkeys((*shipped_agents(problem.id), *strongest, paper, *tuned, known.score_reference))
+    wanted = dict.fromkeys((*pretrained_agents(problem.id), *strongest, paper, *tuned, known.score_reference))
     return [name for name in wanted if name in present]
 
 
@@ -101,7 +101,7 @@ def summary(found: Sequence[Benchmarked]) -> Grid:
     """Best of every origin on the training distribution of each environment, and the reference."""
     rows = []
     for problem, every in found:
-        reference, learned = problem.baselines.score_reference, shipped_agents(problem.id)
+        reference, learned = problem.baselines.score_reference, pretrained_agents(problem.id)
         records = [record for record in every if record.scenario == problem.task.default_scenario]
         values, kinds = _by_name(records), {record.policy: record.kind for record in records}
         places = [place.name for place in ranking(records)] if records else []
@@ -129,7 +129,7 @@ def harm(found: Sequence[Benchmarked]) -> Grid:
     """The scenario in which each learned agent stands worst against the paper's algorithm."""
     rows = []
     for problem, records in found:
-        for name in shipped_agents(problem.id):
+        for name in pretrained_agents(problem.id):
             own = [r for r in records if (r.policy, r.metric) == (name, DIFFERENCE) and r.value is not None]
             if not own:
                 continue
@@ -176,7 +176,7 @@ def compare_environment(measured: Benchmarked, width: int = 2) -> Comparison:
         )
     by_window = {(s, p, m, c, "all"): r for (s, p, m, c), r in found.items()}
     bounds = [name for name in known.bounds if (next(iter(sizes)), name, *known.physical) in found]
-    kinds, learned = {r.policy: r.kind for r in records}, shipped_agents(cls.id)
+    kinds, learned = {r.policy: r.kind for r in records}, pretrained_agents(cls.id)
     verdicts = {s: who_is_best([record for record in records if record.scenario == s]) for s in sizes}
 
     def grid(title: str, names: Sequence[str], text: Callable[[str, str], str], judged: bool = False) -> Grid:

@@ -17,7 +17,7 @@ from filtergym.baselines.problem import Problem
 from filtergym.envs.backend import make_model
 from filtergym.envs.model import Model
 from filtergym.envs.observation import Block
-from filtergym.envs.parameters import Limits, declared
+from filtergym.envs.parameters import Limits, field_limits
 from filtergym.envs.task import Task
 from filtergym.papers.grid import markdown_table
 from pages import insert_between_markers, markers_of
@@ -126,7 +126,7 @@ def _parameters(cls: type[Task]) -> list[str]:
     texts, defaults = field_documentation(cls.Parameters), cls.Parameters()
     rows = [
         (f"`{name}`", f"`{getattr(defaults, name)!r}`", _limits(limits), texts[name])
-        for name, (_, limits) in declared(cls.Parameters).items()
+        for name, (_, limits) in field_limits(cls.Parameters).items()
     ]
     return markdown_table(("keyword", "default", "limits", "meaning"), rows)
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy
 from filtergym.evaluation.looks import styles
-from filtergym.evaluation.print_layout import figure_with_axes, in_print, titled
+from filtergym.evaluation.print_layout import add_title, figure_with_axes, in_print
 
 
 @in_print
@@ -45,7 +45,7 @@ def draw_learning_curves(
     axis.set_xlabel("environment steps, millions")
     axis.set_ylabel(f"validation cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4)
-    return titled(figure, title)
+    return add_title(figure, title)
 
 
 @in_print
@@ -113,4 +113,4 @@ def draw_differences(
     axis.set_ylim(len(differences) - 0.5, -0.5)
     axis.set_xlabel(f"cost against {paper}, %")
     axis.grid(alpha=0.25, lw=0.4, axis="x")
-    return titled(figure, title)
+    return add_title(figure, title)

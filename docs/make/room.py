@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from filtergym.agents.named_policies import shipped_agents
+from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import Problem
 from filtergym.evaluation.metrics import Record, tidy_records
 from filtergym.papers.grid import markdown_table
@@ -14,7 +14,7 @@ from filtergym.reports.tables import (
     against_paper,
     consistency,
     main_components,
-    ranked,
+    rank_competitors,
     score_text,
     with_interval,
 )
@@ -25,7 +25,7 @@ MARKER = "room table"
 
 def room_policies(problem: Problem) -> list[str]:
     """Names in the room table: everything that has a name, but random actions."""
-    return [name for name in (*problem.names, *shipped_agents(problem.id)) if name != "random"]
+    return [name for name in (*problem.names, *pretrained_agents(problem.id)) if name != "random"]
 
 
 def measure_room(problem: Problem, episodes: int, seed: int, progress: Callable[[int], None]) -> list[Record]:
@@ -53,7 +53,7 @@ def room_markdown(records: list[Record], paper: str, command: str) -> str:
         "score",
     ]
     rows = []
-    for name, kind, control in ranked(records):
+    for name, kind, control in rank_competitors(records):
         rows.append(
             [
                 f"`{name}`",

@@ -23,7 +23,7 @@ from filtergym.evaluation.code import files_digest
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.dataset import groups_of, windows_of
 from filtergym.evaluation.evaluate import check_sendable
-from filtergym.evaluation.metrics import mean_over_time, reported_components, score, squared_errors
+from filtergym.evaluation.metrics import components_and_groups, mean_over_time, score, squared_errors
 from filtergym.evaluation.parallel import Workers, check_workers
 from filtergym.evaluation.statistics import ALL, Statistic
 from filtergym.evaluation.store import Store, Work
@@ -200,7 +200,7 @@ def default_opponents(problem: Problem) -> list[str]:
     """Names that runs are compared with: paper, strong policies, untuned and tuned, references."""
     known = problem.baselines
     untuned = [name for name in known.tunable if name != known.best_constant]
-    names = [problem.paper, *known.compared, *untuned, *problem.tuned, *known.references]
+    names = [problem.paper, *known.compared, *untuned, *problem.tuned_policies, *known.references]
     return list(dict.fromkeys(names))
 
 
@@ -251,7 +251,7 @@ def episode_means(
     workers = check_workers(workers)
     if not workers.alone:
         for _, asked, _ in missing:
-            check_sendable(asked.experiment.environment, {asked.name: asked.maker})
+            check_sendable(asked.experiment.task, {asked.name: asked.maker})
     everyone = [asked for _, asked, _ in missing]
     for i, means in workers.run(_means_of, everyone, [asked.measurements for asked in everyone], progress):
         name, _, work = missing[i]
@@ -303,7 +303,7 @@ def _own_digest() -> str:
 
 def _means_of(asked: EvaluationRequest, tick: Callable[[int], None]) -> PolicyMeans:
     part = reduce_episodes(asked, _mean_statistics, tick)
-    results, units = part.reduction.results(), reported_components(part.head)
+    results, units = part.reduction.results(), components_and_groups(part.head)
     cost = results.pop(("cost",))
     return PolicyMeans(cost, {component: values for (component, *_), values in results.items()}, units)
 
@@ -312,7 +312,7 @@ def _mean_statistics(run: xarray.Dataset) -> Iterator[Statistic]:
     """Declare the mean cost of every episode, and the mean square of every component that is shown."""
     yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     first, last = windows_of(run)["all"]
-    for component in select_components(list(reported_components(run))):
+    for component in select_components(list(components_and_groups(run))):
         squares = squared_errors(run, component, groups_of(run))[:, first - 1 : last]
         yield Statistic((component, "mean_square"), squares.mean(axis=1), sample=ALL)
 

@@ -218,7 +218,7 @@ class _KalmanBucyBank(Bank[Task, Measurement, Any]):
             "log_likelihood": xp.where(there, ordered_sum(self.log_density(state.seen)), math.nan),
         }
 
-    def compared(
+    def update_innovations(
         self, before: Innovations, measurement: Measurement, position: Array, variance: Array
     ) -> Innovations:
         """Innovations of predicted positions, and their averages; without a measurement these stand still.
@@ -275,7 +275,7 @@ class NoiseBank(_KalmanBucyBank):
     def start(self, initial: Initial) -> Augmented:
         """Start where INS and reference agree, with the modelled prior of the rate errors."""
         zero = 0.0 * initial.mean
-        covariance = self.parameters.modelled_prior(zero[0])
+        covariance = self.parameters.prior_covariance(zero[0])
         return Augmented(
             position=initial.mean,
             drift=zero,
@@ -286,11 +286,11 @@ class NoiseBank(_KalmanBucyBank):
             action=self.xp.stack([zero[0]] * len(NOISES)),
         )
 
-    def predicted_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
+    def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
         """Covariance predicted to the measurement with the noises of an action."""
         p, xp = self.parameters, self.xp
         coloured, white = xp.exp(math.log(p.process_scale) * action[1:])
-        growth, displacement = p.modelled_growth
+        growth, displacement = p.variance_growth
         residual = p.coloured**2 * p.sampling.residual
         white_growth = coloured * residual + white * (displacement - residual)
         return ins_gnss.predict_augmented(state.covariance, p.sampling, coloured * growth, white_growth)
@@ -306,12 +306,12 @@ class NoiseBank(_KalmanBucyBank):
         """Predict by the increment of the INS less the estimated rate errors; show it with the last action's noises."""
         s = self.parameters.sampling
         position = state.position + measurement.increment - (s.step * state.drift + s.drive * state.coloured)
-        variance = self.predicted_covariance(state, state.action).position
+        variance = self.predict_covariance(state, state.action).position
         return state._replace(
             position=position,
             coloured=s.decay * state.coloured,
             deviation=self.xp.sqrt(variance),
-            seen=self.compared(state.seen, measurement, position, variance),
+            seen=self.update_innovations(state.seen, measurement, position, variance),
         )
 
     def act(self, state: Augmented, measurement: Measurement, action: Array) -> Augmented:
@@ -319,7 +319,7 @@ class NoiseBank(_KalmanBucyBank):
         innovation = state.seen.innovation
         action = self.xp.clip(action, -1.0, 1.0)
         R = self.receiver_variance(measurement, action)
-        predicted = self.predicted_covariance(state, action)
+        predicted = self.predict_covariance(state, action)
         gain, P = ins_gnss.update_augmented(predicted, R, measurement.available)
         return state._replace(
             position=state.position + gain.position * innovation,
@@ -351,7 +351,7 @@ class GainBank(_KalmanBucyBank):
         p = self.parameters
         self.error_model = p.sampling, p.plain_growth[1], p.drift, p.coloured, p.white_intensity
         smallest = math.log(p.smallest_gain)
-        self.middle = min(max(math.log(p.settled_gains[1]), 0.9 * smallest), 0.1 * smallest)
+        self.middle = min(max(math.log(p.steady_state_gains[1]), 0.9 * smallest), 0.1 * smallest)
         """Logarithm of the gain at action 0: of the paper's, where that leaves room on both sides."""
 
     @property
@@ -373,7 +373,7 @@ class GainBank(_KalmanBucyBank):
         """Predict by the increment of the INS."""
         position = state.position + measurement.increment
         variance = ins_gnss.predict_plain(state.variance, *self.error_model)
-        seen = self.compared(state.seen, measurement, position, variance.assumed)
+        seen = self.update_innovations(state.seen, measurement, position, variance.assumed)
         return state._replace(position=position, variance=variance, seen=seen)
 
     def gain(self, action: Array) -> Array:
@@ -458,7 +458,7 @@ class SchemeBank(_KalmanBucyBank):
             plain_variance=each[:2, :1],
             drift=zero,
             coloured=zero,
-            covariance=p.modelled_prior(zero[0]),
+            covariance=p.prior_covariance(zero[0]),
             seen=self.no_innovations(each),
             weights=each[:, 0],
         )
@@ -470,14 +470,14 @@ class SchemeBank(_KalmanBucyBank):
         corrected = position[2] - (s.step * state.drift + s.drive * state.coloured)
         position = xp.concat([position[:2], corrected[None]])
         plain = state.plain_variance + self.plain_growth
-        P = ins_gnss.predict_augmented(state.covariance, s, *self.parameters.modelled_growth)
+        P = ins_gnss.predict_augmented(state.covariance, s, *self.parameters.variance_growth)
         variance = xp.concat([plain, P.position[None, None]])
         return state._replace(
             position=position,
             plain_variance=plain,
             coloured=s.decay * state.coloured,
             covariance=P,
-            seen=self.compared(state.seen, measurement, position, variance),
+            seen=self.update_innovations(state.seen, measurement, position, variance),
         )
 
     def act(self, state: Schemes, measurement: Measurement, action: Array) -> Schemes:

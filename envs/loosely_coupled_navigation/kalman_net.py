@@ -77,7 +77,7 @@ class KalmanNetBank(NoiseBank):
         """Update by the gain that was answered."""
         xp, innovation = self.xp, state.seen.innovation
         a = xp.clip(action, -1.0, 1.0)
-        P = self.predicted_covariance(state, a[: len(NOISES)])
+        P = self.predict_covariance(state, a[: len(NOISES)])
         R = self.receiver_variance(measurement, a)
         caution, *rates = a[len(NOISES) :]
         share = measurement.available / (P.position + xp.exp(math.log(CAUTION) * caution) * R)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.array_namespace import Array
-from ..parameters import TaskParameters, check, declared, parameter
+from ..parameters import TaskParameters, check, field_limits, parameter
 
 AXES = ("x", "y", "z")
 
@@ -113,7 +113,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         """Turn the duration into a horizon, and check every field."""
         if self.duration is not None:
             for name in ("duration", "sampling_interval"):
-                check(name, getattr(self, name), *declared(LooselyCoupledNavigationParameters)[name])
+                check(name, getattr(self, name), *field_limits(LooselyCoupledNavigationParameters)[name])
             if self.sampling_interval > self.duration:
                 raise ValueError(
                     f"sampling_interval must be at most the duration of {self.duration} s, got "
@@ -149,9 +149,9 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         return white * self.sampling_interval, reduced * self.sampling_interval
 
     @property
-    def settled_gains(self) -> tuple[float, float]:
+    def steady_state_gains(self) -> tuple[float, float]:
         """Gains at which the plain scheme settles, by the two tunings."""
-        white, reduced = (ins_gnss.settled_gain(q, self.receiver_variance) for q in self.plain_growth)
+        white, reduced = (ins_gnss.steady_state_gain(q, self.receiver_variance) for q in self.plain_growth)
         return white, reduced
 
     @functools.cached_property
@@ -160,7 +160,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
         return ins_gnss.sampling(self.correlation_time, self.sampling_interval)
 
     @functools.cached_property
-    def modelled_growth(self) -> tuple[float, float]:
+    def variance_growth(self) -> tuple[float, float]:
         """Variances that the modelled coloured rate error (m^2/s^2) and the displacement (m^2) gain from one
         measurement to the next.
         """
@@ -169,7 +169,7 @@ class LooselyCoupledNavigationParameters(TaskParameters):
             self.white_intensity * self.sampling_interval + self.coloured**2 * self.sampling.residual,
         )
 
-    def modelled_prior(self, none: Array) -> ins_gnss.AugmentedCovariance:
+    def prior_covariance(self, none: Array) -> ins_gnss.AugmentedCovariance:
         """Covariance of INS and rate errors at the start of the track; ``none`` is zero, ``(N,)``."""
         drift, coloured = none + self.drift**2, none + self.coloured**2
         return ins_gnss.AugmentedCovariance(none, none, none, drift, none, coloured)

@@ -123,7 +123,7 @@ class LooselyCoupledNavigationPicture(Picture):
         """No: the strips say it in the filter's terms."""
         return False
 
-    def shaded(self) -> Sequence[tuple[float, float]]:
+    def shading(self) -> Sequence[tuple[float, float]]:
         """Measurements that fail, are jammed or spoofed."""
         return self.disturbed
 

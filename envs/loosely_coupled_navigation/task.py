@@ -124,7 +124,7 @@ class LooselyCoupledNavigation(Task):
         names = ("position",) if p.axes == 1 else tuple(f"position_{axis}" for axis in AXES[: p.axes])
         self.components = tuple(Component(name, "m") for name in names)
         self.groups = {} if p.axes == 1 else {"position": names}
-        action = float(GainBank(self, "gain").action_for_gain(p.settled_gains[1]))
+        action = float(GainBank(self, "gain").action_for_gain(p.steady_state_gains[1]))
         self.paper_policy = PaperPolicy("gain", (action,) * p.axes)
 
     def picture(self, model: Model) -> Any:

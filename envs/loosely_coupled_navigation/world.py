@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy
 
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, between
+from ..draws import Draws, draw_between
 from ..faults import Outliers
 from ..filter import Initial
 from ..observation import Array
@@ -147,8 +147,10 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             reported_levels=xp.stack(reported),
             change=xp.stack([earlier, later]),
             **windows,
-            jamming_gain=xp.sqrt(zeros[0] + between(draws.log_uniform, "jamming_factor", p.jamming_factor)),
-            spoofing_rate=zeros[0] + between(draws.uniform, "spoofing_rate", p.spoofing_rate),
+            jamming_gain=xp.sqrt(
+                zeros[0] + draw_between(draws.log_uniform, "jamming_factor", p.jamming_factor)
+            ),
+            spoofing_rate=zeros[0] + draw_between(draws.uniform, "spoofing_rate", p.spoofing_rate),
             deviation=levels[0],
             reported_deviation=reported[0],
             available=zeros[0] + 1.0,
@@ -185,7 +187,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             deviation, reported = (Steps(level, truth.change).at(number, xp) for level in levels)
         if p.jamming_probability:
             deviation = xp.where(within(number, truth.jamming), truth.jamming_gain * deviation, deviation)
-        deviation = self.outliers.amplified(deviation, noise[3 * n :], xp)
+        deviation = self.outliers.amplify(deviation, noise[3 * n :], xp)
         fix = reference + deviation * noise[2 * n : 3 * n]
         if p.spoofing_probability:
             pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
@@ -208,11 +210,11 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         """Position, ``(A, N)``."""
         return truth.reference
 
-    def seen(self, measurement: Measurement) -> Array:
+    def component_readings(self, measurement: Measurement) -> Array:
         """The receiver's position."""
-        return self.received(measurement).fix
+        return self.mask_missing(measurement).fix
 
-    def stated_deviation(self, measurement: Measurement) -> Array:
+    def component_deviations(self, measurement: Measurement) -> Array:
         """As the receiver reports it."""
         return measurement.reported_deviation + 0.0 * measurement.fix
 

@@ -101,24 +101,24 @@ class _RadarBank(Bank["ManeuveringTarget", Measurement, Any]):
         self.forgetting = math.exp(-1.0 / self.parameters.averaging_measurements)
         self.average = f"exponential average over {self.parameters.averaging_measurements:g} scans"
 
-    def averaged(self, measurement: Measurement, old: Array, new: Array) -> Array:
+    def exponential_average(self, measurement: Measurement, old: Array, new: Array) -> Array:
         """Exponential average with a new value taken in, if there is one."""
-        return self.seen(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
+        return self.where_detected(measurement, self.forgetting * old + (1.0 - self.forgetting) * new, old)
 
     def interval(self, measurement: Measurement) -> float | Array:
         """Seconds since the scan before."""
         return self.T if self.regular else measurement.interval
 
-    def elapsed(self, measurement: Measurement) -> float | Array:
+    def time_since_last(self, measurement: Measurement) -> float | Array:
         """Seconds since the last measurement."""
         return self.T if self.regular else measurement.elapsed
 
-    def seen(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
+    def where_detected(self, measurement: Measurement, then: Any, otherwise: Any) -> Any:
         """One of two where the scan saw the target, the other where it missed it: arrays, or tuples of them."""
         if self.regular or then is otherwise:
             return then
         if isinstance(then, tuple):
-            parts = [self.seen(measurement, *pair) for pair in zip(then, otherwise, strict=True)]
+            parts = [self.where_detected(measurement, *pair) for pair in zip(then, otherwise, strict=True)]
             return type(then)(*parts) if hasattr(then, "_fields") else tuple(parts)
         return self.xp.where(measurement.available > 0.0, then, otherwise)
 
@@ -250,7 +250,7 @@ class GainBank(_RadarBank):
         xp, f, interval = self.xp, state, self.interval(measurement)
         predicted = alpha_beta.predict(f.mean[:2], f.mean[2:], interval)
         covariance = alpha_beta.predict_covariance(f.covariance, interval)
-        innovation = self.seen(measurement, measurement.position - predicted, 0.0)
+        innovation = self.where_detected(measurement, measurement.position - predicted, 0.0)
         S = covariance.position + measurement.variance
         normalised = innovation / xp.sqrt(S)
         squares = normalised * normalised
@@ -260,10 +260,12 @@ class GainBank(_RadarBank):
             covariance=covariance,
             innovation=innovation,
             innovation_variance=S,
-            average_excess=self.averaged(measurement, f.average_excess, innovation * innovation - S),
-            average_innovation=self.averaged(measurement, f.average_innovation, normalised),
+            average_excess=self.exponential_average(
+                measurement, f.average_excess, innovation * innovation - S
+            ),
+            average_innovation=self.exponential_average(measurement, f.average_innovation, normalised),
             log_squared=log_squared,
-            average_log_squared=self.averaged(measurement, f.average_log_squared, log_squared),
+            average_log_squared=self.exponential_average(measurement, f.average_log_squared, log_squared),
         )
 
     def alpha(self, action: Array) -> Array:
@@ -278,7 +280,7 @@ class GainBank(_RadarBank):
 
     def act(self, state: AlphaBeta, measurement: Measurement, action: Array) -> AlphaBeta:
         """Update with the gain of the action and the beta that belongs to it."""
-        xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.elapsed(measurement)
+        xp, f, alpha, elapsed = self.xp, state, self.alpha(action), self.time_since_last(measurement)
         beta = alpha_beta.benedict_bordner_beta(alpha)
         updated = alpha_beta.update(f.predicted, f.mean[2:], f.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_covariance(f.covariance, measurement.variance, alpha, beta, elapsed)
@@ -287,7 +289,7 @@ class GainBank(_RadarBank):
             return after
         after = after._replace(grown=measurement.elapsed, since=xp.zeros_like(measurement.elapsed))
         missed = f._replace(mean=xp.concat([f.predicted, f.mean[2:]]), since=measurement.elapsed)
-        return self.seen(measurement, after, missed)
+        return self.where_detected(measurement, after, missed)
 
     def covariance(self, state: AlphaBeta) -> Array:
         """Covariance that belongs to the gains used, and what an acceleration since the measurement before the last
@@ -297,11 +299,11 @@ class GainBank(_RadarBank):
         T, since = (self.T, 0.0) if self.regular else (f.grown, f.since)
         usual = (0.5 * T**2 * self.parameters.unmodelled_acceleration) ** 2
         beta = alpha_beta.benedict_bordner_beta(f.alpha)
-        told = usual + xp.clip(f.average_excess, 0.0, None)
+        extra_variance = usual + xp.clip(f.average_excess, 0.0, None)
         # Of one direction; beyond this the sum would be singular to rounding.
         largest = LARGEST_SHARE * xp.minimum(f.covariance.position, T**2 * f.covariance.velocity)
-        told = xp.minimum(told, largest / (1.0 + since / T) ** 4)
-        P = alpha_beta.left_by_acceleration(f.covariance, told, f.alpha, beta, T, since)
+        extra_variance = xp.minimum(extra_variance, largest / (1.0 + since / T) ** 4)
+        P = alpha_beta.left_by_acceleration(f.covariance, extra_variance, f.alpha, beta, T, since)
         zero = 0.0 * P.cross[0]
         entries = ((P.position, P.cross), (P.cross, P.velocity))
         return xp.stack(
@@ -318,9 +320,9 @@ class GainBank(_RadarBank):
         nis, S = self.xp.expm1(state.log_squared), state.innovation_variance
         density = -0.5 * (nis + self.xp.log(S[0]) + self.xp.log(S[1])) - math.log(2.0 * math.pi)
         return {
-            "nis": self.seen(measurement, nis, math.nan),
+            "nis": self.where_detected(measurement, nis, math.nan),
             "nis_degrees": 2.0 * measurement.available,
-            "log_likelihood": self.seen(measurement, density, math.nan),
+            "log_likelihood": self.where_detected(measurement, density, math.nan),
             "alpha": state.alpha,
         }
 
@@ -347,13 +349,13 @@ class FilterBank(_RadarBank):
         xp = self.xp
         each = tuple(str(j + 1) for j in range(self.count))
 
-        def normalised(i: int) -> Any:
+        def innovation_in_sigmas(i: int) -> Any:
             return lambda f, _: f.innovation[i] / xp.sqrt(f.innovation_covariance[i, i])
 
         over_sigma = "the filter's innovation over its predicted sigma"
         return (
-            Block("innovation_x", normalised(0), over_sigma, each, SIGNED_LOG),
-            Block("innovation_y", normalised(1), over_sigma, each, SIGNED_LOG),
+            Block("innovation_x", innovation_in_sigmas(0), over_sigma, each, SIGNED_LOG),
+            Block("innovation_y", innovation_in_sigmas(1), over_sigma, each, SIGNED_LOG),
             Block(
                 "log_squared_innovation",
                 lambda f, _: f.log_squared,
@@ -425,7 +427,7 @@ class FilterBank(_RadarBank):
         mean, covariance = imm.mix(bank.mean, bank.covariance, prediction.mixing)
         mean = xp.concat([alpha_beta.predict(mean[:2], mean[2:], interval), mean[2:]])
         covariance = alpha_beta.predict_joint_covariance(covariance, interval)
-        innovation = self.seen(measurement, measurement.position[:, None] - mean[:2], 0.0)
+        innovation = self.where_detected(measurement, measurement.position[:, None] - mean[:2], 0.0)
         identity = xp.eye(2, dtype=mean.dtype, device=mean.device)[:, :, None, None]
         S = covariance[:2, :2] + identity * measurement.variance[:, None]
         log_likelihood, squared = log_density(innovation, S)
@@ -438,10 +440,10 @@ class FilterBank(_RadarBank):
             imm.log_probabilities(prediction.probabilities),
             innovation,
             S,
-            self.seen(measurement, log_likelihood, 0.0),
-            self.averaged(measurement, bank.average_innovation, normalised),
+            self.where_detected(measurement, log_likelihood, 0.0),
+            self.exponential_average(measurement, bank.average_innovation, normalised),
             log_squared,
-            self.averaged(measurement, bank.average_log_squared, log_squared),
+            self.exponential_average(measurement, bank.average_log_squared, log_squared),
             bank.alpha,
         )
 
@@ -455,12 +457,12 @@ class FilterBank(_RadarBank):
             self.parameters.evidence_scale,
             self.xp,
         )
-        after = self._updated(state, measurement, self.gain_alpha, self.gain_beta)
+        after = self._update_filters(state, measurement, self.gain_alpha, self.gain_beta)
         return self._in_force(state, measurement, after._replace(probabilities=probabilities))
 
-    def _updated(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
+    def _update_filters(self, state: Filters, measurement: Measurement, alpha: Array, beta: Array) -> Filters:
         """Update every filter by its gains."""
-        elapsed = self.elapsed(measurement)
+        elapsed = self.time_since_last(measurement)
         updated = alpha_beta.update(state.mean[:2], state.mean[2:], state.innovation, alpha, beta, elapsed)
         covariance = alpha_beta.update_joint_covariance(
             state.covariance, measurement.variance[:, None], alpha, beta, elapsed
@@ -471,8 +473,8 @@ class FilterBank(_RadarBank):
         """Filters after an update, or where the scan missed the target as predicted, with the probabilities (13)."""
         if self.regular:
             return after
-        predicted = imm.normalised_exponential(state.log_predicted)
-        return self.seen(measurement, after, state._replace(probabilities=predicted))
+        predicted = imm.softmax(state.log_predicted)
+        return self.where_detected(measurement, after, state._replace(probabilities=predicted))
 
     def mean(self, state: Filters) -> Array:
         """Combination of the filters (15), ``(4, N)``."""
@@ -490,9 +492,9 @@ class FilterBank(_RadarBank):
         innovation, S = imm.combine(state.innovation, state.innovation_covariance, predicted)
         density = imm.log_mixture_density(state.log_predicted, state.log_likelihood)
         return {
-            "nis": self.seen(measurement, log_density(innovation, S)[1], math.nan),
+            "nis": self.where_detected(measurement, log_density(innovation, S)[1], math.nan),
             "nis_degrees": 2.0 * measurement.available,
-            "log_likelihood": self.seen(measurement, density, math.nan),
+            "log_likelihood": self.where_detected(measurement, density, math.nan),
             "mode_probability": state.probabilities,
         }
 
@@ -522,5 +524,5 @@ class SteeredFilterBank(FilterBank):
         alpha = 1.0 / (1.0 + xp.exp(-moved))
         beta = alpha_beta.benedict_bordner_beta(alpha)
         probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
-        after = self._updated(state, measurement, alpha, beta)
+        after = self._update_filters(state, measurement, alpha, beta)
         return self._in_force(state, measurement, after._replace(probabilities=probabilities, alpha=alpha))

@@ -47,7 +47,9 @@ class Course(ABC):
     def advance(self, flight: Any, scan: Array, motion: Motion) -> Motion:
         """Motion at a scan from that at the one before, both on time."""
 
-    def between(self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+    def motion_at_early_scan(
+        self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
+    ) -> Motion:
         """Motion at a scan that comes early by a share of the scan period; here :meth:`advance` knows every time.
 
         Args:
@@ -72,7 +74,7 @@ class Course(ABC):
 
 def after(time: Array, turn: Array, motion: Motion, task: Task) -> Motion:
     """Motion after a time (s) on a circle, or a straight line, at constant speed; ``turn`` in rad/s."""
-    state = coordinated_turn.turned(task.xp.concat([*motion, turn[None]]), time)
+    state = coordinated_turn.propagate(task.xp.concat([*motion, turn[None]]), time)
     return state[:2], state[2:4]
 
 
@@ -118,7 +120,7 @@ class Maneuvered(Course):
             velocity = velocity + (effect[0] * before + effect[1] * across)
         return position, velocity
 
-    def between(
+    def motion_at_early_scan(
         self, flight: Maneuvers, scan: Array, early: Array, before: Motion, on_time: Motion
     ) -> Motion:
         """Thrust is constant within a period, and so is the turn rate."""
@@ -242,7 +244,9 @@ class RandomStraight(Course):
         position, velocity = motion
         return position + self.parameters.sampling_interval * velocity, velocity
 
-    def between(self, flight: None, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+    def motion_at_early_scan(
+        self, flight: None, scan: Array, early: Array, before: Motion, on_time: Motion
+    ) -> Motion:
         """Go straight for a part of the scan period."""
         position, velocity = before
         return position + (self.parameters.sampling_interval * (1.0 - early)) * velocity, velocity
@@ -334,7 +338,9 @@ class Table(Course):
         """Look it up; beyond the end the target stays at the last state."""
         return self._states(self.xp.clip(scan, None, float(self.table.shape[1]) - 1.0))
 
-    def between(self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion) -> Motion:
+    def motion_at_early_scan(
+        self, flight: Any, scan: Array, early: Array, before: Motion, on_time: Motion
+    ) -> Motion:
         """A table has no states between its scans: they come on time."""
         return on_time
 

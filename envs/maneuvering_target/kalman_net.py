@@ -187,7 +187,7 @@ class KalmanNetBank(Bank["ManeuveringTarget", Measurement, Track]):
         along, across = state.acceleration[0], state.acceleration[1]
         rate = 1.0 / speed_of(state.mean[2:], LEAST_SPEED)
         turning = xp.concat([state.mean, (across * rate)[None]])
-        turned = coordinated_turn.turned(turning, T)
+        turned = coordinated_turn.propagate(turning, T)
         faster = T * along * rate
         position = state.mean[:2] + (1.0 + 0.5 * faster) * (turned[:2] - state.mean[:2])
         mean = xp.concat([position, (1.0 + faster) * turned[2:4]])

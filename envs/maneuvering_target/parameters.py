@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ..parameters import TaskParameters, parameter, sized, square_matrix
+from ..parameters import TaskParameters, check_length, parameter, square_matrix
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class ManeuveringTargetParameters(TaskParameters):
         if modes < 2:
             raise ValueError(f"gains must name at least two filters, got {self.gains!r}")
         square_matrix("transition", self.transition, modes)
-        sized("initial_probabilities", self.initial_probabilities, modes)
+        check_length("initial_probabilities", self.initial_probabilities, modes)
         for i, leg in enumerate(self.legs):
             if leg[0] <= 0.0:
                 raise ValueError(f"legs[{i}][0] must be a duration above 0 s, got {leg[0]!r}")
@@ -128,4 +128,6 @@ class ManeuveringTargetParameters(TaskParameters):
             if len(self.track) != 4:
                 raise ValueError(f"track must have the four rows x, y, vx, vy, got {len(self.track)} rows")
             for row, name in zip(self.track, ("x", "y", "vx", "vy"), strict=True):
-                sized(f"track {name}", row, sum(scans + 2 for scans in self.track_scans or (self.horizon,)))
+                check_length(
+                    f"track {name}", row, sum(scans + 2 for scans in self.track_scans or (self.horizon,))
+                )

@@ -153,7 +153,7 @@ class ManeuveringTargetPicture(Picture):
         """No: the strips say it in the filter's terms."""
         return False
 
-    def shaded(self) -> Sequence[tuple[float, float]]:
+    def shading(self) -> Sequence[tuple[float, float]]:
         """Scans of the manoeuvres."""
         return self.maneuvers
 

@@ -106,7 +106,7 @@ class UnreliableScans(RegularScans):
         before = scans.position, scans.velocity
         on_time = self.course.advance(flight, number, before)
         early = scans.jitter * uniforms[1]
-        motion = self.course.between(flight, number, early, before, on_time)
+        motion = self.course.motion_at_early_scan(flight, number, early, before, on_time)
         available = self.xp.astype(uniforms[0] < scans.detection_probability, number.dtype)
         interval = self.parameters.sampling_interval * (1.0 + (scans.early - early))
         elapsed = scans.unseen + interval

@@ -13,7 +13,7 @@ import numpy
 
 from ..flights import Flights, flight_of
 from ..model import Model
-from ..parameters import check, declared, frozen
+from ..parameters import check, field_limits, freeze
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
@@ -168,7 +168,7 @@ class ManeuveringTarget(Task):
                 f"of {interval:g} s: give a smaller sampling_interval"
             )
         horizon = scans if horizon is None else horizon
-        track = trajectory.resampled(interval, horizon + 2)
+        track = trajectory.resample(interval, horizon + 2)
         return Scenario(
             trajectory.name,
             "A flight given by its positions.",
@@ -182,8 +182,8 @@ class ManeuveringTarget(Task):
         for name in ("sampling_interval", "decision_interval", "horizon"):
             found[name] = getattr(ManeuveringTargetParameters, name) if name != "horizon" else None
             if name in keywords:
-                found[name] = frozen(keywords[name])
-                check(name, found[name], *declared(ManeuveringTargetParameters)[name])
+                found[name] = freeze(keywords[name])
+                check(name, found[name], *field_limits(ManeuveringTargetParameters)[name])
         return found["sampling_interval"], found["decision_interval"], found["horizon"]
 
     @classmethod
@@ -204,7 +204,7 @@ class ManeuveringTarget(Task):
                 f"the flights of {flights.name!r} have {sum(scans):,} scans of {interval:g} s together, more than "
                 f"{MOST_SCANS:,}: fly fewer, or give a smaller horizon"
             )
-        tracks = [flight.resampled(interval, count + 2) for flight, count in zip(used, scans, strict=True)]
+        tracks = [flight.resample(interval, count + 2) for flight, count in zip(used, scans, strict=True)]
         return Scenario(
             flights.name,
             "Flights given by their positions.",

@@ -96,7 +96,7 @@ class RadarWorld(World[Task, Truth, Measurement]):
         before, glint = (truth.position, truth.velocity), uniforms[self.scans.row_uniforms :]
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
-        measured = self._measure(position, self.glint.amplified(errors, glint, self.xp))
+        measured = self._measure(position, self.glint.amplify(errors, glint, self.xp))
         variance = self._variances(measured)
         if not p.regular:
             seen = available > 0.0
@@ -124,12 +124,12 @@ class RadarWorld(World[Task, Truth, Measurement]):
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
 
-    def seen(self, measurement: Measurement) -> Array:
+    def component_readings(self, measurement: Measurement) -> Array:
         """The measured position; nothing of the velocity."""
-        position = self.received(measurement).position
+        position = self.mask_missing(measurement).position
         return self.xp.concat([position, position * math.nan])
 
-    def stated_deviation(self, measurement: Measurement) -> Array:
+    def component_deviations(self, measurement: Measurement) -> Array:
         """Root of the position's variance."""
         sigma = self.xp.sqrt(measurement.variance)
         return self.xp.concat([sigma, sigma * math.nan])

@@ -15,7 +15,7 @@ from ...filters import class_fusion, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank
-from ..observation import BOUNDED_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, scaled
+from ..observation import BOUNDED_LOG, KEPT_AS_LOG1P, SIGNED_LOG, Array, Block, linear_scale
 from .parameters import RadarEsmTrackingParameters
 from .world import Measurement, Start
 
@@ -152,7 +152,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
             ),
             Block(
                 "bearing_difference", lambda f, measurement: measurement.bearing_difference,
-                "radar minus ESM bearing over the gate", shown=scaled(1.0 / self.gate), over_interval="mean",
+                "radar minus ESM bearing over the gate", shown=linear_scale(1.0 / self.gate), over_interval="mean",
             ),
             Block("last_weight", lambda f, _: f.probabilities, "weight in force before this scan", classes),
             Block(
@@ -199,17 +199,12 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
                 f.believed, f.mean, f.covariance, measurement.radar, models, self.class_transition
             )
         else:
-            channels, column = self.channels, xp.clip(measurement.scan, 0, self.last_scan)
+            scan = xp.clip(measurement.scan, 0, self.last_scan)
+            channels = class_fusion.Channels(*(xp.take(part, scan, axis=-1) for part in self.channels))
             mean, innovation, log_likelihood = class_fusion.update_channels(
-                f.mean,
-                measurement.radar,
-                models.Phi,
-                models.H,
-                xp.take(channels.gain, column, axis=-1),
-                xp.take(channels.whitening, column, axis=-1),
-                xp.take(channels.log_normaliser, column, axis=-1),
+                f.mean, measurement.radar, models, channels
             )
-            covariance = xp.take(channels.covariance, column, axis=-1)
+            covariance = channels.covariance
             log_predicted = imm.log_probabilities(f.believed) + log_likelihood
         log_squared = xp.log1p(ordered_sum(innovation * innovation))
         used, used_counts, refused_counts = self._count_decisions(
@@ -277,7 +272,7 @@ class ClassBank(Bank["RadarEsmTracking", Measurement, Filters]):
         calibrated its expectation is 2, that of the true class's filter.
         """
         squared = ordered_sum(state.innovation * state.innovation)
-        nis = weighted_sum(imm.normalised_exponential(state.log_predicted), squared)
+        nis = weighted_sum(imm.softmax(state.log_predicted), squared)
         expected = imm.log_probabilities(state.expected)
         return {
             "mode_probability": state.probabilities,

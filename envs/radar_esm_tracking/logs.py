@@ -49,14 +49,14 @@ def read_log(columns: Columns) -> TrackLog:
         )
     difference = _differences(columns, decided)
     looked = columns.whole("looked")[:, 0] > 0.5 if columns.has("looked") else scans % p.esm_period == 0
-    said = {
+    raw = {
         "scan": scans,
         "radar": radar,
         "looked": looked | decided,
         "decision": numpy.where(decided, decision, types).astype(numpy.int64),
         "bearing_difference": numpy.where(decided, difference, 0.0),
     }
-    measured = {name: values[None] for name, values in said.items()}
+    measured = {name: values[None] for name, values in raw.items()}
     later, initial, _ = start_track(measured, columns.time[None], p)
     return TrackLog(
         {name: values[0] for name, values in later.items()},

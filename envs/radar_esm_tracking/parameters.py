@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ...filters import singer
-from ..parameters import Limits, TaskParameters, check, parameter, sized, square_matrix
+from ..parameters import Limits, TaskParameters, check, check_length, parameter, square_matrix
 
 STANDARD_GRAVITY = 9.81
 """m/s^2."""
@@ -117,14 +117,14 @@ class RadarEsmTrackingParameters(TaskParameters):
         classes, types = len(self.manoeuvrability), len(self.recognition)
         if classes < 2:
             raise ValueError(f"manoeuvrability must name at least two classes, got {self.manoeuvrability!r}")
-        sized("acceleration_sigma", self.acceleration_sigma, classes)
+        check_length("acceleration_sigma", self.acceleration_sigma, classes)
         if not types:
             raise ValueError("recognition must have a row for each emitter type, got none")
         square_matrix("recognition", self.recognition, types)
-        sized("composition", self.composition, classes, "rows, one for each class")
+        check_length("composition", self.composition, classes, "rows, one for each class")
         for s, row in enumerate(self.composition):
-            sized(f"composition[{s}]", row, types)
-        sized("prior", self.prior, classes)
+            check_length(f"composition[{s}]", row, types)
+        check_length("prior", self.prior, classes)
         square_matrix("class_transition", self.class_transition, classes)
         check("true_class", self.true_class, str, Limits(choices=("random", *self.class_names)))
         # The class at scan 0 must have governed one motion before it can change.

@@ -102,7 +102,7 @@ class RadarEsmTrackingPicture(Picture):
         """No: the strips say it in the filter's terms."""
         return False
 
-    def shaded(self) -> Sequence[tuple[float, float]]:
+    def shading(self) -> Sequence[tuple[float, float]]:
         """Scans after the class has changed."""
         return [] if self.change is None else [(self.change, self.task.horizon + 0.5)]
 

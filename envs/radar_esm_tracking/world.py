@@ -7,7 +7,7 @@ import numpy
 
 from ...filters import class_fusion
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, between, category
+from ..draws import Draws, category, draw_between
 from ..faults import Outliers
 from ..observation import Array
 from ..world import World
@@ -131,9 +131,9 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         side = xp.where(draws.event("other_side", 0.5), -1.0, 1.0)
         radiating = draws.unit("radiating")
         zero = 0.0 * distance
-        silence_start = zero + between(draws.uniform, "silence_start", p.silence_start)
-        silence_end = zero + between(draws.uniform, "silence_end", p.silence_end)
-        second_emitter = zero + between(
+        silence_start = zero + draw_between(draws.uniform, "silence_start", p.silence_start)
+        silence_end = zero + draw_between(draws.uniform, "silence_end", p.silence_end)
+        second_emitter = zero + draw_between(
             draws.uniform, "second_emitter_probability", p.second_emitter_probability
         )
         if p.class_change_probability < 1.0:
@@ -200,7 +200,7 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         if p.silence_start[1] > 0.0:
             on = xp.where(truth.radiating, noise[10] >= truth.silence_start, noise[10] < truth.silence_end)
             truth = truth._replace(radiating=xp.where(self._looks(scan), on, truth.radiating))
-        radar = self.glint.amplified(noise[3:5], noise[11:], xp)
+        radar = self.glint.amplify(noise[3:5], noise[11:], xp)
         return truth, self._measure(truth, radar, noise[5:7], noise[7:10])
 
     # --- the sensors
@@ -249,17 +249,17 @@ class RadarEsmWorld(World["RadarEsmTracking", Truth, Measurement]):
         """Range, range rate and acceleration, ``(3, N)``."""
         return truth.motion
 
-    def received(self, measurement: Measurement) -> Measurement:
+    def mask_missing(self, measurement: Measurement) -> Measurement:
         """Difference of bearings NaN where the ESM decided nothing."""
         decided = measurement.decision < self.task.types
         difference = self.xp.where(decided, measurement.bearing_difference, math.nan)
         return measurement._replace(bearing_difference=difference)
 
-    def seen(self, measurement: Measurement) -> Array:
+    def component_readings(self, measurement: Measurement) -> Array:
         """Range and range rate; nothing of the acceleration."""
         return self.xp.concat([measurement.radar, measurement.radar[:1] * math.nan])
 
-    def stated_deviation(self, measurement: Measurement) -> Array:
+    def component_deviations(self, measurement: Measurement) -> Array:
         """Those of range and range rate."""
         p, once = self.parameters, self.xp.ones_like(measurement.radar[0])
         return self.xp.stack([p.range_sigma * once, p.range_rate_sigma * once, math.nan * once])

@@ -190,7 +190,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         probabilities = task.constant(self.parameters.initial_probabilities)[:, None] + zeros
         nis = xp.stack([xp.stack([zeros] * M)] * len(task.sensors))
         return Filters(
-            predicted=self._predicted(means, covariances, probabilities),
+            predicted=self._predict_hypotheses(means, covariances, probabilities),
             means=means,
             covariances=covariances,
             log_likelihood=nis[0],
@@ -206,7 +206,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             last_action=xp.stack([zeros] * len(self.actions)),
         )
 
-    def _predicted(self, means: Array, covariances: Array, probabilities: Array) -> Prediction:
+    def _predict_hypotheses(self, means: Array, covariances: Array, probabilities: Array) -> Prediction:
         """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, probabilities)
@@ -224,7 +224,9 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, task, combined = self.xp, self.task, state.predicted.combined
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
-        update = self._updated(state, measurement, task.sensor_variance, self.thresholds(state, measurement))
+        update = self._update_hypotheses(
+            state, measurement, task.sensor_variance, self.thresholds(state, measurement)
+        )
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
         accelerometers = measurement.readings[task.sensors[2].readings]
@@ -241,7 +243,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             range_innovation=innovation,
         )
 
-    def _updated(
+    def _update_hypotheses(
         self,
         state: Filters,
         measurement: Measurement,
@@ -288,18 +290,18 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             last = probabilities
         else:
             last = xp.astype(xp.clip(action, 0.0 if control == "weights" else -1.0, 1.0), dtype)
-        return self._weighed(state, probabilities, last)
+        return self._combine_and_predict(state, probabilities, last)
 
     def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
         """Weigh the hypotheses by Bayes' rule (step 7), as the paper does."""
         probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
-        return self._weighed(state, probabilities, last_action)
+        return self._combine_and_predict(state, probabilities, last_action)
 
-    def _weighed(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
+    def _combine_and_predict(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
         """Combine (step 8), and predict to the next measurement."""
         mean, covariance = imm.combine(state.means, state.covariances, probabilities)
         return state._replace(
-            predicted=self._predicted(state.means, state.covariances, probabilities),
+            predicted=self._predict_hypotheses(state.means, state.covariances, probabilities),
             probabilities=probabilities,
             mean=mean,
             covariance=covariance,
@@ -338,7 +340,7 @@ class NoiseBank(HypothesisBank):
         """Update with the noise that the action asks for, and weigh by Bayes' rule."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
-        update = self._updated(
+        update = self._update_hypotheses(
             state, measurement, self._variance(exponent, state), self._thresholds(exponent)
         )
         state = state._replace(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy
 
 from ...filters import gnss_ins, satellites
-from ..parameters import TaskParameters, parameter, sized, square_matrix
+from ..parameters import TaskParameters, check_length, parameter, square_matrix
 
 REST, LINE, SINGER = 0, 1, 2
 HYPOTHESES = ("rest", "constant-velocity", "singer")
@@ -218,7 +218,7 @@ class TightlyCoupledNavigationParameters(TaskParameters):
     def check(self) -> None:
         """Check what concerns several fields together: the chain, and where the satellites stand."""
         square_matrix("transition", self.transition, len(HYPOTHESES))
-        sized("initial_probabilities", self.initial_probabilities, len(HYPOTHESES))
+        check_length("initial_probabilities", self.initial_probabilities, len(HYPOTHESES))
         if not self.satellites or len(set(self.satellites)) != len(self.satellites):
             raise ValueError(f"satellites must be different slots, at least one, got {self.satellites!r}")
         if self.satellites_outage_probability > 0.0 and len(self.satellites) < 2:

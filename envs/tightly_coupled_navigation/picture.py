@@ -140,7 +140,7 @@ class TightlyCoupledNavigationPicture(Picture):
         """No: the strips say it in the filter's terms."""
         return False
 
-    def shaded(self) -> Sequence[tuple[float, float]]:
+    def shading(self) -> Sequence[tuple[float, float]]:
         """Steps on which the user manoeuvres."""
         return self.motions[SINGER]
 

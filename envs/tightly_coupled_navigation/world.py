@@ -13,7 +13,7 @@ import numpy
 
 from ...filters import gnss_ins
 from ...filters.ordered_sums import ordered_sum
-from ..draws import Draws, between
+from ..draws import Draws, draw_between
 from ..filter import Initial
 from ..observation import Array
 from ..task import Task
@@ -157,7 +157,9 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """Draw legs and faults; what is known of the start has errors."""
         xp, p, S = self.xp, self.parameters, self.task.satellites
         zeros = xp.zeros_like(normals[0])
-        legs, velocity = self._random_legs(draws) if p.course == "random" else self._fixed_legs(draws, zeros)
+        legs, velocity = (
+            self._random_legs(draws) if p.course == "random" else self._deterministic_legs(draws, zeros)
+        )
         faults = self._faults(draws)
         # Drawn in open country too: every scenario takes the same numbers.
         cn0 = draws.uniform("cn0", p.cn0_limits, S)
@@ -190,7 +192,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         covariance = (identity * self.initial_sigma**2)[:, :, None] + zeros
         return truth, Initial(moving + self.known * spread, covariance)
 
-    def _fixed_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array]:
+    def _deterministic_legs(self, draws: Draws, zeros: Array) -> tuple[Legs, Array]:
         """Legs of the paper's experiment, or one that is matched to hypothesis 3, and the velocity."""
         xp, p, constant = self.xp, self.parameters, self.task.constant
         # As many numbers as three random legs take: the faults of a fixed course do not depend on what it is.
@@ -291,7 +293,7 @@ class NavigationWorld(World[Task, Truth, Measurement]):
         """Draw what only some scenarios draw: the others take as many numbers as ever."""
         xp, p, T = self.xp, self.parameters, self.parameters.sampling_interval
         zero = 0.0 * faults.rate_factor
-        factor = zero + between(draws.log_uniform, "rate_fault_factor", p.rate_fault_factor)
+        factor = zero + draw_between(draws.log_uniform, "rate_fault_factor", p.rate_fault_factor)
         faults = faults._replace(rate_factor=factor)
         if p.ramp_probability:
             happens = draws.event("ramp", p.ramp_probability)

@@ -55,7 +55,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
     """What both controls share: a subclass says what an action does to the process noise."""
 
     parameters: UavAutopilotParameters
-    shown_action: Any
+    action_block: Any
     no_action: tuple[float, ...]
     """What is shown as the last action before the first."""
 
@@ -147,7 +147,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
                 lambda _, measurement: measurement.number / horizon,
                 "measurements so far over the horizon",
             ),
-            self.shown_action,
+            self.action_block,
         )
 
     @property
@@ -221,7 +221,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             mean_nis=state.mean_nis + forget * (nis - state.mean_nis),
         )
 
-    def steered(self, action: Array) -> tuple[Array, Array]:
+    def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Return the action as shown, ``(A, N)``, and the factor on the process noise, ``(N,)``."""
         raise NotImplementedError
 
@@ -229,7 +229,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
         """Variances of the readings that the update takes, of each sensor, numbers or ``(m, N)``."""
         return self.task.sensor_variances
 
-    def believed(
+    def autopilot_estimate(
         self, update: packed_covariance.Update, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
         """Return what the autopilot uses, and its packed covariance."""
@@ -237,7 +237,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
 
     def act(self, state: Filter, measurement: Measurement, action: Array) -> Filter:
         """Equations (12), (11) with the noises that the action asks for."""
-        shown, scale = self.steered(action)
+        shown, scale = self.decode_action(action)
         update = packed_covariance.update_coordinates(
             state.mean,
             state.covariance + scale * self.process_noise,
@@ -246,7 +246,7 @@ class _AutopilotFilter(Bank["UavAutopilot", Measurement, Filter]):
             self.sensor_variances(shown),
             measurement.available,
         )
-        estimate, covariance = self.believed(update, measurement, shown)
+        estimate, covariance = self.autopilot_estimate(update, measurement, shown)
         return state._replace(
             mean=update.mean,
             covariance=update.covariance,
@@ -283,10 +283,10 @@ class GainBank(_AutopilotFilter):
     """Control ``gain``: the action scales the process noise."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,), numpy.float32)
-    shown_action = Block("action", lambda f, _: f.action, "last action")
+    action_block = Block("action", lambda f, _: f.action, "last action")
     no_action = (0.0,)
 
-    def steered(self, action: Array) -> tuple[Array, Array]:
+    def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale by ``10 ** (gain_decades a)``."""
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
@@ -298,8 +298,8 @@ class GainBank(_AutopilotFilter):
         Whether the action is right about the noise, only the innovations tell. Left alone, it is the paper's filter
         with the paper's covariance.
         """
-        told = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
-        return super().covariance(state) * told
+        factor = self.xp.where(state.action[0] == 0.0, 1.0, self.xp.clip(state.mean_nis, 1.0, None))
+        return super().covariance(state) * factor
 
 
 class NoiseBank(_AutopilotFilter):
@@ -316,11 +316,11 @@ class NoiseBank(_AutopilotFilter):
         return gymnasium.spaces.Box(-1.0, 1.0, (1 + len(self.task.sensors),), numpy.float32)
 
     @property
-    def shown_action(self) -> Block:
+    def action_block(self) -> Block:
         """Last action."""
         return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors))
 
-    def steered(self, action: Array) -> tuple[Array, Array]:
+    def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale the process noise by ``10 ** (process_decades a)``."""
         xp = self.xp
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
@@ -336,7 +336,7 @@ class ModeBank(_AutopilotFilter):
     """Control ``mode``: nominal, wide-band, over-smoothed, or raw sensors, behind which the filter runs on."""
 
     action_space = gymnasium.spaces.Discrete(len(MODES))
-    shown_action = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
+    action_block = Block("action", lambda f, _: f.action, "1 if this was the last action", MODES)
     no_action = (1.0, 0.0, 0.0, 0.0)
 
     def __init__(self, task: "UavAutopilot", control: str) -> None:
@@ -348,14 +348,14 @@ class ModeBank(_AutopilotFilter):
         raw = d.H.T @ d.R @ d.H + numpy.diag(unmeasured)
         self.raw_covariance = task.constant(packed_covariance.pack(raw)[:, None])
 
-    def steered(self, action: Array) -> tuple[Array, Array]:
+    def decode_action(self, action: Array) -> tuple[Array, Array]:
         """Scale by ``wide_band_scale`` in mode "wide-band", by ``over_smoothed_scale`` in "over-smoothed"."""
         xp, p = self.xp, self.parameters
         shown = xp.stack([xp.astype(action == i, xp.float64) for i in range(len(MODES))])
         wide, smooth = (p.wide_band_scale - 1.0) * shown[1], (p.over_smoothed_scale - 1.0) * shown[3]
         return shown, 1.0 + (wide + smooth)
 
-    def believed(
+    def autopilot_estimate(
         self, update: packed_covariance.Update, measurement: Measurement, shown: Array
     ) -> tuple[Array, Array]:
         """Readings in place of the measured coordinates and zero for the others in mode "raw-sensors"."""

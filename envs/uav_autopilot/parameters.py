@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..parameters import Limits, TaskParameters, check, parameter, sized
+from ..parameters import Limits, TaskParameters, check, check_length, parameter
 from ..task import Component
 
 COORDINATES: Mapping[str, tuple[Component, ...]] = {
@@ -172,11 +172,11 @@ class UavAutopilotParameters(TaskParameters):
             raise ValueError(
                 f"sensor_sigmas must be given for sensors {sensors!r}: {missing!r} have no default"
             )
-        sized("sensor_sigmas", self.value("sensor_sigmas"), len(sensors))
+        check_length("sensor_sigmas", self.value("sensor_sigmas"), len(sensors))
         for name in ("initial_sigmas", "state_weights"):
-            sized(name, self.value(name), len(names))
+            check_length(name, self.value(name), len(names))
         if self.feedback is not None:
-            sized("feedback", self.feedback, len(names))
+            check_length("feedback", self.feedback, len(names))
         if self.plant == "P" and self.actuator_lag != 1.0:
             raise ValueError(
                 f"actuator_lag must be 1 for plant 'P', which has no actuator, got {self.actuator_lag}"

@@ -224,10 +224,10 @@ class AircraftWorld(World["UavAutopilot", Truth, Measurement]):
         )
         return truth, Measurement(number, reading, available, command, feedback)
 
-    def seen(self, measurement: Measurement) -> Array:
+    def component_readings(self, measurement: Measurement) -> Array:
         """Every coordinate that has a sensor."""
         sensors = list(self.task.sensors)
-        reading, nothing = self.received(measurement).reading, measurement.command * math.nan
+        reading, nothing = self.mask_missing(measurement).reading, measurement.command * math.nan
         rows = [nothing] * len(self.task.components)
         for i, component in enumerate(self.task.components):
             if component.name in sensors:

@@ -8,11 +8,10 @@ import xarray
 from rich.table import Table
 
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import read_recording, task_class
+from ..envs.catalogue import read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
-from ..envs.task import Task
 from ..evaluation.competitors import TOLD_MORE, kind_of
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
@@ -92,16 +91,16 @@ def find_data(
     """
     if recording is not None and scenario is not None:
         raise ValueError("--recording takes the place of --scenario: leave one of them out")
-    named = task_class(environment).scenarios if environment else {}
+    problem = problem_of(environment) if environment else None
+    named = problem.task.scenarios if problem else {}
     if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
         speeds = pair("--speeds", options.speeds)
         found = read_recording(recording or str(scenario), environment, speeds=speeds, **keywords)
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
-    if environment is None:
+    if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
-    problem = problem_of(environment)
     if scenario in named or not names_flights(scenario):
         if options.site is not None:
             raise _no_flights(scenario)
@@ -170,7 +169,6 @@ class Outcome(NamedTuple):
 
 def run(
     problem: Problem,
-    task: Task,
     experiment: Experiment,
     names: Sequence[str],
     outputs: Outputs,
@@ -183,13 +181,13 @@ def run(
 
     Args:
         problem: whose they are.
-        task: with the data.
         experiment: over what they run.
         names: of competitors.
         outputs: what will be written.
         workers: who share the work.
         trust: load models that can execute code.
     """
+    task = experiment.make_task()
     measurements = len(set(names)) * experiment.episodes * task.horizon
     size = measurements * len(task.components) * 8
     refusal = _size_warning(size, size, outputs.netcdf)
@@ -206,7 +204,7 @@ def run(
             curves = None if outputs.folder is None else curves_of(dataset)
             return Outcome(dataset, tidy_records(dataset), curves, refusal, store)
         requests = evaluation_requests(problem, experiment, names, trust)
-        work = [] if outputs.folder is None else [work_of(one) for one in requests]
+        work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))
     records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
     return Outcome(dataset, records, summary_curves, refusal, store)

@@ -1,17 +1,14 @@
 """Commands that search for something better: tuned values and trained agents."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import typer
-from rich.progress import Progress, TaskID
 
 from ..agents import training_run
 from ..agents.export import export_run
-from ..agents.settings import THROUGH_THE_FILTER, parse_settings
-from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
+from ..agents.settings import parse_settings
+from ..agents.training_run import RunOptions, Session
 from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune
@@ -19,13 +16,13 @@ from ..envs.catalogue import nearest
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store
-from ..reports import standing
-from ..reports.tables import tuned_table
+from ..reports.tables import tuning_table
 from .terminal import (
     Backend,
     Cluster,
     Environment,
     Jobs,
+    TrainedControl,
     TrainingScenario,
     Trust,
     complete_policy,
@@ -33,9 +30,7 @@ from .terminal import (
     progress_bar,
     whole_numbers,
 )
-
-Trainer = Callable[[TrainingRun, Session], TrainingRun]
-"""What trains a run."""
+from .training import open_run, open_runs, print_standing, train_runs, trainer_of
 
 
 def tune_policy(
@@ -71,102 +66,15 @@ def tune_policy(
         )
     command = f"filtergym tune {problem.name} --policy {policy} --budget {budget} --seed {seed}"
     path = save_tuned(outcome, command, out)
-    console.print(tuned_table(outcome, tunable[policy].start))
+    console.print(tuning_table(outcome, tunable[policy].start))
     console.print(f"saved in {path}; use it as --policy {policy}-tuned")
-
-
-def _trainer(algo: str) -> Trainer:
-    """Return what trains with an algorithm: a run and a session in, the run out.
-
-    Raises:
-        ValueError: if it needs packages that are not installed.
-    """
-    try:
-        import torch
-
-        if algo in THROUGH_THE_FILTER:
-            from ..agents.bptt import train_bptt as trainer
-        else:
-            from ..agents.sb3_training import train_sb3 as trainer
-    except ImportError as error:
-        raise ValueError(
-            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
-        ) from error
-    torch.set_num_threads(1)  # networks this small run slower on more
-    return trainer
-
-
-class _Training(NamedTuple):
-    """A run that is to be trained, or trained on."""
-
-    run: TrainingRun
-    session: Session
-
-
-def _session_with(session: Session, bar: Progress, line: TaskID) -> Session:
-    """Return the session with its progress and reports on the console."""
-    return replace(
-        session,
-        progress=lambda done: bar.update(line, completed=done),
-        report=lambda text: console.print(text, highlight=False),
-    )
-
-
-def _one_by_one(
-    waiting: Mapping[Path, _Training], trainer: Trainer, several: bool
-) -> dict[Path, TrainingRun]:
-    """Train in this process, up to a wish to stop."""
-    for folder, (run, session) in waiting.items():
-        if several:
-            console.print(f"{folder}: seed {run.seed}")
-        with progress_bar() as bar:
-            line = bar.add_task(f"training {run.algorithm}", total=run.steps)
-            trainer(run, _session_with(session, bar, line))
-        _print_done(folder, run)
-        if not run.finished:
-            break
-    return {folder: training.run for folder, training in waiting.items()}
-
-
-def _side_by_side(waiting: Mapping[Path, _Training], workers: Workers) -> dict[Path, TrainingRun]:
-    """Train in other processes; what each has to say is printed when it has ended."""
-    folders, found = list(waiting), {}
-    with progress_bar() as bar:
-        line = bar.add_task("training", total=sum(training.run.steps for training in waiting.values()))
-        work = list(waiting.values())
-        sizes = [training.run.steps for training in work]
-        for i, lines in workers.run(_train, work, sizes, lambda done: bar.update(line, advance=done)):
-            folder = folders[i]
-            if not training_run.holds_run(folder):
-                raise ValueError(
-                    f"{folder} is not here: the machines of a cluster must share the folder of a run"
-                )
-            found[folder] = training_run.load_run(folder, work[i].session.trust)
-            console.print(f"{folder}: seed {found[folder].seed}")
-            for text in lines:
-                console.print(text, highlight=False)
-            _print_done(folder, found[folder])
-    return found
-
-
-def _train(training: _Training, tick: Any) -> list[str]:
-    """Train in a process of its own; returns what there is to say."""
-    lines: list[str] = []
-    _trainer(training.run.algorithm)(training.run, replace(training.session, report=lines.append))
-    return lines
-
-
-def _print_done(folder: Path, run: TrainingRun) -> None:
-    console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
 
 
 def train(
     environment: Environment,
     out: Annotated[Path, typer.Option(help="Folder of the run: record, checkpoint, best agent, log.")],
     algo: Annotated[str, typer.Option(help="ppo, recurrent-ppo, sac, dqn, bptt or kalman-net.")] = "ppo",
-    control: Annotated[
-        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
-    ] = None,
+    control: TrainedControl = None,
     scenario: TrainingScenario = None,
     steps: Annotated[int | None, typer.Option(help="Environment steps in all.")] = None,
     envs: Annotated[int | None, typer.Option(help="Environments side by side.")] = None,
@@ -228,7 +136,7 @@ def train(
 
     Example: filtergym train filtergym/ManeuveringTarget-v0 --algo bptt --seeds 0-4 --out runs/bptt
     """
-    trainer = _trainer(algo)
+    trainer = trainer_of(algo)
     if seeds is not None and (seed is not None or resume):
         raise ValueError(
             "--seeds names every seed, and goes on with runs by itself: leave out --seed and --resume"
@@ -238,7 +146,6 @@ def train(
     keywords, hyperparameters = parse_settings(set_ or [])
     if reward is not None:
         keywords["reward"] = reward
-
     problem = problem_of(environment)
     options = RunOptions(
         algo,
@@ -254,43 +161,16 @@ def train(
         residual_to,
         gated,
     )
-
-    def make_run(number: int) -> TrainingRun:
-        return training_run.new_run(problem, replace(options, seed=number))
-
+    session = Session(out, resume, validate_every, trust)
     # Every run is opened before any is trained, so that a wrong word costs nothing.
-    runs: dict[Path, tuple[TrainingRun, bool]] = {}
     if seeds is None:
-        same = not (keywords or hyperparameters or config)
-        runs[out] = training_run.open_run(out, make_run(seed or 0), resume, same), resume
+        opened = [open_run(problem, options, session)]
     else:
-        for number in whole_numbers("--seeds", seeds):
-            folder = out.with_name(f"{out.name}-{number}")
-            begun = training_run.holds_run(folder)
-            run = training_run.open_run(folder, make_run(number), begun)
-            if begun and not run.finished and algo not in THROUGH_THE_FILTER:
-                training_run.check_trust(
-                    f"{folder} goes on from a checkpoint that is loaded with pickle", trust
-                )
-            runs[folder] = run, begun
-    waiting = {}
-    for folder, (run, begun) in runs.items():
-        if begun and run.finished:
-            console.print(f"{folder} is finished: {run.steps_done:,} steps")
-        else:
-            waiting[folder] = _Training(run, Session(folder.absolute(), begun, validate_every, trust))
+        opened = open_runs(problem, options, session, whole_numbers("--seeds", seeds))
     with Workers(jobs, cluster) as workers:
-        done = (
-            _one_by_one(waiting, trainer, seeds is not None)
-            if workers.alone
-            else _side_by_side(waiting, workers)
-        )
-    for folder, run in done.items():
-        runs[folder] = run, True
-    if not all(run.finished for run, _ in runs.values()):
-        return  # somebody wished to stop
-    if compare:
-        _print_standing({folder: run for folder, (run, _) in runs.items()}, trust)
+        runs = train_runs(opened, trainer, workers)
+    if compare and all(run.is_complete for run in runs):  # unless somebody wished to stop
+        print_standing(opened, runs)
 
 
 def search(
@@ -300,9 +180,7 @@ def search(
     trials: Annotated[int, typer.Option(help="In all, those before an interruption included.")] = 50,
     steps: Annotated[int, typer.Option(help="Environment steps of each run.")] = 100_000,
     seeds: Annotated[str, typer.Option(help="Training seeds of every trial, such as 0-2.")] = "0",
-    control: Annotated[
-        str | None, typer.Option(help="What the agent steers; default: the environment's first.")
-    ] = None,
+    control: TrainedControl = None,
     scenario: TrainingScenario = None,
     seed: Annotated[int, typer.Option(help="Of what is drawn to be tried.")] = 0,
     set_: Annotated[
@@ -321,7 +199,7 @@ def search(
 
     Example: filtergym search filtergym/ManeuveringTarget-v0 --algo ppo --steps 77000 --trials 50 --out searches/ppo
     """
-    trainer = _trainer(algo)
+    trainer = trainer_of(algo)
     try:
         from ..agents import search as searching
     except ImportError as error:
@@ -354,21 +232,6 @@ def search(
     best = out / "best.yml"
     if best.exists():
         console.print(f"best settings: filtergym train {environment} --algo {algo} --config {best} --out RUN")
-
-
-def _print_standing(runs: dict[Path, TrainingRun], trust: bool) -> None:
-    """Print how the best agents of runs that differ in their seed stand against who was not trained."""
-    first = next(iter(runs.values()))
-    agents = {folder: best_agent(folder) for folder in runs}
-    if any(agent.suffix != ".safetensors" for agent in agents.values()) and not trust:
-        console.print("an agent that plain arrays cannot hold is compared with --trust only")
-        return
-    opponents = standing.Opponents(first)
-    found = [
-        standing.agent_standing(runs[folder], agent, str(folder), opponents, trust)
-        for folder, agent in agents.items()
-    ]
-    console.print(standing.standing_table(found, opponents, first.scenario))
 
 
 def export(

@@ -1,29 +1,24 @@
 """Commands that measure: what there is, and how it compares on the same noise."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 import xarray
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
-from ..envs.catalogue import (
-    catalogue,
-    check_names,
-    make_task,
-    parameter_names,
-    task_class,
-)
+from ..envs.catalogue import catalogue, check_names
 from ..envs.recording import Recording
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
 from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
-from ..evaluation.recording import record
+from ..evaluation.recording import record_experiment
+from ..evaluation.rollout import Progress
 from ..names import find_competitor, is_learned
-from ..offline import default_policies, write_datasets
-from ..reports.benchmark import Cell, all_records, run_benchmark
+from ..offline import plan_datasets
+from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
@@ -35,11 +30,13 @@ from .terminal import (
     Backend,
     Cluster,
     Columns,
+    Control,
     Environment,
     Episodes,
     Experiment,
     Formats,
     Jobs,
+    Parameters,
     ScenarioName,
     Split,
     Threads,
@@ -95,13 +92,11 @@ def evaluate_policies(
         ),
     ] = None,
     scenario: ScenarioName = None,
-    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    control: Control = None,
     episodes: Episodes = 500,
     seed: Experiment = 0,
     split: Split = "test",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
-    ] = None,
+    settings: Parameters = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for records, a table, the whole result and figures.")
     ] = None,
@@ -186,9 +181,8 @@ def evaluate_policies(
         strict=strict,
         keywords=keywords,
     )
-    task = make_task(problem.task, data, **keywords)
     with Workers(jobs, cluster) as workers:
-        outcome = run(problem, task, experiment, names, outputs, workers, trust)
+        outcome = run(problem, experiment, names, outputs, workers, trust)
     write(problem, outcome, outputs, learned)
 
 
@@ -199,33 +193,22 @@ def record_scenario(
     episodes: Annotated[int, typer.Option(help="Episodes to record.")] = 10,
     seed: Experiment = 0,
     split: Split = "test",
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
-    ] = None,
+    settings: Parameters = None,
     backend: Backend = "auto",
 ) -> None:
     """Record what the sensors say in episodes of the simulation, with the truth.
 
     Example: filtergym record filtergym/ManeuveringTarget-v0 --scenario paper --episodes 20 --out plots.nc
     """
-    cls = task_class(environment)
-    keywords = parse_settings(settings or [])
-    check_names(cls, keywords)
+    problem, keywords = problem_of(environment), parse_settings(settings or [])
+    check_names(problem.task, keywords)
     if out.suffix != ".nc":
         raise ValueError(f"a recording is a NetCDF file, whose name ends in .nc, got {str(out)!r}")
     writable_file(out)
+    experiment = problem.experiment(scenario, episodes, seed, split, backend=backend, keywords=keywords)
     with progress_bar() as bar:
-        line = bar.add_task("recording", total=episodes * make_task(cls, scenario, **keywords).horizon)
-        recording = record(
-            cls.id,
-            scenario,
-            episodes,
-            seed,
-            split,
-            progress=lambda done: bar.update(line, advance=done),
-            backend=backend,
-            **keywords,
-        )
+        line = bar.add_task("recording", total=episodes * experiment.make_task().horizon)
+        recording = record_experiment(experiment, lambda done: bar.update(line, advance=done))
     with whole_file(out) as waiting:
         recording.write(waiting)
     console.print(f"{len(recording.names)} episodes in {out}", soft_wrap=True)
@@ -242,7 +225,7 @@ def write_offline(
         ),
     ] = None,
     scenario: ScenarioName = None,
-    control: Annotated[str | None, typer.Option(help="Demand this control.")] = None,
+    control: Control = None,
     episodes: Annotated[int, typer.Option(help="Episodes in each data set.")] = 1000,
     seed: Experiment = 0,
     split: Annotated[
@@ -272,28 +255,12 @@ def write_offline(
 
     Example: filtergym offline filtergym/ManeuveringTarget-v0 --policy imm --policy random --episodes 500
     """
-    cls = task_class(environment)
-    keywords = parse_settings(settings or [])
-    policies = policy or default_policies(cls.id, control)
-    known = parameter_names(cls)
-    task = make_task(cls, scenario, **{n: value for n, value in keywords.items() if n in known})
+    problem, keywords = problem_of(environment), parse_settings(settings or [])
+    experiment = problem.experiment(scenario, episodes, seed, split, control, keywords=keywords)
+    plan = plan_datasets(problem, experiment, policy, trust)
     with progress_bar() as bar:
-        total = len(policies) * episodes * (task.horizon // task.decision_interval)
-        line = bar.add_task("recording", total=total)
-        written = write_datasets(
-            cls.id,
-            policies,
-            scenario,
-            control,
-            episodes,
-            seed,
-            split,
-            out,
-            namespace,
-            progress=lambda done: bar.update(line, advance=done),
-            trust=trust,
-            **keywords,
-        )
+        line = bar.add_task("recording", total=plan.decisions)
+        written = plan.write(out, namespace, lambda done: bar.update(line, advance=done))
     console.print(datasets_table(written))
     place = f", with MINARI_DATASETS_PATH={out}" if out is not None else ""
     console.print(f'load one by minari.load_dataset("{written[0].name}"){place}', soft_wrap=True)
@@ -334,9 +301,10 @@ def benchmark(
     """
     formats = check_formats(format or [])
     check_columns(columns)
+    options = BenchmarkOptions(full, seed, environment or (), split, backend, threads, command_line())
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
-        def started(total: int) -> Any:
+        def started(total: int) -> Progress:
             line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
@@ -345,29 +313,12 @@ def benchmark(
                 print_results(result.records, result.knows)
 
         def drawn(cell: Cell, curves: xarray.Dataset) -> None:
-            figures = (
-                evaluation_figures(curves, columns, learned=shipped_agents(cell.environment))
-                if formats
-                else ()
-            )
-            for name, figure in figures:
+            learned = pretrained_agents(cell.environment)
+            for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
-        results = run_benchmark(
-            out,
-            full,
-            seed,
-            environment or (),
-            split,
-            started,
-            finished,
-            drawn,
-            backend=backend,
-            threads=threads,
-            command=command_line(),
-            workers=workers,
-        )
+        results = run_benchmark(out, options, Callbacks(started, finished, drawn), workers)
     tables = [headline_table(results)]
     tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
     with whole_files(out) as waiting:
@@ -375,7 +326,7 @@ def benchmark(
         write_text(waiting / "tables.tex", "\n".join(map(latex_table, tables)))
     print_verdict(results)
     console.print(f"results in {out}: {RESULTS}, records.csv, tables.tex", soft_wrap=True)
-    make_report(results, settings_of(command_line()), out / REPORT)
+    make_report(results, settings_of(options.command), out / REPORT)
 
 
 def animate(
@@ -402,5 +353,5 @@ def animate(
             out / f"{problem.id.rpartition('/')[2]}-{Path(name.rpartition(':')[2]).name}.gif"
         )
         maker = find_competitor(problem, name, trust)
-        write_animation(episode_frames(problem.id, name, maker, scenario, seed, every), path)
+        write_animation(episode_frames(problem.task, name, maker, scenario, seed, every), path)
         console.print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")

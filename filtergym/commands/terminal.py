@@ -67,11 +67,11 @@ def complete_training_scenario(ctx: typer.Context, incomplete: str) -> list[str]
 
 def complete_policy(ctx: typer.Context, incomplete: str) -> list[str]:
     """Names of the environment's policies, estimators, references and bounds, tuned ones, and shipped agents."""
-    from ..agents.named_policies import shipped_agents
+    from ..agents.named_policies import pretrained_agents
     from ..baselines.problem import problem_of
 
     ids = _environments_of(ctx)
-    names = dict.fromkeys(name for id in ids for name in [*problem_of(id).names, *shipped_agents(id)])
+    names = dict.fromkeys(name for id in ids for name in [*problem_of(id).names, *pretrained_agents(id)])
     return [name for name in names if name.startswith(incomplete)]
 
 
@@ -113,6 +113,13 @@ Trust = Annotated[
     typer.Option(
         "--trust", help="Load files and modules that can execute code: you made them, or know who did."
     ),
+]
+Control = Annotated[str | None, typer.Option(help="Demand this control.")]
+TrainedControl = Annotated[
+    str | None, typer.Option(help="What the agent steers; default: the environment's first.")
+]
+Parameters = Annotated[
+    list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
 ]
 Backend = Annotated[
     str,

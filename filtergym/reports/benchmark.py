@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 import xarray
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import catalogue
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
 from ..evaluation.parallel import Workers, check_workers
+from ..evaluation.rollout import Progress
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import EvaluationRequest, Summary, combine_summaries, summaries
 from ..names import evaluation_requests
@@ -26,7 +27,7 @@ from .results import (
     components_to_draw,
     select_competitors,
     settings_of,
-    thinned,
+    thin_curves,
     track_of,
     write_results,
 )
@@ -83,8 +84,8 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
         horizon: measurements of an episode.
     """
     known = problem.baselines
-    tuned = problem.tuned if full or horizon <= LONG else []
-    learned = shipped_agents(problem.id)
+    tuned = problem.tuned_policies if full or horizon <= LONG else []
+    learned = pretrained_agents(problem.id)
     if full:
         unranked = (*known.smoothers, *known.references, *known.bounds)
         everything = (*known.policies, *known.estimators, *tuned, *learned, *unranked)
@@ -152,94 +153,124 @@ def result_of(
         {name: knows[name] for name in names if name in knows},
         notes_of(dataset),
         records,
-        thinned(curves.sel(policy=shown)),
+        thin_curves(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
     )
 
 
+class BenchmarkOptions(NamedTuple):
+    """What a benchmark runs, and how."""
+
+    full: bool = False
+    """All scenarios and policies, and more episodes."""
+    seed: int = 0
+    """Number of the experiment."""
+    environments: Sequence[str] = ()
+    """Ids; none: all."""
+    split: str = "test"
+    """Or another one, for development."""
+    backend: str = "auto"
+    """What computes the steps, see :func:`~.envs.backend.task_on`."""
+    threads: int = 1
+    """How many share the episodes, of the compiled backend."""
+    command: str = "filtergym benchmark"
+    """That runs this, kept in the results."""
+
+    def requests(self, cell: Cell) -> list[EvaluationRequest]:
+        """Return what is asked for in a cell."""
+        experiment = cell.problem.experiment(
+            cell.scenario,
+            cell.episodes,
+            self.seed,
+            self.split,
+            drawn_episodes=1,
+            backend=self.backend,
+            threads=self.threads,
+        )
+        return evaluation_requests(cell.problem, experiment, cell.policies)
+
+
+class Callbacks(NamedTuple):
+    """What is called while a benchmark runs."""
+
+    started: Callable[[int], Progress] = lambda total: lambda done: None
+    """With the number of measurements; returns what is told of progress."""
+    finished: Callable[[Result], None] = lambda result: None
+    """With the result of each cell, in their order."""
+    drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None
+    """With each cell and its curves."""
+
+
+class _Results:
+    """Results of cells, made when the last competitor of each is there.
+
+    Args:
+        wanted: the cells.
+        callbacks: told of curves and results.
+    """
+
+    def __init__(self, wanted: Sequence[Cell], callbacks: Callbacks) -> None:
+        self.wanted, self.callbacks = wanted, callbacks
+        self._summaries: list[dict[str, Summary]] = [{} for _ in wanted]
+        self._results: list[Result | None] = [None] * len(wanted)
+        self._told = 0
+
+    def add(self, i: int, name: str, summary: Summary) -> None:
+        """Take in the summary of a competitor of a cell, and tell of all results that are due."""
+        cell, found = self.wanted[i], self._summaries[i]
+        found[name] = summary
+        if len(found) == len(cell.policies):
+            records, curves, head = combine_summaries([found.pop(name) for name in cell.policies])
+            self.callbacks.drawn(cell, curves)
+            learned = pretrained_agents(cell.environment)
+            self._results[i] = result_of(cell.problem, head, records, curves, learned)
+        while self._told < len(self._results) and (due := self._results[self._told]) is not None:
+            self.callbacks.finished(due)
+            self._told += 1
+
+    def all(self) -> list[Result]:
+        """Return the results, in the order of the cells."""
+        return [result for result in self._results if result is not None]
+
+
 def run_benchmark(
     folder: Path,
-    full: bool,
-    seed: int,
-    environments: Sequence[str] = (),
-    split: str = "test",
-    started: Callable[[int], Callable[[int], None]] = lambda total: lambda done: None,
-    finished: Callable[[Result], None] = lambda result: None,
-    drawn: Callable[[Cell, xarray.Dataset], None] = lambda cell, curves: None,
-    backend: str = "auto",
-    threads: int = 1,
-    command: str = "filtergym benchmark",
+    options: BenchmarkOptions,
+    callbacks: Callbacks | None = None,
     workers: Workers | None = None,
 ) -> list[Result]:
     """Run every cell, going on after an interruption with the competitors that are missing.
 
     Args:
         folder: where ``results.json`` goes; competitors wait in ``unfinished/`` until all are done.
-        full: all scenarios and policies, and more episodes.
-        seed: number of the experiment.
-        environments: ids; default: all.
-        split: "test", or another one for development.
-        started: called with the number of measurements; returns what is told of progress.
-        finished: called with the result of each cell, in their order.
-        drawn: called with each cell and its curves.
-        backend: what computes the steps, see :func:`~.envs.backend.task_on`.
-        threads: how many share the episodes, of the compiled backend.
-        command: that runs this, kept in the results.
+        options: what is run.
+        callbacks: called meanwhile; default: nothing is.
         workers: who does the work; default: this process.
 
     Returns:
         All results.
     """
-    wanted = cells(full, environments, split)
-    settings = settings_of(command)
+    wanted = cells(options.full, options.environments, options.split)
+    settings = settings_of(options.command)
     store = Store(folder / UNFINISHED)
     writable_file(folder / RESULTS)
-    tick = started(sum(cell.measurements for cell in wanted))
-    results: list[Result | None] = [None] * len(wanted)
+    callbacks = callbacks or Callbacks()
+    tick = callbacks.started(sum(cell.measurements for cell in wanted))
     # What is asked for, and the cell that it belongs to.
-    asked: list[tuple[EvaluationRequest, int]] = []
-    found: list[dict[str, Summary]] = [{} for _ in wanted]
-    for i, cell in enumerate(wanted):
-        experiment = cell.problem.experiment(
-            cell.scenario,
-            cell.episodes,
-            seed,
-            split,
-            drawn_episodes=1,
-            backend=backend,
-            threads=threads,
-        )
-        everyone = evaluation_requests(cell.problem, experiment, cell.policies)
-        asked += [(one, i) for one in everyone]
-    told = 0
-
-    def settle(i: int) -> None:
-        """Make the result of a cell when its last competitor is there, and tell of all results that are due."""
-        nonlocal told
-        cell = wanted[i]
-        if len(found[i]) == len(cell.policies):
-            everyone = [found[i].pop(name) for name in cell.policies]
-            records, curves, head = combine_summaries(everyone)
-            drawn(cell, curves)
-            results[i] = result_of(cell.problem, head, records, curves, shipped_agents(cell.environment))
-        while told < len(results) and (due := results[told]) is not None:
-            finished(due)
-            told += 1
-
+    asked = [(one, i) for i, cell in enumerate(wanted) for one in options.requests(cell)]
     workers = check_workers(workers)
     if not workers.alone:  # the dear ones first, that nobody waits for them at the end
         asked.sort(
             key=lambda one: -one[0].measurements * wanted[one[1]].problem.baselines.measurement_seconds
         )
-    work = [work_of(one) for one, _ in asked]
+    work = [work_of(wanted[i].problem, one) for one, i in asked]
+    results = _Results(wanted, callbacks)
     for k, summary in summaries([one for one, _ in asked], workers, tick, store, work):
         one, i = asked[k]
-        found[i][one.name] = summary
-        settle(i)
-    done = [result for result in results if result is not None]
-    write_results(folder / RESULTS, done, settings)
+        results.add(i, one.name, summary)
+    write_results(folder / RESULTS, results.all(), settings)
     store.clear()
-    return done
+    return results.all()
 
 
 def all_records(results: Sequence[Result]) -> list[Record]:

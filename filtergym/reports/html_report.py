@@ -22,7 +22,14 @@ from ..evaluation.metrics import Record
 from .headline import headline
 from .ranking import origin, ranking_sentence, verdict
 from .results import Result, Settings, serialise_datasets
-from .tables import against_paper, consistency_word, main_components, ranked, score_text, with_interval
+from .tables import (
+    against_paper,
+    consistency_word,
+    main_components,
+    rank_competitors,
+    score_text,
+    with_interval,
+)
 
 HTML = Path(__file__).parent / "html"
 
@@ -149,7 +156,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
     header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
     header += [*(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown), "origin", "control"]
     rows = []
-    for name, kind, control in ranked(records):
+    for name, kind, control in rank_competitors(records):
         median, wins = against_paper(found, name)
         nees = found.get((name, "anees", "state", "all"))
         value = None if nees is None else nees.value
@@ -184,7 +191,7 @@ def _differences(result: Result) -> list[list[Any]]:
         r.policy: r for r in result.records if (r.metric, r.window) == ("relative_cost_difference", "all")
     }
     rows = []
-    for name, kind, _ in ranked(result.records):
+    for name, kind, _ in rank_competitors(result.records):
         record = found.get(name)
         if record is None or record.value is None or (kind not in RANKED and name != result.reference):
             continue
@@ -232,9 +239,9 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
 def _figures(result: Result) -> list[dict[str, str]]:
     """Figures of a scenario: what each is called, what it shows in words, and what reads it instead of looking."""
     found = {(r.policy, r.metric, r.component): r for r in result.records if r.window == "all"}
-    order = [name for name, kind, _ in ranked(result.records) if kind in RANKED]
+    order = [name for name, kind, _ in rank_competitors(result.records) if kind in RANKED]
 
-    def told(metric: str, component: str, names: Sequence[str]) -> str:
+    def in_words(metric: str, component: str, names: Sequence[str]) -> str:
         parts = []
         for name in names:
             record = found.get((name, metric, component))
@@ -260,13 +267,13 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "title": "Error over time",
                 "text": "Root mean square over episodes, with 95 % bands. A click on a name shows it alone, a second "
                 "one all again.",
-                "alternative": f"RMSE of {component} over the whole run: {told('rmse', component, order[:6])}.",
+                "alternative": f"RMSE of {component} over the whole run: {in_words('rmse', component, order[:6])}.",
             },
             {
                 "kind": "exceeded",
                 "title": "Distribution of errors",
                 "text": "Share of measurements whose error is larger.",
-                "alternative": f"Largest RMSE at any time: {told('peak_rmse', component, order[:6])}.",
+                "alternative": f"Largest RMSE at any time: {in_words('peak_rmse', component, order[:6])}.",
             },
         ]
     if result.curves is not None and {"anees", "anis"} & set(result.curves):
@@ -276,10 +283,10 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "title": "Consistency",
                 "text": "Mean of the normalised squared error (NEES) or innovation (NIS) over its dimension. One is "
                 "consistent; the band holds 95 % of a consistent estimator's (chi-square).",
-                "alternative": f"Mean NEES over its dimension: {told('anees', 'state', order[:6])}.",
+                "alternative": f"Mean NEES over its dimension: {in_words('anees', 'state', order[:6])}.",
             }
         )
-    if result.curves is not None and STEERED & set(result.curves):
+    if result.curves is not None and BEHAVIOUR_CURVES & set(result.curves):
         figures.append(
             {
                 "kind": "steering",
@@ -302,5 +309,5 @@ def _figures(result: Result) -> list[dict[str, str]]:
     return figures
 
 
-STEERED = {"mode_probability", "true_class_probability", "action", "gain"}
+BEHAVIOUR_CURVES = {"mode_probability", "true_class_probability", "action", "gain"}
 """Curves of what competitors do."""

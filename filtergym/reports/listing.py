@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem
 from ..compiler.library import fastest
 from ..compiler.native import processor
@@ -27,8 +27,8 @@ def environment_lines(problem: Problem) -> Iterator[str]:
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
         "estimators": list(known.estimators),
-        "tuned": problem.tuned,
-        "learned": shipped_agents(cls.id),
+        "tuned": problem.tuned_policies,
+        "learned": pretrained_agents(cls.id),
         "parameters": parameter_names(cls),
     }
     for title, names in rows.items():

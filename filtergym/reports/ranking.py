@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ..agents.named_policies import shipped_agents
+from ..agents.named_policies import pretrained_agents
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .results import Result
@@ -40,7 +40,7 @@ def ranking(records: Sequence[Record], learned: Sequence[str] | None = None) -> 
         records: of the scenario.
         learned: names of those that were learned; default: the environment's shipped agents.
     """
-    learned = shipped_agents(records[0].environment) if learned is None else learned
+    learned = pretrained_agents(records[0].environment) if learned is None else learned
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
     places = []
     for name, kind in dict.fromkeys((r.policy, r.kind) for r in records if r.kind in RANKED):

@@ -17,7 +17,7 @@ import xarray
 from ..evaluation.competitors import RANKED
 from ..evaluation.files import write_text
 from ..evaluation.metrics import Record
-from ..evaluation.stored import read_json, restored
+from ..evaluation.stored import read_json, restore
 from ..evaluation.stored_dataset import dataset_as_json, dataset_from_json
 
 RESULTS = "results.json"
@@ -33,7 +33,10 @@ TRACK_TIMES = 160
 TRACK_DIGITS = {"truth": 7, "estimate": 7, "seen": 7}
 DIGITS = 4
 """Significant digits: a curve is looked at; of a track one also looks at a few metres in a hundred kilometres."""
-NEEDED = {"curves": ("policy", "time"), "track": ("policy", "time", "component", "unit", "estimate", "sigma")}
+REQUIRED_DIMENSIONS = {
+    "curves": ("policy", "time"),
+    "track": ("policy", "time", "component", "unit", "estimate", "sigma"),
+}
 """What a report cannot be made without."""
 
 
@@ -117,7 +120,7 @@ def spread(count: int, most: int) -> numpy.ndarray:
     return numpy.unique(numpy.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def thinned(curves: xarray.Dataset) -> xarray.Dataset:
+def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
     """Return curves at fewer times, and every other share of the errors."""
     fewer = curves.isel(time=spread(curves.sizes["time"], MOST_TIMES))
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
@@ -228,7 +231,7 @@ def read_results(path: Path) -> tuple[list[Result], Settings]:
         values = read_json(path)
         if not isinstance(values, dict) or values.get("format") != FORMAT:
             raise ValueError("it is no file of results, or one of another version of filtergym")
-        settings = restored(Settings, values.get("settings"))
+        settings = restore(Settings, values.get("settings"))
         if not isinstance(values.get("results"), list):
             raise ValueError("it holds no list of results")
         return [_restore(fields) for fields in values["results"]], settings
@@ -254,18 +257,22 @@ def read_all_results(paths: Sequence[Path]) -> tuple[list[Result], Settings]:
 def _restore(fields: Any) -> Result:
     if not isinstance(fields, dict) or not isinstance(fields.get("records"), list):
         raise ValueError("a result needs its fields, and a list of records among them")
-    records = [restored(Record, record) for record in fields["records"]]
+    records = [restore(Record, record) for record in fields["records"]]
     for record in records:
         check_numbers(record)
     datasets = {
         name: None if fields.get(name) is None else dataset_from_json(fields[name])
         for name in ("curves", "track")
     }
-    result = restored(Result, {**fields, "records": records, **datasets})
+    result = restore(Result, {**fields, "records": records, **datasets})
     if not records:
         raise ValueError("a result holds no records")
     for part, found in datasets.items():
-        missing = [] if found is None else [name for name in NEEDED[part] if name not in found.variables]
+        missing = (
+            []
+            if found is None
+            else [name for name in REQUIRED_DIMENSIONS[part] if name not in found.variables]
+        )
         if missing:
             raise ValueError(f"the {part} of a result lack {', '.join(missing)}")
     if result.curves is not None and "rmse" in result.curves and not result.curves.sizes.get("quantity"):

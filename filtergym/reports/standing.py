@@ -12,7 +12,7 @@ import numpy
 from rich.table import Table
 
 from ..agents import training_run
-from ..agents.named_policies import learned_policy
+from ..agents.named_policies import find_learned_policy
 from ..agents.training_run import TrainingEpisodes, TrainingRun, validation_backend
 from ..envs.model import Episode, Model
 from ..evaluation.bootstrap import Bootstrap, Estimate
@@ -65,9 +65,9 @@ class Opponents:
             self._fly(known.score_reference, "reference")
 
     def _fly(self, name: str, role: str) -> None:
-        self.found.append(Standing(name, role, self.measured(self.problem.competitor(name))))
+        self.found.append(Standing(name, role, self.measure(self.problem.competitor(name))))
 
-    def measured(self, competitor: Any) -> dict[str, numpy.ndarray]:
+    def measure(self, competitor: Any) -> dict[str, numpy.ndarray]:
         """Return cost and normalised estimation error of every episode, ``(episodes,)``."""
         return self.episodes.means(competitor, report=_cost_and_nees)
 
@@ -76,7 +76,7 @@ class Opponents:
         known = self.problem.baselines
         makers = {
             name: self.problem.competitor(name)
-            for name in (*known.policies, *known.estimators, *self.problem.tuned)
+            for name in (*known.policies, *known.estimators, *self.problem.tuned_policies)
         }
         names = [n for n, maker in makers.items() if n != self.paper and maker is not RandomPolicy]
         if not names:
@@ -106,8 +106,8 @@ def agent_standing(
     Raises:
         ValueError: if the agent cannot be read, or takes ``trust``.
     """
-    competitor = learned_policy(run.problem.task, str(agent), trust)
-    return Standing(name, "agent", opponents.measured(competitor), run.beat_paper)
+    competitor = find_learned_policy(run.problem.task, str(agent), trust)
+    return Standing(name, "agent", opponents.measure(competitor), run.beat_paper)
 
 
 def standing_table(agents: list[Standing], opponents: Opponents, scenario: str) -> Table:

@@ -96,7 +96,7 @@ def select_components(names: Sequence[str]) -> list[str]:
     return [g for g in names if sum(other.startswith(f"{g}_") for other in names) > 1] or list(names[:3])
 
 
-def ranked(records: Sequence[Any]) -> list[tuple[str, str, str]]:
+def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
     """Name, kind and control of every competitor: those that are ranked by their cost, then those that are not."""
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
     found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
@@ -145,7 +145,7 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
     lost = {r.policy: round(r.value * r.episodes) for r in records if r.metric == "lost_episodes" and r.value}
     if lost:
         costs["lost"] = lambda name: f"{lost.get(name, 0)}"
-    names = ranked(records)
+    names = rank_competitors(records)
     title = (
         f"{first.environment}, scenario {first.scenario} "
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
@@ -203,9 +203,11 @@ def _of_competitors(
         if kind not in RANKED and kind != section:
             table.add_section()
             section = kind
-        told = steered if kind == "policy" else f"({kind})"
+        control_column = steered if kind == "policy" else f"({kind})"
         shown = "\n".join(textwrap.wrap(name, NARROW if compact else WIDE))
-        table.add_row(shown, *([told] if control else []), *(column(name) for column in columns.values()))
+        table.add_row(
+            shown, *([control_column] if control else []), *(column(name) for column in columns.values())
+        )
     return table
 
 
@@ -288,7 +290,7 @@ def _flights(
 ) -> Table:
     """Return the table with at most some competitors beside the one that they are compared with."""
     found = {(r.scenario, r.policy, r.metric, r.component): r for r in records}
-    names = [name for name, kind, _ in ranked(over_all) if kind in RANKED]
+    names = [name for name, kind, _ in rank_competitors(over_all) if kind in RANKED]
     shown, paper = main_components(over_all), dataset.attrs["paper"]
     base = paper if paper in names else [*names, *dataset["policy"].values.tolist()][0]
     every = [name for name in names if name != paper]
@@ -339,7 +341,7 @@ def _flights(
     return table
 
 
-def tuned_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
+def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     """Return what a search has found beside the values that it started from."""
     table = Table("value", "untuned", "tuned", title=f"{outcome.policy} on {outcome.scenario}")
     for name, value in outcome.values.items():

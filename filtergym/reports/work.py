@@ -4,27 +4,31 @@ import hashlib
 import json
 
 from ..agents.learned_policy import pretrained_path
-from ..agents.named_policies import shipped_agents
-from ..baselines.problem import Problem, problem_of
+from ..agents.named_policies import pretrained_agents
+from ..baselines.problem import Problem
 from ..envs.catalogue import short_name
 from ..evaluation.evaluate import Experiment
 from ..evaluation.store import Work
 from ..evaluation.summary import EvaluationRequest
 
 
-def work_of(asked: EvaluationRequest) -> Work | None:
-    """Return the piece of work that the summary of a competitor is; None where nothing is kept of it."""
-    experiment = asked.experiment
-    meaning = meaning_of(problem_of(experiment.environment), asked.name)
+def work_of(problem: Problem, asked: EvaluationRequest) -> Work | None:
+    """Return the piece of work that the summary of a competitor is; None where nothing is kept of it.
+
+    Args:
+        problem: whose competitor it is.
+        asked: of an experiment on the problem.
+    """
+    meaning = meaning_of(problem, asked.name)
     if meaning is None:
         return None
     plain = asked._replace(maker=None, metrics=None)
-    return Work(f"{stem_of(experiment)}.{asked.name}", f"{meaning} {tuple(plain)}")
+    return Work(f"{stem_of(asked.experiment)}.{asked.name}", f"{meaning} {tuple(plain)}")
 
 
 def stem_of(experiment: Experiment) -> str:
     """Begin the name of a file about an experiment."""
-    environment, scenario = short_name(experiment.environment), experiment.scenario or "default"
+    environment, scenario = short_name(experiment.task.id), experiment.scenario or "default"
     return f"{environment}.{scenario}.{experiment.episodes}.{experiment.split}{experiment.seed}"
 
 
@@ -40,8 +44,8 @@ def meaning_of(problem: Problem, name: str) -> str | None:
     """
     if problem.name != problem.id:
         return None
-    if name in problem.tuned:
+    if name in problem.tuned_policies:
         return json.dumps(problem.tuned_values.values(name.removesuffix("-tuned"))[0])
-    if name in shipped_agents(problem.id):
+    if name in pretrained_agents(problem.id):
         return hashlib.sha256(pretrained_path(problem.id, name).read_bytes()).hexdigest()
     return name if name in problem.baselines.names else None

@@ -11,7 +11,7 @@ from ..measured import Measured, mean, means, measured
 from ..reproduction import Statement, Verdict, verdict_of
 from .experiment import (
     BOX_PAIRS,
-    COMPARED,
+    COMPARED_POLICIES,
     COMPONENTS,
     HIGH_GAINS,
     LATER,
@@ -89,7 +89,7 @@ def compared(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comp
 
 def comparisons(r: Results) -> dict[str, Comparison]:
     """Every comparison of the IMM with an adaptive filter on the manoeuvre section."""
-    canonical = {name: r.main[name].squares for name in COMPARED}
+    canonical = {name: r.main[name].squares for name in COMPARED_POLICIES}
     experiments: dict[str, Mapping[str, numpy.ndarray]] = {"canonical, 0.3 / 0.7": canonical}
     experiments |= {f"gains {a:g} / {b:g}": curves for (a, b), curves in r.boxed.items()}
     experiments |= {"polar measurements": r.polar, f"turn {LATER} scan later": r.later}
@@ -97,7 +97,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
     return {
         f"{name}; against {NAMES[other]}": compared(e["imm"], e[other], LATER if e is r.later else 0)
         for name, e in experiments.items()
-        for other in COMPARED[1:]
+        for other in COMPARED_POLICIES[1:]
     }
 
 
@@ -448,7 +448,7 @@ def tables(r: Results) -> list[Grid]:
             f"Errors along x on the paper's flight ({unit})",
             header,
             [
-                *(simulated[name] for name in COMPARED),
+                *(simulated[name] for name in COMPARED_POLICIES),
                 *exact[:-1],
                 simulated["kalman-imm"],
                 exact[-1],

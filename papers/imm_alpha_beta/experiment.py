@@ -52,9 +52,14 @@ NAMES = {
     "known-turn": "Kalman filter told the turn's scans",
     "known-input-bound": "Cramer-Rao bound, acceleration known",
 }
-COMPARED = ("imm", "adaptive", "adaptive-rearm")
+COMPARED_POLICIES = ("imm", "adaptive", "adaptive-rearm")
 COMPONENTS = (("position", "m"), ("velocity", "m/s"))
-STEPS = len(NAMES) + (len(BOX_PAIRS) + 2) * len(COMPARED) + len(VARIANTS) + len(LIKELIHOODS) * len(LOW_GAINS)
+STEPS = (
+    len(NAMES)
+    + (len(BOX_PAIRS) + 2) * len(COMPARED_POLICIES)
+    + len(VARIANTS)
+    + len(LIKELIHOODS) * len(LOW_GAINS)
+)
 
 
 def mean_squares(error: numpy.ndarray) -> numpy.ndarray:
@@ -112,8 +117,10 @@ def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any)
     kept = []
     for _ in range(lanes.decisions_per_episode):
         for episode, _ in lanes.decide(numpy.zeros((episodes, 1))):
-            said, truth = episode.measurement, task.world.state(episode.truth)
-            kept.append([values[:, :episodes] for values in (said.position, said.variance, truth)])
+            measurement, truth = episode.measurement, task.world.state(episode.truth)
+            kept.append(
+                [values[:, :episodes] for values in (measurement.position, measurement.variance, truth)]
+            )
     (initial,) = starts
     start_variance = numpy.stack([initial.covariance[i, i, :episodes] for i in range(2)])
     measurement, variance, truth = (numpy.stack(values) for values in zip(*kept, strict=True))
@@ -168,7 +175,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         return numpy.stack(mean_square_errors(flight, alpha), axis=-1)[None]
 
     def rivals(**keywords: Any) -> dict[str, Any]:
-        return {name: later(squares_of, name, episodes, **keywords) for name in COMPARED}
+        return {name: later(squares_of, name, episodes, **keywords) for name in COMPARED_POLICIES}
 
     schedule = best_schedule(flight)
     exact = {f"fixed gain {a:g}": exactly(numpy.full(scans, a)) for a in (low, high, 0.65)}

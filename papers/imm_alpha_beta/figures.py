@@ -9,7 +9,7 @@ from ...evaluation.looks import styles
 from ..measured import means
 from ..panels import draw, finish, legend_outside, looks, panels, shade
 from .claims import HIGH_BOX, LOW_BOX, NEAR_MINIMUM, grid_errors
-from .experiment import COMPARED, COMPONENTS, HIGH_GAINS, LOW_GAINS, NAMES, WINDOWS, Results
+from .experiment import COMPARED_POLICIES, COMPONENTS, HIGH_GAINS, LOW_GAINS, NAMES, WINDOWS, Results
 from .gain_schedules import ramp_schedule
 
 
@@ -90,7 +90,7 @@ def draw_errors(r: Results) -> Any:
     scans = numpy.arange(1, len(r.schedule) + 1)
     for c, (axis, (component, unit)) in enumerate(zip(grid[:, 0], COMPONENTS, strict=True)):
         _shade_turn(axis)
-        for name, style in looks((*COMPARED, "known-turn")).items():
+        for name, style in looks((*COMPARED_POLICIES, "known-turn")).items():
             draw(axis, scans, numpy.sqrt(r.main[name].squares[:, :, c]), label=NAMES[name], **style)
         axis.set_ylim(bottom=0.0)
         finish(

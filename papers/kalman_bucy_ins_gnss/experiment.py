@@ -41,7 +41,7 @@ NAMES = {
     "matched": "augmented, told the noise levels (reference)",
 }
 DRIFTING = ("plain-white", "plain-reduced", "best-constant", "augmented")
-DRAWN = ("plain-white", "plain-reduced", "augmented")
+EXAMPLE_POLICIES = ("plain-white", "plain-reduced", "augmented")
 DRIFT = 1.0
 """Constant rate error of the example run and of the attenuation experiment, m/s."""
 LONG = 2000
@@ -117,8 +117,8 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
     model = make_model(LooselyCoupledNavigation, maker.control, "paper", fixed_drift=DRIFT)
 
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
-        said = episode.measurement
-        shown = (episode.truth.reference, said.ins, said.fix, model.mean(episode))
+        measurement = episode.measurement
+        shown = (episode.truth.reference, measurement.ins, measurement.fix, model.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
 
     series = recorded(model, maker(model), episode_seeds("test", SEED, 1), fields)
@@ -138,7 +138,7 @@ def exact_plain(intensity: float, riccati: bool) -> float:
     Phi, Qd = van_loan(dynamics, growth, p.sampling_interval)
     R, settled = (
         p.receiver_variance,
-        ins_gnss.settled_gain(intensity * p.sampling_interval, p.receiver_variance),
+        ins_gnss.steady_state_gain(intensity * p.sampling_interval, p.receiver_variance),
     )
     variance, squares = 0.0, []
     for _ in range(p.horizon):
@@ -233,7 +233,7 @@ class Results(NamedTuple):
     drift: Mapping[str, numpy.ndarray]
     """Mean error over time with the drift ``DRIFT``, m, ``(1 + resamples, LONG)``."""
     paths: Mapping[str, Mapping[str, numpy.ndarray]]
-    """One run of the policies of ``DRAWN``."""
+    """One run of the policies of ``EXAMPLE_POLICIES``."""
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
@@ -267,4 +267,4 @@ def _drift(name: str, count: int) -> numpy.ndarray:
 
 
 def _example_runs() -> dict[str, dict[str, numpy.ndarray]]:
-    return {name: example_run(name) for name in DRAWN}
+    return {name: example_run(name) for name in EXAMPLE_POLICIES}

@@ -45,7 +45,7 @@ SHORTEST_LEG = 150
 
 PSEUDORANGES = {"rate_sigma": NOTHING, "accelerometer_sigma": NOTHING}
 CANONICAL_PSEUDORANGES = "pseudoranges only, stay 0.998"
-MATCHED: dict[str, dict[str, Any]] = {
+MATCHED_PARAMETERS: dict[str, dict[str, Any]] = {
     "all sensors": {},
     "no accelerometers": {"accelerometer_sigma": NOTHING},
     "pseudoranges only, stay 0.9998": PSEUDORANGES | {"transition": chain(0.9998)},
@@ -68,7 +68,7 @@ for _name, _parameter, _unit, _values in (
 ):
     SETTINGS |= {f"{_name} {value:g} {_unit}": {_parameter: value} for value in _values}
 
-STEPS = 4 + len(MATCHED) + len(WAITS) + 4 + len(SETTINGS)
+STEPS = 4 + len(MATCHED_PARAMETERS) + len(WAITS) + 4 + len(SETTINGS)
 
 COMPONENTS = (
     ("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s²"), ("attitude", "rad"), ("clock bias", "m"),
@@ -217,7 +217,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
             },
             "matched": {
                 name: run("matched", {ADAPTIVE: few, "Singer": few}, horizon=MATCHED_WINDOW[1], **keywords)
-                for name, keywords in MATCHED.items()
+                for name, keywords in MATCHED_PARAMETERS.items()
             },
             "waits": {
                 name: run("paper", {ADAPTIVE: episodes}, horizon=MOTION + 99, **keywords)

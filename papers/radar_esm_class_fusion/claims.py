@@ -25,7 +25,7 @@ from .experiment import (
 
 CLOSE = 0.01
 """Within 1 % of the ideal filter counts as having reached it (ours)."""
-RECOGNISED = 0.99
+RECOGNITION_PROBABILITY = 0.99
 """Mean P(true class) after 30 s that counts as recognition within a limited time (ours)."""
 RARE = 0.05
 """Share of runs that may be sure of a wrong class (ours)."""
@@ -34,8 +34,10 @@ SECONDS = (2, 5, 10, 20, 30, 60)
 
 
 def recognition_verdict(at_30: Sequence[Measured]) -> Verdict:
-    """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNISED`` in all classes, some, or none."""
-    return verdict_of(m.low >= RECOGNISED for m in at_30)
+    """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all classes,
+    in some, or in none.
+    """
+    return verdict_of(m.low >= RECOGNITION_PROBABILITY for m in at_30)
 
 
 def approach_verdict(excess: Sequence[Sequence[Measured]]) -> Verdict:
@@ -93,7 +95,7 @@ CLAIMS = (
         "D1",
         "The class is recognised correctly within a limited time (figure 1).",
         "{recognition}",
-        f"{EACH}, types drawn anew for every decision; all classes reach a mean of {RECOGNISED} at 30 s",
+        f"{EACH}, types drawn anew for every decision; all classes reach a mean of {RECOGNITION_PROBABILITY} at 30 s",
         lambda q: recognition_verdict(q.at_30),
     ),
     Statement(

@@ -15,7 +15,7 @@ from .experiment import (
     AFTER_STEP,
     CASES,
     HORIZON,
-    SETTLED,
+    STEADY_WINDOW,
     Results,
     covariance_curves,
     flatness,
@@ -114,7 +114,7 @@ def quantities(r: Results) -> dict[str, Any]:
     for case, loops in r.noise.items():
         F, B, H, L, K, _, _ = matrices(loops["kalman"].task)
         defects.append(f"{case}: {linear_systems.separation_defect(F, B, H, L, K):.0e}")
-        flat.append(f"{case} {flatness(loops['kalman'].innovation[:, SETTLED]):.3f}")
+        flat.append(f"{case} {flatness(loops['kalman'].innovation[:, STEADY_WINDOW]):.3f}")
     settled, alone, blind, gusts = covariance_curves(U.task).values()
     theory = [[loop_theory(s.task, scale) for scale in SCALES] for s in ours]
     transients = [r.transient(plant) for plant in plants]
@@ -139,8 +139,8 @@ def quantities(r: Results) -> dict[str, Any]:
         "literal": [settles_without_command(s.task) for s in ours],
         "overshoot": [100 * over for over, _, _ in transients],
         "settling": [settling for _, _, settling in transients],
-        "cost": mean_ratio(lambda s: s.cost[:, SETTLED]),
-        "variance": mean_ratio(lambda s: s.output[:, SETTLED] ** 2),
+        "cost": mean_ratio(lambda s: s.cost[:, STEADY_WINDOW]),
+        "variance": mean_ratio(lambda s: s.output[:, STEADY_WINDOW] ** 2),
         "above": [[f"{100 * (t[0] / plant[1][0] - 1):.0f} %" for t in plant] for plant in theory],
         "tuned": theory[1][1],
         "loose": theory[1][2],
@@ -157,7 +157,7 @@ def tables(r: Results) -> list[Grid]:
             theory = stationary(s.task, name)
             assert theory is not None
             output, control = (
-                f"{measured(means((values[:, SETTLED] ** 2).mean(axis=1))):.5f}"
+                f"{measured(means((values[:, STEADY_WINDOW] ** 2).mean(axis=1))):.5f}"
                 for values in (s.output, s.control)
             )
             rows.append(
@@ -190,7 +190,7 @@ def tables(r: Results) -> list[Grid]:
 
 def _quantities(r: Results, case: str) -> dict[str, str]:
     s = r.noise[case]["kalman"]
-    innovation, observation = s.innovation[:, SETTLED], s.observation[:, SETTLED]
+    innovation, observation = s.innovation[:, STEADY_WINDOW], s.observation[:, STEADY_WINDOW]
     over, rise, settling = r.transient(case)
     rms, theory = math.sqrt(numpy.mean(innovation**2)), math.sqrt(innovation_variance(s.task))
     noise = f"{s.variance('observation'):.4g} to {s.variance('estimate'):.4g}"

@@ -18,7 +18,7 @@ from ..reproduction import Progress, gathered, later
 
 EPISODES = 600
 HORIZON = 600
-SETTLED = slice(200, HORIZON)
+STEADY_WINDOW = slice(200, HORIZON)
 """Measurements after the burn-in."""
 AFTER_STEP = slice(300, HORIZON)
 STEP_TIME = 200
@@ -56,13 +56,13 @@ class Signals:
     plant_input: numpy.ndarray
     """Control plus white noise, plant P; control, plant U."""
 
-    def text(self, name: str, digits: int = 4, times: slice = SETTLED) -> str:
+    def text(self, name: str, digits: int = 4, times: slice = STEADY_WINDOW) -> str:
         """Mean of a signal over runs and time."""
         return f"{mean(getattr(self, name)[:, times].mean(axis=1)):.{digits}f}"
 
     def variance(self, name: str) -> float:
         """Mean square of a node about the output, settled."""
-        return float(numpy.mean((getattr(self, name) - self.output)[:, SETTLED] ** 2))
+        return float(numpy.mean((getattr(self, name) - self.output)[:, STEADY_WINDOW] ** 2))
 
     @property
     def decibel(self) -> float:
@@ -78,20 +78,20 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
     shown = task.measured.index(task.output)
 
     def fields(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
-        error, said = model.error(episode), model.records(episode)
+        error, records = model.error(episode), model.records(episode)
         covariance = numpy.moveaxis(model.covariance(episode), -1, 0)
         whitened = numpy.linalg.solve(covariance, error.T[:, :, None])[:, :, 0]
-        without_filter = numpy.full_like(said["output"], numpy.nan)
-        innovation = said.get("innovation", without_filter)
+        without_filter = numpy.full_like(records["output"], numpy.nan)
+        innovation = records.get("innovation", without_filter)
         return {
-            "output": said["output"],
-            "control": said["control_signal"],
+            "output": records["output"],
+            "control": records["control_signal"],
             "cost": model.cost(episode) * task.cost_unit,
             "observation": episode.measurement.reading[shown],
             "estimate": model.mean(episode)[task.output],
             "innovation": innovation * math.sqrt(innovation_variance(task)),
             "nees": (whitened * error.T).sum(axis=1) / len(error),
-            "nis": said["nis"] / said["nis_degrees"] if "nis" in said else without_filter,
+            "nis": records["nis"] / records["nis_degrees"] if "nis" in records else without_filter,
             "truth": episode.truth.state,
         }
 

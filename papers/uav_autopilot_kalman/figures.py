@@ -10,7 +10,7 @@ from ...evaluation.looks import COLOURS
 from ..panels import finish, legend_outside, looks, panels
 from .experiment import (
     HORIZON,
-    SETTLED,
+    STEADY_WINDOW,
     STEP_TIME,
     TWO_MINUTES,
     Results,
@@ -22,7 +22,7 @@ from .experiment import (
     theory_spectra,
 )
 
-SHOWN = slice(160, 320)
+PLOT_WINDOW = slice(160, 320)
 """Measurements of one run that are drawn."""
 
 
@@ -65,7 +65,7 @@ def figures(r: Results) -> dict[str, tuple[Any, str]]:
 
 
 def _times(signals: Signals) -> numpy.ndarray:
-    return numpy.arange(1, HORIZON + 1)[SHOWN] * interval(signals.task)
+    return numpy.arange(1, HORIZON + 1)[PLOT_WINDOW] * interval(signals.task)
 
 
 def draw_filter(noise: Signals, step: Signals) -> Any:
@@ -75,9 +75,11 @@ def draw_filter(noise: Signals, step: Signals) -> Any:
         axes[:, 0], (noise, step), ("input: white noise", "input: unit step and white noise"), strict=True
     ):
         t = _times(signals)
-        axis.plot(t, signals.observation[0, SHOWN], color=COLOURS[5], lw=0.9, label="A: observation (node 2)")
-        axis.plot(t, signals.estimate[0, SHOWN], color=COLOURS[0], lw=1.8, label="B: estimate (node 3)")
-        axis.plot(t, signals.output[0, SHOWN], color=COLOURS[6], lw=1.0, ls="--", label="true position")
+        axis.plot(
+            t, signals.observation[0, PLOT_WINDOW], color=COLOURS[5], lw=0.9, label="A: observation (node 2)"
+        )
+        axis.plot(t, signals.estimate[0, PLOT_WINDOW], color=COLOURS[0], lw=1.8, label="B: estimate (node 3)")
+        axis.plot(t, signals.output[0, PLOT_WINDOW], color=COLOURS[6], lw=1.0, ls="--", label="true position")
         finish(axis, "time, s" if signals is step else "", "position, m", title)
     axes[1, 0].axvline(STEP_TIME * interval(step.task), color="0.5", lw=0.8, ls=":")
     legend_outside(figure, "upper right")
@@ -91,7 +93,7 @@ def draw_node(name: str, unit: str, title: str, noise: Signals, step: Signals) -
         axes.T, (noise, step), ("white noise", "unit step and white noise"), strict=True
     ):
         values, T = getattr(signals, name), interval(signals.task)
-        above.plot(_times(signals), values[0, SHOWN], color=COLOURS[0], lw=1.0)
+        above.plot(_times(signals), values[0, PLOT_WINDOW], color=COLOURS[0], lw=1.0)
         # Without its last value, the one of node 1 that has no successor.
         frequency, power = spectrum(values[:, STEP_TIME : HORIZON - 2], T)
         below.plot(frequency, power, color=COLOURS[0], lw=1.4, label=f"{len(values)} runs")
@@ -116,7 +118,7 @@ def draw_pitch_spectra(signals: Signals) -> Any:
     axis, T = axes[0, 0], interval(signals.task)
     nodes = (("observation", "node 2", 5), ("estimate", "node 3", 0), ("innovation", "node 4", 2))
     for name, node, colour in nodes:
-        frequency, power = spectrum(getattr(signals, name)[:, SETTLED], T)
+        frequency, power = spectrum(getattr(signals, name)[:, STEADY_WINDOW], T)
         axis.plot(frequency[1:], power[1:], color=COLOURS[colour], lw=1.6, label=f"{node}, {name}")
         fine = numpy.geomspace(frequency[1], frequency[-1], 300)
         axis.plot(fine, theory_spectra(signals.task, fine)[name], color="k", lw=0.9, ls="--")

@@ -1,0 +1,193 @@
+"""The steps of ``filtergym train``: open the runs, train them, say how their best agents stand."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..agents import training_run
+from ..agents.settings import THROUGH_THE_FILTER
+from ..agents.training_run import RunOptions, Session, TrainingRun, best_agent
+from ..baselines.problem import Problem
+from ..evaluation.parallel import Workers
+from ..reports import standing
+from .terminal import console, progress_bar
+
+Trainer = Callable[[TrainingRun, Session], TrainingRun]
+"""What trains a run."""
+
+
+class Training(NamedTuple):
+    """A run, and how it is trained."""
+
+    folder: Path
+    """Of the run, as the user names it."""
+    run: TrainingRun
+    session: Session
+    """In the same folder, with its absolute path."""
+
+
+def trainer_of(algo: str) -> Trainer:
+    """Return what trains with an algorithm: a run and a session in, the run out.
+
+    Raises:
+        ValueError: if it needs packages that are not installed.
+    """
+    try:
+        import torch
+
+        if algo in THROUGH_THE_FILTER:
+            from ..agents.bptt import train_bptt as trainer
+        else:
+            from ..agents.sb3_training import train_sb3 as trainer
+    except ImportError as error:
+        raise ValueError(
+            f"training needs more packages: pip install 'filtergym[agents]' ({error})"
+        ) from error
+    torch.set_num_threads(1)  # networks this small run slower on more
+    return trainer
+
+
+def open_run(problem: Problem, options: RunOptions, session: Session) -> Training:
+    """Begin a run in the folder of a session, or go on with the one that is there.
+
+    Args:
+        problem: that is trained on.
+        options: what is asked of the run.
+        session: how it is trained.
+
+    Raises:
+        ValueError: as of :func:`.training_run.new_run` and :func:`.training_run.open_run`.
+    """
+    same = not (options.keywords or options.overrides or options.config)
+    asked = training_run.new_run(problem, options)
+    return _training(training_run.open_run(session.folder, asked, session.resume, same), session)
+
+
+def open_runs(
+    problem: Problem, options: RunOptions, session: Session, seeds: Sequence[int]
+) -> list[Training]:
+    """Begin a run for each seed, or go on with it where there is one, in folders that end with a dash and the seed.
+
+    Args:
+        problem: that is trained on.
+        options: what is asked of every run, but for the seed.
+        session: how they are trained; the folders begin with its folder.
+        seeds: of the runs.
+
+    Raises:
+        ValueError: as of :func:`open_run`, and for a checkpoint that can execute code and is not trusted.
+    """
+    found = []
+    for seed in seeds:
+        folder = session.folder.with_name(f"{session.folder.name}-{seed}")
+        begun = training_run.holds_run(folder)
+        asked = training_run.new_run(problem, replace(options, seed=seed))
+        run = training_run.open_run(folder, asked, begun)
+        if begun and not run.is_complete and options.algorithm not in THROUGH_THE_FILTER:
+            training_run.check_trust(
+                f"{folder} goes on from a checkpoint that is loaded with pickle", session.trust
+            )
+        found.append(_training(run, replace(session, folder=folder, resume=begun)))
+    return found
+
+
+def _training(run: TrainingRun, session: Session) -> Training:
+    # Another process may have another working directory.
+    return Training(session.folder, run, replace(session, folder=session.folder.absolute()))
+
+
+def train_runs(opened: Sequence[Training], trainer: Trainer, workers: Workers) -> list[TrainingRun]:
+    """Train what is not finished, and return all runs as they are then.
+
+    Args:
+        opened: runs of one algorithm.
+        trainer: of the algorithm.
+        workers: who share the runs.
+    """
+    waiting = []
+    for training in opened:
+        if training.session.resume and training.run.is_complete:
+            console.print(f"{training.folder} is finished: {training.run.steps_done:,} steps")
+        else:
+            waiting.append(training)
+    if workers.alone:
+        _train_one_by_one(waiting, trainer)
+        return [training.run for training in opened]
+    trained = _train_side_by_side(waiting, workers)
+    return [trained.get(training.folder, training.run) for training in opened]
+
+
+def _train_one_by_one(waiting: Sequence[Training], trainer: Trainer) -> None:
+    """Train in this process, up to a wish to stop; the runs say what has become of them."""
+    for training in waiting:
+        _train_here(training, trainer)
+        if not training.run.is_complete:
+            return
+
+
+def _train_here(training: Training, trainer: Trainer) -> None:
+    """Train a run with its progress and reports on the console."""
+    folder, run, session = training
+    console.print(f"{folder}: seed {run.seed}")
+    with progress_bar() as bar:
+        line = bar.add_task(f"training {run.algorithm}", total=run.steps)
+        shown = replace(
+            session,
+            progress=lambda done: bar.update(line, completed=done),
+            report=lambda text: console.print(text, highlight=False),
+        )
+        trainer(run, shown)
+    _print_done(folder, run)
+
+
+def _train_side_by_side(waiting: Sequence[Training], workers: Workers) -> dict[Path, TrainingRun]:
+    """Train in other processes; what each has to say is printed when it has ended."""
+    found = {}
+    sizes = [training.run.steps for training in waiting]
+    with progress_bar() as bar:
+        line = bar.add_task("training", total=sum(sizes))
+        for i, lines in workers.run(_train, waiting, sizes, lambda done: bar.update(line, advance=done)):
+            folder, _, session = waiting[i]
+            if not training_run.holds_run(folder):
+                raise ValueError(
+                    f"{folder} is not here: the machines of a cluster must share the folder of a run"
+                )
+            run = found[folder] = training_run.load_run(folder, session.trust)
+            console.print(f"{folder}: seed {run.seed}")
+            for text in lines:
+                console.print(text, highlight=False)
+            _print_done(folder, run)
+    return found
+
+
+def _train(training: Training, tick: Any) -> list[str]:
+    """Train in a process of its own; returns what there is to say."""
+    lines: list[str] = []
+    _, run, session = training
+    trainer_of(run.algorithm)(run, replace(session, report=lines.append))
+    return lines
+
+
+def _print_done(folder: Path, run: TrainingRun) -> None:
+    console.print(f"{run.steps_done:,} steps done; best agent in {folder / 'best'}, checkpoint beside it")
+
+
+def print_standing(opened: Sequence[Training], runs: Sequence[TrainingRun]) -> None:
+    """Print how the best agents of runs that differ in their seed stand against who was not trained.
+
+    Args:
+        opened: of :func:`open_run`.
+        runs: of :func:`train_runs`.
+    """
+    agents = [best_agent(training.folder) for training in opened]
+    trust = opened[0].session.trust
+    if any(agent.suffix != ".safetensors" for agent in agents) and not trust:
+        console.print("an agent that plain arrays cannot hold is compared with --trust only")
+        return
+    opponents = standing.Opponents(runs[0])
+    found = [
+        standing.agent_standing(run, agent, str(training.folder), opponents, trust)
+        for training, run, agent in zip(opened, runs, agents, strict=True)
+    ]
+    console.print(standing.standing_table(found, opponents, runs[0].scenario))
