@@ -75,7 +75,14 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
 def test_summaries_tell_what_the_evaluation_does(env):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env)
-    kinds = ([known.score_paper], known.estimators, known.references, known.bounds, pretrained_agents(env))
+    kinds = (
+        [known.score_paper],
+        known.estimators,
+        known.smoothers,
+        known.references,
+        known.bounds,
+        pretrained_agents(env),
+    )
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)

@@ -16,6 +16,7 @@ from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm
 from .references import KnownInputBound, KnownTurn
+from .smoothers import SMOOTHERS
 from .tunable_estimators import ESTIMATORS
 from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
 
@@ -183,6 +184,7 @@ BASELINES = Baselines(
         "random": RandomPolicy,
     },
     estimators=ESTIMATORS,
+    smoothers=SMOOTHERS,
     references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
@@ -201,6 +203,7 @@ BASELINES = Baselines(
         "random",
         "known-turn",
         *ESTIMATORS,
+        "imm-smoother",
         "known-input-bound",
     ),
 )

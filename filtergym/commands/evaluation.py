@@ -12,7 +12,7 @@ from ..envs.catalogue import read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
-from ..evaluation.competitors import RANKED, kind_of
+from ..evaluation.competitors import TOLD_MORE, kind_of
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
@@ -131,7 +131,7 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
     names = list(policies or known.benchmark or known.names)
     if policies or not isinstance(data, Recording):
         return names
-    return [name for name in names if kind_of(find_competitor(problem, name)) in RANKED]
+    return [name for name in names if kind_of(find_competitor(problem, name)) not in TOLD_MORE]
 
 
 class Outcome(NamedTuple):
