@@ -261,7 +261,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
-    monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
+    monkeypatch.setitem(registration.USER_TASKS, ENV, task_class(ENV))
     assert work.work_of(problem_of(ENV), asked) is None
 
 
