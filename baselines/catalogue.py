@@ -11,7 +11,7 @@ from types import ModuleType
 
 from ..envs.catalogue import nearest
 from ..envs.task import Task
-from ..evaluation.competitors import RANKED, RandomPolicy, kind_of
+from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
 
 USER_BASELINES: dict[str, Baselines] = {}
@@ -69,6 +69,7 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
     tables = {
         "policy": table.policies,
         "estimator": table.estimators,
+        "smoother": table.smoothers,
         "reference": table.references,
         "bound": table.bounds,
     }
@@ -78,6 +79,6 @@ def add_baselines(task: type[Task], table: Baselines) -> None:
                 raise ValueError(
                     f"{name!r} stands in the table as {kind}, but its kind is {kind_of(maker)!r}"
                 )
-            if kind not in RANKED and not getattr(maker, "knows", ""):
+            if kind in TOLD_MORE and not getattr(maker, "knows", ""):
                 raise ValueError(f"{kind} {name!r} does not say what it knows: set the class attribute knows")
     USER_BASELINES[task.id] = table

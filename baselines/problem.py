@@ -83,17 +83,17 @@ class Problem:
 
     @property
     def names(self) -> list[str]:
-        """Names of its policies, estimators, references and bounds, and of policies that were tuned."""
+        """Names of its policies, estimators, smoothers, references and bounds, and of policies that were tuned."""
         return [*self.baselines.names, *self.tuned_policies]
 
     def competitor(self, name: str) -> Any:
-        """Return what makes one of its own policies or estimators, tuned or not, references or bounds.
+        """Return what makes one of its own policies or estimators, tuned or not, smoothers, references or bounds.
 
         Raises:
             ValueError: if there is no such name.
         """
         known = self.baselines
-        for table in (known.policies, known.estimators, known.references, known.bounds):
+        for table in (known.policies, known.estimators, known.smoothers, known.references, known.bounds):
             if name in table:
                 return table[name]
         if name.endswith("-tuned"):

@@ -132,6 +132,8 @@ class Baselines:
     """Classes that keep the protocol :class:`.Bound`."""
     estimators: Mapping[str, Any] = field(default_factory=dict)
     """Classes that keep the protocol :class:`.Estimator`."""
+    smoothers: Mapping[str, Any] = field(default_factory=dict)
+    """Classes that keep the protocol :class:`.Smoother`: estimators that use later measurements."""
     score_paper: str = ""
     """The policy whose score is 0."""
     score_reference: str = ""
@@ -161,4 +163,4 @@ class Baselines:
     @property
     def names(self) -> tuple[str, ...]:
         """Every name, policies first."""
-        return (*self.policies, *self.estimators, *self.references, *self.bounds)
+        return (*self.policies, *self.estimators, *self.smoothers, *self.references, *self.bounds)

@@ -1,10 +1,12 @@
-"""What a policy, an estimator, a reference and a bound are.
+"""What a policy, an estimator, a smoother, a reference and a bound are.
 
 A **policy** sees observations and returns actions; learned or classical, it answers Stable-Baselines3's
 call. An **estimator** sees what a policy's filters see, the start of the track and every measurement, and answers with
-mean and covariance; it is ranked with the policies, and marked. A **reference** is an estimator that may be told what
-no competitor knows; it is never ranked. A **bound** is computed. Each says what it is by its ``kind``; what says
-nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of Stable-Baselines3.
+mean and covariance; it is ranked with the policies, and marked. A **smoother** is an estimator that answers after the
+last measurement and uses later ones, too: it is not causal, and never ranked. A **reference** is an estimator
+that may be told what no competitor knows; it is never ranked. A **bound** is computed. Each says what it is by its
+``kind``; what says nothing is an estimator if it has ``start`` and ``update``, otherwise a policy, such as a model of
+Stable-Baselines3.
 """
 
 import inspect
@@ -18,9 +20,13 @@ from ..envs.backend import host_array
 from ..envs.model import Model
 from ..envs.task import Array, Task
 
-Kind = Literal["policy", "estimator", "reference", "bound"]
+Kind = Literal["policy", "estimator", "smoother", "reference", "bound"]
 RANKED: tuple[Kind, ...] = ("policy", "estimator")
-"""What is ranked: it knows nothing that is hidden."""
+"""What is ranked: it knows nothing that is hidden, and nothing before it is measured."""
+TOLD_MORE: tuple[Kind, ...] = ("reference", "bound")
+"""What may be told more than is measured, and says so in ``knows``."""
+NOT_CAUSAL = "Not causal, with later measurements"
+"""What is said of smoothers wherever they are reported, before their names."""
 
 
 def kind_of(competitor: Any) -> Kind:
@@ -58,13 +64,17 @@ def check_competitor(name: str, found: Any, kind: Kind | None = None) -> Any:
         kind: as which it must compete; default: what it says it is.
 
     Raises:
-        ValueError: if it has not the methods of its kind: ``predict``, or ``start`` and ``update``.
+        ValueError: if it has not the methods of its kind: ``predict``, or ``start`` and ``update``, and ``smooth`` of a
+            smoother.
     """
     kind = kind or kind_of(found)
-    methods = ("predict",) if kind == "policy" else ("start", "update")
+    methods = {"policy": ("predict",), "smoother": ("start", "update", "smooth")}.get(
+        kind, ("start", "update")
+    )
     if kind not in get_args(Kind) or not _has(found, *methods):
+        too = ", a smoother smooth too" if kind == "smoother" else ""
         raise ValueError(
-            f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update"
+            f"{name!r} is no competitor: a policy has a method predict, an estimator the methods start and update{too}"
         )
     return found
 
@@ -279,6 +289,29 @@ class Estimator(Protocol):
             Mean ``(C, N)`` and covariance ``(C, C, N)`` of the task's components in their units, and the memory. A
             fourth entry may tell how well the measurement was predicted: its log-likelihood ``(N,)`` in nats, or a
             :class:`Likelihood`. Then the estimator is judged by it too, also on recordings without truth.
+        """
+
+
+class Smoother(Estimator, Protocol):
+    """An estimator that answers after the last measurement, each time with all measurements or some scans later.
+
+    It runs forward like any estimator, and what it has kept is given back to it. It says so by ``kind = "smoother"``;
+    an estimator with a method ``smooth`` alone is judged by what it says at the time. In a closed loop, where the
+    estimate decides what is measured next, it is refused.
+    """
+
+    kind: ClassVar[Kind] = "smoother"
+
+    def smooth(self, measurements: Sequence[Any], memories: Sequence[Any]) -> tuple[Array, Array]:
+        """Estimate again when all is measured.
+
+        Args:
+            measurements: the K measurements that :meth:`update` was given, in their order.
+            memories: what :meth:`start` and every :meth:`update` have returned, K + 1 of them. A memory that is changed
+                in place shows only its last state.
+
+        Returns:
+            Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` at the measurements.
         """
 
 

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation: every policy, estimator, reference and bound on identical noise.
+"""Monte Carlo evaluation: every policy, estimator, smoother, reference and bound on identical noise.
 
 The result is an :class:`xarray.Dataset` from which every number and figure follows; see :func:`run_experiment`.
 """
@@ -23,11 +23,12 @@ from ..envs.reward import charge
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
-from .competitors import RANKED, Kind, kind_of
+from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .parallel import Workers, check_workers
 from .rollout import Progress, Series, rollout
 from .seeds import episode_seeds
+from .smoothers import check_open_loop
 from .threads import one_thread
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
@@ -237,7 +238,8 @@ def run_experiment(
     Args:
         experiment: which episodes, and how.
         competitors: by the name that stands in the tables: each a class or function that makes it,
-            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``.
+            or an object, with a method ``predict`` or, of an estimator, with ``start`` and ``update``; of a smoother
+            with ``smooth``, too.
         progress: called with the number of measurements done, now and then.
         workers: who runs competitors and chunks of episodes; default: this process, one after the other.
 
@@ -327,7 +329,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
             series.add({"action": _applied(model.action_space, action, count)})
         tick(count)
     arrays = series.arrays()
-    if kind in ("estimator", "reference"):
+    if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
             if name in arrays and numpy.isnan(arrays[name]).all():
                 del arrays[name]
@@ -481,6 +483,8 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         models[name] = experiment.make_model(maker, controls[name])
     for name, model in models.items():
         check_observation(model, competitors[name], name)
+        if kinds[name] == "smoother":
+            check_open_loop(model, name)
     first = next(iter(models.values()))
     group_of_each(
         [c.name for c in first.task.components], first.task.groups
@@ -521,7 +525,7 @@ def check_sendable(task: type[Task], competitors: Mapping[str, Any]) -> None:
 def _check_truth_available(kinds: Mapping[str, Kind], name: str) -> None:
     """Raise ValueError for a competitor that needs more of the truth than a recording holds."""
     for competitor, kind in kinds.items():
-        if kind not in RANKED:
+        if kind in TOLD_MORE:
             raise ValueError(
                 f"{kind} {competitor!r} is told what recording {name!r} does not hold, more of the truth than the "
                 "components: leave it out"

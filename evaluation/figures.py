@@ -2,7 +2,7 @@
 
 At most six lines of a picture are told apart by colour: the paper's algorithm, the reference, the bound, the best
 learned and the best classical competitor, then the others by their cost; the rest stays grey. Policies and estimators
-are solid, references dashed, bounds dotted, in every picture.
+are solid, smoothers dash-dotted, references dashed, bounds dotted, in every picture.
 """
 
 import textwrap

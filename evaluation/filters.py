@@ -23,6 +23,9 @@ from ..filters.small_matrices import cholesky
 from .competitors import Kind, Likelihood, check_competitor, make_competitor
 from .dataset import FAULTS
 
+UNTOLD: tuple[Kind, ...] = ("estimator", "smoother")
+"""What starts and updates with nothing but the initial estimate and the measurements."""
+
 
 def select_lanes(part: Any, lanes: numpy.ndarray | int) -> Any:
     """Return nested tuples of arrays with some entries of their last axis, each an array of its own; or with one
@@ -242,14 +245,14 @@ def make_filter(kind: Kind, model: Model, own: Any, in_python: bool) -> Filter:
     """Make the filter of a competitor.
 
     Args:
-        kind: estimator, reference or bound.
+        kind: estimator, smoother, reference or bound.
         model: in whose loop it is put; a bound flies beside its filter.
         own: the competitor, made for the task; None where it runs in Python, beside traced steps.
         in_python: whether it does.
     """
     if kind == "bound":
         return BoundFilter(model.task, model.filter, own, in_python)
-    return (EstimatorFilter if kind == "estimator" else ReferenceFilter)(model.task, own, in_python)
+    return (EstimatorFilter if kind in UNTOLD else ReferenceFilter)(model.task, own, in_python)
 
 
 class _InPython:
@@ -391,7 +394,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
 
     Args:
         model: task with a bank.
-        competitor: estimator, reference or bound, or a class or function that makes it.
+        competitor: estimator, smoother, reference or bound, or a class or function that makes it.
         kind: what it is.
         name: of it, in errors.
         count: number of episodes.
@@ -409,7 +412,7 @@ def put_in_loop(model: Model, competitor: Any, kind: Kind, name: str, count: int
             warn_of(f"{name!r} of {model.task.id}", error)
     looped = model.with_filter(_Maker(kind, None))
     shown = f"{kind} {name!r}"
-    estimates = kind == "estimator"
+    estimates = kind in UNTOLD
     asked = (
         _CheckedInPython(own, model.task, shown, count) if estimates else _InPython(own, model.task, shown)
     )

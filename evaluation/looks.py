@@ -11,7 +11,7 @@ from .competitors import RANKED
 LINES = ("-", "--", "-.", ":")
 # Okabe and Ito's palette: distinguishable for colour-blind readers.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000", "#999933")
-LINES_OF_KINDS = {"policy": "-", "estimator": "-", "reference": "--", "bound": ":"}
+LINES_OF_KINDS = {"policy": "-", "estimator": "-", "smoother": "-.", "reference": "--", "bound": ":"}
 GREY = "0.72"
 """Of lines that are not told apart."""
 MOST_HIGHLIGHTED = 6
@@ -114,8 +114,8 @@ def looks(
     for name in chosen:
         if name not in colours:
             colours[name] = next(rest)
-    # A second reference, or bound, is told from the first by its grey.
-    for kind in ("reference", "bound"):
+    # A second smoother, reference or bound is told from the first by its grey.
+    for kind in ("smoother", "reference", "bound"):
         for name, shade in zip(
             [n for n in chosen if kinds[n] == kind], ("#000000", "0.4", "0.6") * 2, strict=False
         ):

@@ -33,7 +33,7 @@ class Record(NamedTuple):
     scenario: str
     policy: str
     kind: str
-    """"policy", "estimator", "reference" or "bound"."""
+    """"policy", "estimator", "smoother", "reference" or "bound"."""
     metric: str
     component: str
     window: str
@@ -280,6 +280,7 @@ class _Against:
         self.wins = dict(zip(self.ratios, means[len(self.costs) :], strict=True))
         ranked = {c.name: c.costs.mean() for c in contenders if c.kind in RANKED and c.costs is not None}
         self.ranked = list(ranked)
+        self.smoothers = {c.name for c in contenders if c.kind == "smoother"}
         # The first where none is a number, as of flights in which nobody was measured.
         self.best = list(ranked)[int(numpy.argmin(list(ranked.values())))] if ranked else ""
 
@@ -300,7 +301,8 @@ class _Against:
             "median_cost_ratio": bootstrap.interval(bootstrap.quantiles(self.ratios[name])),
             "win_rate": bootstrap.interval(self.wins[name]),
         }
-        if self.reference in self.costs:
+        # A share of the room that a causal competitor has says nothing of one that uses later measurements.
+        if self.reference in self.costs and name not in self.smoothers:
             found["score"] = score(cost, paper, self.means[self.reference], bootstrap)
         for metric, estimate in found.items():
             yield Measure(metric, "", "all", estimate, "1")

@@ -1,16 +1,18 @@
-"""Episodes from their seeds to their end, with a policy, an estimator, a reference or a bound in the loop."""
+"""Episodes from their seeds to their end, with whatever competes in the loop."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy
 
+from ..compiler.functions import round_up_lanes
 from ..envs.compiled import Report
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
 from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .filters import put_in_loop
+from .smoothers import SmoothedTrack, check_open_loop, run_forward
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
@@ -47,7 +49,8 @@ def rollout(
 
     Args:
         model: task with a bank; of a policy, that of its control.
-        competitor: policy, estimator, reference or bound, or a class or function that makes it.
+        competitor: policy, estimator, smoother, reference or bound, or a class or function that makes it. A smoother
+            runs over the episodes twice, the second time with what it says when all is measured.
         seeds: of the episodes, all run side by side.
         report: function of the model and the state after the measurement was taken in; default: the state itself.
         kind: what the competitor is; default: what it says.
@@ -58,6 +61,9 @@ def rollout(
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
+    if kind == "smoother":
+        check_open_loop(model, name)
+        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
     if kind != "policy":
         model = put_in_loop(model, competitor, kind, name, len(seeds))
         lanes, action = start_lanes(model, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
@@ -72,6 +78,30 @@ def rollout(
         action, memory = policy.predict(lanes.observe(), memory)
         for found, _ in lanes.decide(action, report):
             yield found, action
+
+
+def _smoothed_estimates(
+    model: Model, competitor: Any, seeds: Sequence[int], name: str
+) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Return means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of a smoother, N a multiple of eight.
+
+    Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
+    """
+    task = model.task
+    noise = [numpy.random.default_rng(seed).random((task.noise.uniforms, 1)) for seed in seeds]
+    lengths = task.lengths(numpy.concatenate(noise, axis=1))
+    K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
+    means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
+    for length in numpy.unique(lengths).tolist():
+        lanes = numpy.flatnonzero(lengths == length)
+        own = [seeds[lane] for lane in lanes.tolist()]
+        looped = put_in_loop(model, competitor, "smoother", name, len(own))
+        found = run_forward(looped, start_lanes(looped, own), length, name)
+        for kept, answered in zip((means, covariances), found, strict=True):
+            kept[..., :length, lanes] = answered[..., : len(own)]
+            kept[..., length:, lanes] = answered[..., -1:, : len(own)]
+    last = numpy.minimum(numpy.arange(width), len(seeds) - 1)
+    return means[..., last], covariances[..., last]
 
 
 class Series:

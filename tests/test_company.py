@@ -29,7 +29,7 @@ def test_an_episode_is_the_same_in_any_company(env_id, short, monkeypatch):
     names = [*problem.names, *agents]
     if env_id == "filtergym/TightlyCoupledNavigation-v0":  # every competitor takes a second to compile
         known = problem.baselines
-        kinds = (known.policies, known.estimators, known.references, known.bounds, agents)
+        kinds = (known.policies, known.estimators, known.smoothers, known.references, known.bounds, agents)
         names = [name for kind in kinds for name in list(kind)[:1]]
     everyone = evaluate(env_id, names, episodes=13, **short)
     assert_same(evaluate(env_id, names, episodes=1, **short), everyone)

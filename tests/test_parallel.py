@@ -75,7 +75,14 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
 def test_summaries_tell_what_the_evaluation_does(env):
     """One of each kind after the other: some lack what others have, as bounds, and estimators without a bank."""
     known = baselines_of(env)
-    kinds = ([known.score_paper], known.estimators, known.references, known.bounds, pretrained_agents(env))
+    kinds = (
+        [known.score_paper],
+        known.estimators,
+        known.smoothers,
+        known.references,
+        known.bounds,
+        pretrained_agents(env),
+    )
     names = list(dict.fromkeys(name for kind in kinds for name in list(kind)[:1]))
     shorter = {} if env == ENV else {"horizon": 60}
     dataset = evaluate(env, names, episodes=6, drawn_episodes=1, **shorter)
@@ -254,7 +261,7 @@ def test_what_other_code_has_kept_is_made_again(tmp_path, edit, monkeypatch, fil
 def test_of_an_environment_of_ones_own_nothing_is_kept(monkeypatch):
     """Nobody can say whether its code is what it was."""
     [asked] = evaluation_requests(problem_of(ENV), problem_of(ENV).experiment(episodes=4), ["imm"])
-    monkeypatch.setitem(registration.ADDED, ENV, task_class(ENV))
+    monkeypatch.setitem(registration.USER_TASKS, ENV, task_class(ENV))
     assert work.work_of(problem_of(ENV), asked) is None
 
 

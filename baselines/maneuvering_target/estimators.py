@@ -98,9 +98,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         )
         # All modes are left equally often in the long run, so they are met in proportion to how long they last.
         lasting = [1.0 / (1.0 - probability) for probability in stay]
-        self.probabilities = task.constant([[scans / sum(lasting)] for scans in lasting])
-        if self.probabilities.ndim == 3:
-            self.probabilities = self.probabilities[:, 0]
+        self.probabilities = task.constant([scans / sum(lasting) for scans in lasting])
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Give an estimate of position and velocity the state in which the filters are mixed."""
@@ -125,7 +123,7 @@ class KalmanInteractingMultipleModel(KalmanModel):
         return KalmanBank(
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
-            self.probabilities + 0.0 * mean[:1],
+            (self.probabilities[:, None] if self.probabilities.ndim == 1 else self.probabilities) + 0.0 * mean[:1],
         )
 
     def update(

@@ -17,6 +17,7 @@ from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm
 from .log_families import log_families
 from .references import KnownInputBound, KnownTurn
+from .smoothers import SMOOTHERS
 from .tunable_estimators import ESTIMATORS
 from .tunable_estimators import TUNABLE as TUNABLE_ESTIMATORS
 
@@ -184,6 +185,7 @@ BASELINES = Baselines(
         "random": RandomPolicy,
     },
     estimators=ESTIMATORS,
+    smoothers=SMOOTHERS,
     references={"known-turn": KnownTurn},
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
@@ -203,6 +205,7 @@ BASELINES = Baselines(
         "random",
         "known-turn",
         *ESTIMATORS,
+        "imm-smoother",
         "known-input-bound",
     ),
 )

@@ -154,6 +154,9 @@ def _policies(problem: Problem) -> list[str]:
         )
     for name, maker in known.estimators.items():
         rows.append((f"`{name}`", "(estimator)", _first_sentence(maker)))
+    for name, maker in known.smoothers.items():
+        text = f"{_first_sentence(maker)} Not causal: it uses later measurements."
+        rows.append((f"`{name}`", "(smoother)", text))
     for kind, table in (("reference", known.references), ("bound", known.bounds)):
         for name, maker in table.items():
             text = f"{_first_sentence(maker)} Knows {maker.knows}."

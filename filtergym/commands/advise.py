@@ -13,9 +13,8 @@ from ..envs.catalogue import check_names, nearest, read_recording, short_name
 from ..evaluation.files import writable_file
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table, parameter_lines
-from .evaluation import find_names
+from .evaluation import causal_names
 from .terminal import command_line, console, pair, parse_settings, progress_bar
-
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
 
@@ -100,7 +99,7 @@ def advise_on_log(
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
     learned = list(pretrained_agents(problem.id))
-    shipped = {name: find_competitor(problem, name) for name in find_names(problem, found, None)}
+    shipped = {name: find_competitor(problem, name) for name in causal_names(problem)}
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)

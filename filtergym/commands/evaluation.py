@@ -132,7 +132,13 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
     known = problem.baselines
     if policies or not isinstance(data, Recording):
         return list(policies or known.benchmark or known.names)
+    return [*causal_names(problem), *known.smoothers]
+
+
+def causal_names(problem: Problem) -> list[str]:
+    """Return the names of all that can run on a recording as it comes: classical, tuned and learned."""
     # What is drawn by lot says nothing of anybody's sensors.
+    known = problem.baselines
     classical = [name for name in known.policies if problem.competitor(name) is not RandomPolicy]
     return [*classical, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 

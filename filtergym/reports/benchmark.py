@@ -76,7 +76,7 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
     """Names that a cell compares, the paper's algorithm first.
 
     Quick: the telling ones, tuned where they can be and episodes are not long; shipped agents. Full: every policy and
-    estimator as it is, those that were tuned, shipped agents, references, bounds.
+    estimator as it is, those that were tuned, shipped agents, smoothers, references, bounds.
 
     Args:
         problem: whose they are.
@@ -87,7 +87,8 @@ def benchmark_policies(problem: Problem, full: bool, horizon: int = 0) -> tuple[
     tuned = problem.tuned_policies if full or horizon <= LONG else []
     learned = pretrained_agents(problem.id)
     if full:
-        everything = (*known.policies, *known.estimators, *tuned, *learned, *known.references, *known.bounds)
+        unranked = (*known.smoothers, *known.references, *known.bounds)
+        everything = (*known.policies, *known.estimators, *tuned, *learned, *unranked)
     else:
         telling = known.benchmark or known.names
         everything = (*(name for name in telling if f"{name}-tuned" not in tuned), *tuned, *learned)

@@ -17,7 +17,7 @@ import jinja2
 import markupsafe
 from plotly.offline import get_plotlyjs
 
-from ..evaluation.competitors import RANKED
+from ..evaluation.competitors import NOT_CAUSAL, RANKED
 from ..evaluation.metrics import Record
 from .headline import headline
 from .ranking import origin, ranking_sentence, verdict
@@ -82,6 +82,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         environments=environments,
         settings=settings,
         words=WORDS,
+        not_causal=NOT_CAUSAL,
         first=results[0].records[0],
         style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),
         script=markupsafe.Markup(script),
@@ -126,6 +127,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "sentence": ranking_sentence(result.records, result.paper, result.learned),
         "header": header,
         "rows": rows,
+        "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
         "figures": _figures(result),
         "data": _pack(
             {
@@ -139,7 +141,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
 
 
 def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
-    """Header and rows of every competitor, lowest cost first; references and bounds last."""
+    """Header and rows of every competitor, lowest cost first; smoothers, references and bounds last."""
     records = result.records
     found = {(r.policy, r.metric, r.component, r.window): r for r in records}
     shown = main_components(records)
@@ -202,7 +204,7 @@ def _dots(group: Sequence[Result]) -> dict[str, Any]:
     """What the picture over all scenarios of an environment shows: the competitors of the first one's curves."""
     return {
         "paper": group[0].paper,
-        "lines": [line for line in _lines(group[0], group) if line["origin"] != "bound"],
+        "lines": [line for line in _lines(group[0], group) if line["origin"] not in ("bound", "smoother")],
         "scenarios": [
             [result.scenario, "training" if result.training else "held out", _differences(result)]
             for result in group
@@ -220,7 +222,7 @@ def _lines(result: Result, group: Sequence[Result]) -> list[dict[str, Any]]:
             names.setdefault(name, origin(one, name, kinds.get(name, "policy")))
     # Learned ones first: there are fewer colours than names.
     coloured = sorted(
-        (name for name, where in names.items() if where not in ("paper", "reference", "bound")),
+        (name for name, where in names.items() if where not in ("paper", "reference", "bound", "smoother")),
         key=lambda name: names[name] != "learned",
     )
     own = names if result.curves is None else map(str, result.curves["policy"].values.tolist())

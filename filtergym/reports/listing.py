@@ -35,6 +35,8 @@ def environment_lines(problem: Problem) -> Iterator[str]:
         if names:
             yield f"  {title + ':':<12} {', '.join(names)}"
     yield f"  {'backend:':<12} {model.backend}{_library(model.backend)}"
+    if known.smoothers:
+        yield f"  smoothers:   {', '.join(known.smoothers)} (not causal: they use later measurements)"
     for title, table in (("references", known.references), ("bounds", known.bounds)):
         if table:
             yield f"  {title}:"

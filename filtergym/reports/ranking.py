@@ -111,7 +111,8 @@ def origin(result: Result, name: str, kind: str) -> str:
     """Return where a competitor comes from.
 
     "paper", its algorithm; "classical", another policy that steers the environment's filters; "estimator", filters of
-    its own; "learned", policy or estimator; "reference", who knows the truth; or "bound".
+    its own; "learned", policy or estimator; "smoother", which uses later measurements; "reference", who knows the
+    truth; or "bound".
     """
     if name == result.paper:
         return "paper"

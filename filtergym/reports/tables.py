@@ -12,7 +12,7 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from ..baselines.tuned_values import Tuned
-from ..evaluation.competitors import RANKED
+from ..evaluation.competitors import NOT_CAUSAL, RANKED
 from ..offline import Written
 
 NARROW, WIDE = 24, 44
@@ -97,13 +97,14 @@ def select_components(names: Sequence[str]) -> list[str]:
 
 
 def rank_competitors(records: Sequence[Any]) -> list[tuple[str, str, str]]:
-    """Name, kind and control of every competitor: those that are ranked by their cost, then references and bounds."""
+    """Name, kind and control of every competitor: those that are ranked by their cost, then those that are not."""
     cost = {r.policy: r.value for r in records if (r.metric, r.window) == ("cost", "all")}
     found = dict.fromkeys((r.policy, r.kind, r.control) for r in records)
 
-    def place(entry: tuple[str, str, str]) -> tuple[bool, float]:
+    def place(entry: tuple[str, str, str]) -> tuple[int, float]:
         value = cost.get(entry[0])
-        return entry[1] not in RANKED, math.inf if value is None else value
+        section = 0 if entry[1] in RANKED else 1 if entry[1] == "smoother" else 2
+        return section, math.inf if value is None else value
 
     return sorted(found, key=place)
 
@@ -170,6 +171,8 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         notes.append(
             "lost: episodes in which an answer was not finite, or no covariance; the last valid one is held."
         )
+    smoothers = [name for name, kind, _ in names if kind == "smoother"]
+    notes += [f"{NOT_CAUSAL}: {', '.join(smoothers)}."] if smoothers else []
     notes += [f"{name} knows {knows[name]}." for name, *_ in names if name in knows]
     tables[-1].caption = "\n".join(notes)
     return tables
@@ -186,7 +189,7 @@ def _of_competitors(
     control: bool,
     compact: bool = False,
 ) -> Table:
-    """Return a table of what each competitor has in each column; references and bounds in sections of their own."""
+    """Return a table of what each competitor has in each column; those that are not ranked in sections of their own."""
     table = Table(title_justify="left", caption_justify="left")
     if compact:
         table.box, table.pad_edge = None, False
@@ -249,9 +252,13 @@ def recording_table(records: Sequence[Any]) -> Table:
         table.add_row(*row)
     table.caption = (
         "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
-        "predicted, nats; the higher the better, if errors are white.\nmean NIS: normalised innovation squared over its dimension; in the "
-        "band if the innovations are as large as predicted; - : it reports none."
+        "predicted, nats; the higher the better, if errors are white.\nmean NIS: normalised innovation squared over "
+        "its dimension; in the band if the innovations are as large as predicted; - : it reports none."
     )
+    if any(record.kind == "smoother" for record in records):
+        table.caption += (
+            "\nA smoother predicts nothing: --estimates writes what it has found, with its deviation."
+        )
     table.caption_justify = "left"
     return table
 

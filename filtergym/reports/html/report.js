@@ -46,10 +46,11 @@
     if (line.origin === "paper") Object.assign(style, { color: css("--fg"), width: 2 });
     else if (line.origin === "reference") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dash" });
     else if (line.origin === "bound") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dot" });
+    else if (line.origin === "smoother") Object.assign(style, { color: css("--fg"), width: 1.6, dash: "dashdot" });
     else if (line.colour !== null && line.colour < COLOURS.length) Object.assign(style, { color: COLOURS[line.colour], width: line.origin === "learned" ? 2.6 : 1.6 });
     return style;
   }
-  const isGrey = (line) => !["paper", "reference", "bound"].includes(line.origin) && !(line.colour < COLOURS.length);
+  const isGrey = (line) => !["paper", "reference", "bound", "smoother"].includes(line.origin) && !(line.colour < COLOURS.length);
   const faint = (colour) => {
     const [r, g, b] = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
     return `rgba(${r},${g},${b},0.16)`;

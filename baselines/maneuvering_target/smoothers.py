@@ -1,0 +1,158 @@
+"""Smoothers of ManeuveringTarget: its Kalman filters, asked again when later scans are known.
+
+They are not causal. They run forward as the estimators that they are made of, so that with lag zero they say what these
+say; scans that missed the target are prediction only, backward too.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from ...envs.filter import Initial
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.world import Measurement
+from ...envs.observation import Array
+from ...evaluation.competitors import Likelihood
+from ...filters import coordinated_turn, imm, kalman, smoothing
+from ...filters.small_matrices import apply
+from ..table import Variant
+from .estimators import (
+    KalmanBank,
+    KalmanInteractingMultipleModel,
+    KalmanModel,
+    KalmanTurnInteractingMultipleModel,
+)
+
+
+class ConstantVelocitySmoother(KalmanModel):
+    """One Kalman filter of constant velocity with white acceleration, smoothed (Rauch, Tung and Striebel 1965).
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration, m/s^2.
+        lag: how many later scans each estimate uses; default: all of them.
+    """
+
+    kind = "smoother"
+
+    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, lag: int | None = None) -> None:
+        super().__init__(task)
+        self.variance, self.lag = acceleration**2, lag
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """Predict and update."""
+        F, unit = self.motion(measurement.interval)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * unit), measurement)
+        filtered = Initial(result.mean, result.covariance)
+        return *filtered, filtered, self.likelihood(measurement, *result[2:])
+
+    def _motion(self, mean: Array, measurement: Measurement) -> smoothing.Motion:
+        F, unit = self.motion(measurement.interval)
+        return smoothing.Motion(F, self.variance * unit, apply(F, mean))
+
+    def smooth(self, measurements: Sequence[Measurement], memories: Sequence[Initial]) -> tuple[Array, Array]:
+        """Smooth the whole track, or with the lag."""
+        filtered = smoothing.Estimate(*smoothing.stack_scans(memories))
+        motion = smoothing.over_time(
+            self._motion, smoothing.drop_last(filtered.mean), smoothing.stack_scans(measurements)
+        )
+        smoothed = smoothing.smooth(filtered, motion, self.lag)
+        return smoothed.mean[:, 1:], smoothed.covariance[:, :, 1:]
+
+
+class KalmanIMMSmoother(KalmanInteractingMultipleModel):
+    """The usual IMM over two Kalman filters of constant velocity, smoothed by a second filter backward in time.
+
+    Args:
+        task: the problem.
+        lag: how many later scans each estimate uses; default: all of them.
+        **arguments: of :class:`.KalmanInteractingMultipleModel`.
+    """
+
+    kind = "smoother"
+
+    def __init__(self, task: ManeuveringTarget, lag: int | None = None, **arguments: Any) -> None:
+        super().__init__(task, **arguments)
+        self.lag = lag
+
+    def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
+        """How every filter predicts over intervals.
+
+        Args:
+            mixed: mean from which each starts, ``(n, M, N)``.
+            T: s, ``(N,)``.
+        """
+        F, unit = self.motion(T)
+        Q = self.xp.stack([variance * unit for variance in self.variances], axis=2)
+        F = F[:, :, None]
+        return smoothing.Motion(F, Q, apply(F, mixed))
+
+    def _arrival(self, bank: KalmanBank, measurement: Measurement) -> smoothing.Arrival:
+        xp = self.xp
+        prediction = imm.predict_mode_probabilities(self.transition, bank.probabilities)
+        mixed, _ = imm.mix(bank.mean, bank.covariance, prediction.mixing)
+        there = measurement.available > 0.0
+        H = self.xp.zeros((2, bank.mean.shape[0], 1), dtype=bank.mean.dtype, device=self.task.device)
+        H = H + xp.eye(2, bank.mean.shape[0], dtype=bank.mean.dtype, device=self.task.device)[:, :, None]
+        return smoothing.Arrival(
+            self.motions(mixed, measurement.interval),
+            H + 0.0 * measurement.interval,
+            self.identity * xp.where(there, 1.0 / measurement.variance, 0.0),
+            xp.where(there, measurement.position, 0.0),
+        )
+
+    def smooth(
+        self, measurements: Sequence[Measurement], memories: Sequence[KalmanBank]
+    ) -> tuple[Array, Array]:
+        """Smooth the whole track, or with the lag."""
+        filtered = smoothing.Bank(*smoothing.stack_scans(memories))
+        arrival = smoothing.over_time(
+            self._arrival, smoothing.drop_last(filtered), smoothing.stack_scans(measurements)
+        )
+        bank = smoothing.smooth_imm(filtered, arrival, self.transition, self.lag)
+        mean, covariance = imm.combine(*bank)
+        return mean[:4, 1:], covariance[:4, :4, 1:]
+
+
+class KalmanTurnIMMSmoother(KalmanIMMSmoother, KalmanTurnInteractingMultipleModel):
+    """IMM over quiet and noisy constant velocity and the coordinated turn, smoothed by a second filter backward.
+
+    The turn is linearised where the filter has linearised it. A filter of constant velocity forgets the turn rate: its
+    transition is zero there, and its noise the variance of a turn that begins.
+
+    Args:
+        task: the problem.
+        lag: how many later scans each estimate uses; default: all of them.
+        **arguments: of :class:`.KalmanTurnInteractingMultipleModel`.
+    """
+
+    def motions(self, mixed: Array, T: Array) -> smoothing.Motion:
+        """How every filter predicts; arguments as of the class before."""
+        xp = self.xp
+        F, unit = self.motion(T)
+        nothing = 0.0 * unit[0]
+        straight = coordinated_turn.augment_turn_rate(nothing, F, 0.0)[1]
+        noises = [
+            coordinated_turn.augment_turn_rate(nothing, variance * unit, self.turn_variance)[1]
+            for variance in self.variances
+        ]
+        turning = coordinated_turn.jacobian(mixed[:, 2], T)
+        predicted = [apply(straight, mixed[:, j]) for j in range(2)]
+        return smoothing.Motion(
+            xp.stack([straight, straight, turning], axis=2),
+            xp.stack([*noises, self.turn.noise(T)], axis=2),
+            xp.stack([*predicted, coordinated_turn.propagate(mixed[:, 2], T)], axis=1),
+        )
+
+
+SMOOTHERS = {
+    "kalman-smoother": ConstantVelocitySmoother,
+    "imm-smoother": KalmanIMMSmoother,
+    "imm-turn-smoother": KalmanTurnIMMSmoother,
+    "imm-lag-1": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for one later scan only.", lag=1),
+    "imm-lag-2": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for two later scans only.", lag=2),
+    "imm-lag-5": Variant(KalmanIMMSmoother, "``imm-smoother`` that waits for five later scans only.", lag=5),
+}

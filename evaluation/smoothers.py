@@ -1,0 +1,98 @@
+"""A smoother in the loop: run forward like an estimator, then asked again with all that it has kept."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy
+
+from ..envs.failures import explain_errors
+from ..envs.filter import Initial
+from ..envs.lanes import Lanes, whole_episode
+from ..envs.model import Model
+from ..envs.observation import Array
+
+
+class SmoothedTrack:
+    """An estimator that answers what a smoother has found before; its memory counts the measurements.
+
+    Args:
+        means: ``(C, K, N)``.
+        covariances: ``(C, C, K, N)``.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, means: numpy.ndarray, covariances: numpy.ndarray) -> None:
+        self.means, self.covariances = means, covariances
+
+    def start(self, initial: Initial, N: int) -> int:
+        """Start with the first measurement."""
+        return 0
+
+    def update(self, measurement: Any, memory: int) -> tuple[Array, Array, int]:
+        """Answer for the next measurement."""
+        return self.means[:, memory], self.covariances[:, :, memory], memory + 1
+
+
+def check_open_loop(model: Model, name: str) -> None:
+    """Raise ValueError if the estimate decides what is measured next: then there is nothing to be smoothed.
+
+    Args:
+        model: in which a smoother is to run.
+        name: of the smoother.
+    """
+    plain = model.on_numpy()
+    noise = plain.task.noise
+    episode = plain.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
+    if plain.filter.feedback(episode.filter, episode.measurement) is not None:
+        raise ValueError(
+            f"smoother {name!r} cannot run in {plain.task.id}, a closed loop with these parameters, in which the "
+            "estimate steers what is measured later: leave it out"
+        )
+
+
+def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """Run a smoother forward over episodes, then let it smooth them.
+
+    Args:
+        looped: model whose filter it is.
+        lanes: its episodes, with their first measurement made.
+        length: measurements of each of them.
+        name: of the smoother, in errors.
+
+    Returns:
+        Means ``(C, K, N)`` and covariances ``(C, C, K, N)`` of K measurements.
+
+    Raises:
+        ValueError: if what it returns has other shapes.
+    """
+    python = looped.filter.in_python
+
+    def memory_in(episode: Any) -> Any:
+        return looped.filter.own.memory if python else episode.filter.memory
+
+    measurements: list[Any] = []
+    memories = [memory_in(lanes.state)]
+    action = numpy.zeros(lanes.count, dtype=numpy.int64)
+    while len(measurements) < length:
+        for episode, _ in lanes.decide(action, whole_episode):
+            measurements.append(looped.task.world.mask_missing(episode.measurement))
+            memories.append(memory_in(episode))
+    own = looped.filter.own.own if python else looped.filter.own
+    with explain_errors(f"smoother {name!r} failed after {length} measurements"):
+        means, covariances = own.smooth(measurements, memories)
+    C = len(looped.task.components)
+    return (
+        _check_shape("means", means, (C, length, lanes.width), name),
+        _check_shape("covariances", covariances, (C, C, length, lanes.width), name),
+    )
+
+
+def _check_shape(word: str, values: Any, shape: Sequence[int], name: str) -> numpy.ndarray:
+    array = numpy.asarray(values, dtype=numpy.float64)
+    if array.shape != tuple(shape):
+        raise ValueError(
+            f"smoother {name!r}: the {word} must have shape {tuple(shape)}, components, measurements and episodes, "
+            f"got {array.shape}"
+        )
+    return array

@@ -1,0 +1,471 @@
+r"""Smoothing: estimates that use later measurements too, from what a filter has kept.
+
+**One model.** Rauch, Tung and Striebel, AIAA Journal 3 (1965), 1445-1450; Särkkä, Bayesian Filtering and Smoothing
+(2013), theorem 8.2, equations (8.6). With x, P after the update at a scan, x' = F x + b and P' = F P F^T + Q before
+that of the next one,
+
+    G = P F^T P'^-1,  x^s = x + G (x^s_next - x'),  P^s = P + G (P^s_next - P') G^T
+
+The covariance is written ``(I - G F) P (I - G F)^T + G (P^s_next + Q) G^T``, the same sum of what cannot become
+negative. Where P' is singular (no process noise, a component that is known) any solution of ``P' G^T = F P`` gives the
+same result; the one of the Cholesky factor without its zero columns is taken.
+
+**Several models.** Two filters, one forward and one backward in time, as Helmick, Blair and Hoffman, Fixed-interval
+smoothing for Markovian switching systems, IEEE Trans. Information Theory 41 (1995), 1845-1855. The backward one
+carries for every mode the likelihood of all later measurements as a function of the state,
+
+    L_i(x) = p(z_next, z_next+1, ... | x, mode i) = sum_j p_ij B_j(x)
+    B_j(x) = integral of N(x_next; F_j x + b_j, Q_j) p(z_next | x_next) L_j,next(x_next)
+
+each L_j the exponential of a quadratic form, so that B_j is another one, exactly. With the forward filter's N(x_i, P_i)
+and mu_i the smoothed estimate is the mixture of all N(x_i, P_i) B_j with the weights ``mu_i p_ij integral N B_j``: it
+needs no further approximation.
+
+Approximations: the forward filter is an IMM, and the sum of B_j is replaced by one quadratic form. Reading: that one
+gives the same mean and covariance as the sum where it meets the filtered N(x_i, P_i). A sum may leave an estimate less
+certain than the filter was, in some direction, because the modes disagree about the future; no likelihood of this form
+does that, and in this direction the future then says nothing. With one model nothing is approximated. Recursions
+of the Rauch-Tung-Striebel kind mode by mode (Kim, Journal of Econometrics 60, 1994; Nadarajah, Tharmarasa, McDonald and
+Kirubarajan, IEEE Trans. AES 48, 2012, 2673-2678) divide by nothing and are shorter, but let a mode without noise be
+corrected by a smoothed state that it could never have reached.
+
+**A fixed lag** is the same recursion begun anew L scans after each: all scans take one step together, L times over.
+
+Shapes: a time axis of K scans stands before the batch, ``(n, K, N)``. A scan that missed the target is prediction only.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+from . import imm
+from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
+from .small_matrices import apply, product, transpose
+
+Carried = TypeVar("Carried", bound=tuple[Any, ...])
+
+
+class Estimate(NamedTuple):
+    """Mean and covariance."""
+
+    mean: Array
+    """``(n, ...)``."""
+    covariance: Array
+    """``(n, n, ...)``."""
+
+
+class Motion(NamedTuple):
+    """How the state moves from a scan to the next one."""
+
+    F: Array
+    """Transition matrix, or the Jacobian at the estimate, ``(n, n, ...)``."""
+    Q: Array
+    """Covariance of the process noise, ``(n, n, ...)``."""
+    predicted: Array
+    """Predicted mean at the next scan, ``(n, ...)``."""
+
+
+# --- one model
+
+
+def rauch_tung_striebel_step(filtered: Estimate, motion: Motion, later: Estimate) -> Estimate:
+    """Smooth one scan.
+
+    Args:
+        filtered: after the update at this scan, ``(n, N)`` and ``(n, n, N)``.
+        motion: from it to the next one.
+        later: smoothed at the next one; what is filtered there smooths with one more measurement.
+    """
+    F, Q = motion.F, motion.Q
+    FP = product(F, filtered.covariance)
+    gain = transpose(_solve(semidefinite_root(product(FP, transpose(F)) + Q), FP))
+    rest = _identity(filtered.mean) - product(gain, F)
+    return Estimate(
+        filtered.mean + apply(gain, later.mean - motion.predicted),
+        _symmetrize(_congruence(rest, filtered.covariance) + _congruence(gain, later.covariance + Q)),
+    )
+
+
+def smooth(filtered: Estimate, motion: Motion, lag: int | None = None) -> Estimate:
+    """Smooth a track of one Kalman filter, or extended Kalman filter.
+
+    Args:
+        filtered: after the update at each of K scans, ``(n, K, N)`` and ``(n, n, K, N)``.
+        motion: from each of the first K - 1 scans to the next one, ``(n, n, K - 1, N)`` and ``(n, K - 1, N)``.
+        lag: how many later scans each estimate uses, fewer where the track ends before; default: all of them.
+            Zero gives the filter's estimates.
+
+    Returns:
+        The smoothed estimates, in the same shapes.
+
+    Raises:
+        ValueError: for a negative lag.
+    """
+    return backward(rauch_tung_striebel_step, (drop_last(filtered), motion), filtered, lag)
+
+
+# --- several models
+
+
+class Bank(NamedTuple):
+    """Estimates of M models, with the probabilities of their modes."""
+
+    mean: Array
+    """``(n, M, ...)``."""
+    covariance: Array
+    """``(n, n, M, ...)``."""
+    probabilities: Array
+    """``(M, ...)``."""
+
+
+class Arrival(NamedTuple):
+    """How M models move from a scan to the next one, and what is measured there."""
+
+    motion: Motion
+    """Of each model, ``(n, n, M, ...)`` and ``(n, M, ...)``, predicted from its mixed mean as the IMM does."""
+    H: Array
+    """Measurement matrix, ``(m, n, ...)``."""
+    precision: Array
+    """Inverse covariance of the measurement noise, zero where nothing was received, ``(m, m, ...)``."""
+    position: Array
+    """Measurement, ``(m, ...)``; anything finite where nothing was received."""
+
+
+class Likelihood(NamedTuple):
+    """Logarithm of a likelihood, ``value + gradient^T d - d^T curvature d / 2`` with ``d = x - centre``."""
+
+    centre: Array
+    """``(n, ...)``."""
+    value: Array
+    """``(...)``."""
+    gradient: Array
+    """``(n, ...)``."""
+    curvature: Array
+    """Not negative, ``(n, n, ...)``."""
+
+
+class SmoothedBank(NamedTuple):
+    """Smoothed estimates, and the likelihood of everything later that they have used."""
+
+    bank: Bank
+    later: Likelihood
+    """Of each mode, about the filtered mean."""
+
+
+def imm_step(filtered: Bank, arrival: Arrival, next_scan: SmoothedBank, transition: Array) -> SmoothedBank:
+    """Smooth one scan of an IMM.
+
+    Args:
+        filtered: after the update at this scan.
+        arrival: at the next one.
+        next_scan: smoothed there.
+        transition: of the modes, row = from, column = to, ``(M, M)``.
+    """
+    xp = namespace(filtered.mean)
+    prediction = imm.predict_mode_probabilities(transition, filtered.probabilities)
+    mixed, _ = imm.mix(filtered.mean, filtered.covariance, prediction.mixing)
+    seen_from_here = _pull_back(_add_measurement(next_scan.later, arrival), arrival.motion, mixed)
+    # Pairs [j, i]: mode i at this scan, then mode j. Errors are counted in standard deviations of the filter,
+    # x = mean + root e with e ~ N(0, I), in which nothing needs an inverse of the covariance.
+    root = semidefinite_root(filtered.covariance)
+    pairs = Likelihood(*(_insert_axis(part, -2) for part in seen_from_here))
+    pairs = _expand_about(pairs, filtered.mean[:, None])
+    errors, log_evidence = _posterior(pairs, root[:, :, None])
+    log_weights = imm.log_probabilities(transition.T)[:, :, None] + log_evidence
+    of_mode = imm.log_mixture_density(0.0 * log_weights, log_weights)
+    error = Estimate(*imm.combine(*errors, xp.exp(log_weights - of_mode)))
+    bank = Bank(
+        filtered.mean + apply(root, error.mean),
+        _symmetrize(_congruence(root, error.covariance)),
+        imm.softmax(imm.log_probabilities(filtered.probabilities) + of_mode),
+    )
+    return SmoothedBank(bank, _likelihood_from_moments(filtered.mean, root, error, of_mode))
+
+
+def smooth_imm(filtered: Bank, arrival: Arrival, transition: Array, lag: int | None = None) -> Bank:
+    """Smooth a track of an IMM; :func:`.imm.combine` makes one estimate of each scan.
+
+    Args:
+        filtered: after the update at each of K scans, ``(n, M, K, N)``, ``(n, n, M, K, N)`` and ``(M, K, N)``.
+        arrival: at all scans but the first, K - 1 of them before the batch.
+        transition: of the modes, row = from, column = to, ``(M, M)``.
+        lag: as of :func:`smooth`.
+
+    Returns:
+        The smoothed estimates of each mode and the smoothed mode probabilities, in the same shapes.
+
+    Raises:
+        ValueError: for a negative lag.
+    """
+    nothing = Likelihood(
+        filtered.mean, 0.0 * filtered.probabilities, 0.0 * filtered.mean, 0.0 * filtered.covariance
+    )
+    step = functools.partial(imm_step, transition=transition)
+    return backward(step, (drop_last(filtered), arrival), SmoothedBank(filtered, nothing), lag).bank
+
+
+# --- the recursion over time
+
+
+def backward(
+    step: Callable[..., Carried], given: Sequence[Any], nothing_later: Carried, lag: int | None = None
+) -> Carried:
+    """Run a backward recursion over the time axis, the last but one.
+
+    Args:
+        step: of what is given of a scan and what is carried from the next one; it knows no time axis.
+        given: nested tuples of arrays of the first K - 1 scans, ``(..., K - 1, N)``; what is the same at all scans or
+            in the whole batch has an axis of one.
+        nothing_later: what is carried from each of K scans if nothing later is used.
+        lag: how many later scans are used; default: all.
+
+    Returns:
+        What is carried from each of K scans.
+
+    Raises:
+        ValueError: for a negative lag.
+    """
+    if lag is not None and lag < 0:
+        raise ValueError(f"a lag is a number of later scans, at least 0, got {lag}")
+    K, N = _arrays_of(nothing_later)[0].shape[-2:]
+    given = [_map_arrays(lambda values: _broadcast_scans(values, (K - 1, N)), part) for part in given]
+    if lag is None or lag >= K - 1:
+        found = [_map_arrays(lambda values: values[..., K - 1, :], nothing_later)]
+        for k in reversed(range(K - 1)):
+            found.append(
+                step(*(_map_arrays(lambda values, k=k: values[..., k, :], part) for part in given), found[-1])
+            )
+        return stack_scans(found[::-1])
+    carried = nothing_later
+    for _ in range(lag):
+        stepped = over_time(step, *given, _map_arrays(lambda values: values[..., 1:, :], carried))
+        carried = _map_arrays(
+            lambda early, last: namespace(last).concat([early, last[..., K - 1 :, :]], axis=-2),
+            stepped,
+            nothing_later,
+        )
+    return carried
+
+
+def over_time(function: Callable[..., Any], *parts: Any) -> Any:
+    """Call a function that knows no time axis once for all scans.
+
+    Args:
+        function: of nested tuples of arrays ``(..., N)``, each episode for itself.
+        *parts: the same with a time axis, ``(..., K, N)``.
+
+    Returns:
+        What it returns, with a time axis.
+    """
+    first = _arrays_of(parts)[0]
+    last = first.shape[-2:]
+    found = function(*_map_arrays(_flatten_time, parts))
+    return _map_arrays(lambda values: namespace(values).reshape(values, (*values.shape[:-1], *last)), found)
+
+
+def stack_scans(scans: Sequence[Any]) -> Any:
+    """Put a time axis into nested tuples of arrays ``(..., N)``, one for each scan: ``(..., K, N)``."""
+    return _map_arrays(lambda *arrays: namespace(arrays[0]).stack(arrays, axis=-2), *scans)
+
+
+def drop_last(part: Any) -> Any:
+    """Return nested tuples of arrays ``(..., K, N)`` without the last scan."""
+    return _map_arrays(lambda values: values[..., :-1, :], part)
+
+
+def _map_arrays(function: Callable[..., Array], *parts: Any) -> Any:
+    """Apply a function to the arrays of nested tuples."""
+    first = parts[0]
+    if isinstance(first, tuple):
+        answers = [_map_arrays(function, *each) for each in zip(*parts, strict=True)]
+        return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
+    return function(*parts)
+
+
+def _arrays_of(part: Any) -> list[Array]:
+    return [array for each in part for array in _arrays_of(each)] if isinstance(part, tuple) else [part]
+
+
+def _broadcast_scans(values: Array, last: tuple[int, int]) -> Array:
+    return namespace(values).broadcast_to(values, (*values.shape[:-2], *last))
+
+
+def _flatten_time(values: Array) -> Array:
+    """Scans side by side in the batch."""
+    return namespace(values).reshape(values, (*values.shape[:-2], values.shape[-2] * values.shape[-1]))
+
+
+# --- likelihoods as quadratic forms
+
+
+def _expand_about(likelihood: Likelihood, centre: Array) -> Likelihood:
+    """Write a likelihood about another centre."""
+    step = centre - likelihood.centre
+    bent = apply(likelihood.curvature, step)
+    value = likelihood.value + _dot(likelihood.gradient - 0.5 * bent, step)
+    return Likelihood(centre, value, likelihood.gradient - bent, likelihood.curvature)
+
+
+def _add_measurement(later: Likelihood, arrival: Arrival) -> Likelihood:
+    """Add what is measured at a scan to what follows it, about the predicted means."""
+    likelihood = _expand_about(later, arrival.motion.predicted)
+    H, precision = (_insert_axis(matrix, -2) for matrix in (arrival.H, arrival.precision))
+    weighted = product(transpose(H), precision)
+    residual = _insert_axis(arrival.position, -2) - apply(H, likelihood.centre)
+    return likelihood._replace(
+        value=likelihood.value - 0.5 * _dot(residual, apply(precision, residual)),
+        gradient=likelihood.gradient + apply(weighted, residual),
+        curvature=likelihood.curvature + product(weighted, H),
+    )
+
+
+def _pull_back(likelihood: Likelihood, motion: Motion, centre: Array) -> Likelihood:
+    """Integrate over the process noise: the likelihood of a state one scan before, about ``centre``, from which the
+    centre of the given one is predicted.
+    """
+    root = semidefinite_root(motion.Q)
+    bent = product(likelihood.curvature, root)
+    inner = semidefinite_root(_identity(centre) + product(transpose(root), bent))
+    error = apply(transpose(root), likelihood.gradient)
+    gain = transpose(_solve(inner, transpose(bent)))
+    rest = _identity(centre) - product(gain, transpose(root))
+    curvature = _congruence(rest, likelihood.curvature) + product(gain, transpose(gain))
+    back = transpose(motion.F)
+    return Likelihood(
+        centre,
+        likelihood.value + 0.5 * _dot(error, _solve(inner, error)) - _log_diagonal(inner),
+        apply(back, likelihood.gradient - apply(gain, error)),
+        _symmetrize(_congruence(back, curvature)),
+    )
+
+
+def _posterior(likelihood: Likelihood, root: Array) -> tuple[Estimate, Array]:
+    """Bayes' rule for ``x = centre + root e`` with ``e ~ N(0, I)``.
+
+    Returns:
+        Mean and covariance of e, and the logarithm of the evidence.
+    """
+    back = transpose(root)
+    inner = semidefinite_root(_identity(likelihood.centre) + _congruence(back, likelihood.curvature))
+    pull = apply(back, likelihood.gradient)
+    mean = _solve(inner, pull)
+    covariance = _solve(inner, _identity(likelihood.centre) + 0.0 * inner)
+    evidence = likelihood.value + 0.5 * _dot(pull, mean) - _log_diagonal(inner)
+    return Estimate(mean, _symmetrize(covariance)), evidence
+
+
+def _likelihood_from_moments(centre: Array, root: Array, error: Estimate, log_evidence: Array) -> Likelihood:
+    """Likelihood that leads from ``e ~ N(0, I)`` to an error with this mean and covariance, ``x = centre + root e``.
+
+    In a direction in which the variance is not below one it says nothing.
+    """
+    xp = namespace(centre)
+    # LAPACK refuses what is not finite, for the whole batch; here only the episode's own estimates are lost.
+    lost = xp.isnan(ordered_sum([row for matrix in error.covariance for row in matrix]))
+    covariance = xp.where(lost, _identity(centre), error.covariance)
+    variances, directions = xp.linalg.eigh(xp.moveaxis(covariance, (0, 1), (-2, -1)))
+    variances = xp.moveaxis(variances, -1, 0)
+    directions = xp.moveaxis(directions, (-2, -1), (0, 1))
+    informed = variances < 1.0
+    variances = xp.where(informed, variances, 1.0)
+    along = xp.where(informed, apply(transpose(directions), error.mean), 0.0)
+    curvature = 1.0 / variances - 1.0
+    directions = _solve_upper(root, directions)
+    return Likelihood(
+        centre,
+        log_evidence - 0.5 * ordered_sum(along**2 / variances + xp.log(variances)),
+        apply(directions, along / variances),
+        _symmetrize(product(directions * curvature[None], transpose(directions))),
+    )
+
+
+# --- matrices
+
+
+def semidefinite_root(A: Array) -> Array:
+    """Lower triangular L with ``A = L L^T``; where a pivot is rounding, its column is zero.
+
+    Args:
+        A: symmetric and not negative, ``(n, n, ...)``.
+    """
+    xp = namespace(A)
+    n = A.shape[0]
+    tolerance = n * xp.finfo(A.dtype).eps
+    zero = 0.0 * A[0, 0]
+    rows: list[list[Array]] = [[zero] * n for _ in range(n)]
+    for j in range(n):
+        pivot = A[j, j] - ordered_sum([rows[j][k] ** 2 for k in range(j)] or [zero])
+        positive = pivot > tolerance * A[j, j]
+        rows[j][j] = xp.where(positive, xp.sqrt(xp.where(positive, pivot, 1.0)), pivot * 0.0)
+        for i in range(j + 1, n):
+            entry = A[i, j] - ordered_sum([rows[i][k] * rows[j][k] for k in range(j)] or [zero])
+            rows[i][j] = xp.where(positive, entry / xp.where(positive, rows[j][j], 1.0), entry * 0.0)
+    return xp.stack([xp.stack(row) for row in rows])
+
+
+def _solve_lower(L: Array, b: Array) -> Array:
+    """Solve ``L y = b`` by rows; zero where the pivot is."""
+    xp = namespace(b)
+    y: list[Array] = []
+    for i in range(L.shape[0]):
+        entry = b[i]
+        for j in range(i):
+            entry = entry - L[i, j] * y[j]
+        y.append(_divide(entry, L[i, i]))
+    return xp.stack(y)
+
+
+def _solve_upper(L: Array, b: Array) -> Array:
+    """Solve ``L^T x = b`` by rows; zero where the pivot is."""
+    n = L.shape[0]
+    x: list[Array] = [None] * n
+    for i in reversed(range(n)):
+        entry = b[i]
+        for j in range(i + 1, n):
+            entry = entry - L[j, i] * x[j]
+        x[i] = _divide(entry, L[i, i])
+    return namespace(b).stack(x)
+
+
+def _divide(entry: Array, pivot: Array) -> Array:
+    xp = namespace(entry)
+    positive = pivot != 0.0
+    return xp.where(positive, entry / xp.where(positive, pivot, 1.0), entry * 0.0)
+
+
+def _solve(L: Array, b: Array) -> Array:
+    """Solve ``L L^T x = b`` for vectors ``(n, ...)`` or matrices ``(n, p, ...)``."""
+    return _solve_upper(L, _solve_lower(L, b))
+
+
+def _log_diagonal(L: Array) -> Array:
+    """Half the logarithm of the determinant of ``L L^T``."""
+    xp = namespace(L)
+    return ordered_sum([xp.log(L[i, i]) for i in range(L.shape[0])])
+
+
+def _congruence(A: Array, P: Array) -> Array:
+    """``A P A^T``."""
+    return product(product(A, P), transpose(A))
+
+
+def _symmetrize(P: Array) -> Array:
+    """Without the asymmetry that rounding leaves."""
+    return 0.5 * (P + transpose(P))
+
+
+def _identity(mean: Array) -> Array:
+    """Unit matrix ``(n, n, 1, ...)`` for vectors ``(n, ...)``."""
+    xp, n = namespace(mean), mean.shape[0]
+    unit = xp.eye(n, dtype=mean.dtype, device=mean.device)
+    return xp.reshape(unit, (n, n, *(1 for _ in mean.shape[1:])))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return ordered_sum([a[i] * b[i] for i in range(a.shape[0])])
+
+
+def _insert_axis(values: Array, axis: int) -> Array:
+    """Put an axis of one before the batch."""
+    return namespace(values).expand_dims(values, axis=axis)
