@@ -123,7 +123,8 @@ class KalmanInteractingMultipleModel(KalmanModel):
         return KalmanBank(
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
-            (self.probabilities[:, None] if self.probabilities.ndim == 1 else self.probabilities) + 0.0 * mean[:1],
+            (self.probabilities[:, None] if self.probabilities.ndim == 1 else self.probabilities)
+            + 0.0 * mean[:1],
         )
 
     def update(
