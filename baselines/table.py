@@ -11,6 +11,9 @@ from ..envs.model import Model
 from ..evaluation.competitors import ConstantPolicy, Policy
 from .alarm import Alarm
 
+if TYPE_CHECKING:
+    from ..envs.recording import Recording
+
 if TYPE_CHECKING:  # it takes xarray, and `import filtergym` does not
     from ..evaluation.own_metrics import OwnMetrics
 
@@ -27,6 +30,10 @@ class Tunable:
     """The values in force without tuning."""
     apply: Callable[[Mapping[str, float]], tuple[dict[str, Any], Callable[[Any], Any]]]
     """From values to keywords of the task and what makes the policy or estimator for it."""
+    in_lanes: bool = True
+    """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Of the values, without their logarithm; what is not named is a pure number."""
 
 
 def tunable(
@@ -142,6 +149,9 @@ class Baselines:
     full benchmark."""
     tunable: Mapping[str, Tunable] = field(default_factory=dict)
     """Policies and estimators that :mod:`.tuning` can tune; ``NAME-tuned`` is the tuned one."""
+    log_families: "Callable[[Recording | None], Mapping[str, Tunable]] | None" = None
+    """Estimators that are fitted to a recording, with limits that suit it (None: any recording); without this function
+    those of ``tunable``."""
     best_constant: str = ""
     """The tunable policy that stands for the best constant action in the room table."""
     metrics: "OwnMetrics | None" = None

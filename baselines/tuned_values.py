@@ -6,7 +6,7 @@ import reprlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..envs.catalogue import nearest, short_name
 from ..evaluation.competitors import Kind
@@ -33,12 +33,21 @@ class Tuned:
     seed: int
 
 
-class TunedPolicy(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TunedPolicy:
     """A policy or estimator with tuned values, some of which belong to the task."""
 
     task_keywords: dict[str, Any]
     control: str | None
     make: Callable[[Any], Any]
+    content: str
+    """All that it is made of, in words: what is equal in these is compiled once."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TunedPolicy) and other.content == self.content
+
+    def __hash__(self) -> int:
+        return hash(self.content)
 
     @property
     def kind(self) -> Kind:
@@ -124,8 +133,20 @@ class TunedValues:
         if policy not in self.tunable:
             raise nearest("tunable policy", policy, self.tunable)
         tunable = self.tunable[policy]
-        keywords, make = tunable.apply(self.values(policy)[0])
-        return TunedPolicy(keywords, tunable.control, make)
+        values = self.values(policy)[0]
+        return tuned_policy(f"{self.environment} {policy}", tunable, values)
+
+
+def tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
+    """Return what makes a policy or estimator with these values.
+
+    Args:
+        name: of environment and policy; the same name means the same code.
+        tunable: what takes the values.
+        values: by name.
+    """
+    keywords, make = tunable.apply(values)
+    return TunedPolicy(keywords, tunable.control, make, f"{name} {sorted(values.items())!r}")
 
 
 def round_value(value: float) -> float:

@@ -53,6 +53,11 @@ class LogFormat:
     parameters, where a file gives no initial estimate; raises :class:`ValueError` if that cannot be."""
     targets_move: bool = False
     """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
+    scale_noise: Callable[[Any, Any], Any] | None = None
+    """Multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None where none are."""
+    predict: Callable[[Any, Any], tuple[Any, Any]] | None = None
+    """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
+    was received: from the mean ``(C, N)`` after the measurement before, and the ``Measurement``."""
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
     empty where they may not."""

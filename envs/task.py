@@ -46,6 +46,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy
 
+from ..filters.array_namespace import lane_arrays, stack_nested
 from .draws import Draws
 from .filter import Bank
 from .log_format import LogFormat
@@ -289,7 +290,13 @@ class Task(ABC):
         return {}
 
     def constant(self, values: Any) -> Array:
-        """Turn numbers into a float64 array of the task's namespace and device."""
+        """Turn numbers into a float64 array of the task's namespace and device; nested lists may hold arrays ``(N,)``
+        beside numbers, where episodes differ, and then get a last axis of N.
+        """
+        if isinstance(values, list | tuple):
+            arrays = lane_arrays(values)
+            if arrays:
+                return stack_nested(values, 0.0 * sum(arrays[1:], arrays[0]), self.xp)
         return self.xp.asarray(values, dtype=self.xp.float64, device=self.device)
 
 

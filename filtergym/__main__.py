@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from . import __version__
-from .commands import improve, measure, report
+from .commands import advise, improve, measure, report
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
@@ -34,6 +34,9 @@ GROUPS: dict[str, Commands] = {
         "evaluate": measure.evaluate_policies,
         "benchmark": measure.benchmark,
         "reproduce": report.reproduce,
+    },
+    "Judge a log": {
+        "advise": advise.advise_on_log,
     },
     "Tune and train": {
         "tune": improve.tune_policy,

@@ -9,6 +9,7 @@ import xarray
 
 from .agents.gate import add_gate
 from .agents.named_policies import find_learned_policy, pretrained_agents, with_normalisation
+from .baselines.fitted_filters import SUFFIX, read_fitted
 from .baselines.problem import Problem, import_problem, problem_of
 from .envs.backend import make_model
 from .envs.catalogue import import_task, import_user_module, nearest
@@ -47,6 +48,8 @@ def competitor(env: str, name: str | Path, *, trust: bool = False) -> Any:
 
 def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> Any:
     """Return what a name stands for in a problem; names and refusals as of :func:`competitor`."""
+    if isinstance(name, Path) and name.name.endswith(SUFFIX):
+        return read_fitted(name, problem)
     if isinstance(name, Path):
         found = find_learned_policy(problem.task, str(name.absolute()), trust)
         if found is None:
@@ -54,6 +57,8 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
                 f"cannot load policy {str(name)!r}: it is neither a .safetensors, a .zip, nor a folder"
             )
         return found
+    if name.endswith(SUFFIX):
+        return read_fitted(Path(name), problem)
     if name.startswith(GATED):
         inner = name.removeprefix(GATED)
         return add_gate(inner, find_competitor(problem, inner, trust))
@@ -76,7 +81,7 @@ def find_competitor(problem: Problem, name: str | Path, trust: bool = False) -> 
 def is_learned(problem: Problem, name: str) -> bool:
     """Whether a name stands for something learned: a shipped agent, a file, or the folder of a training run."""
     inner = name.removeprefix(GATED)
-    if inner in problem.names:
+    if inner in problem.names or inner.endswith(SUFFIX):
         return False
     return inner in pretrained_agents(problem.id) or ":" not in inner
 

@@ -24,3 +24,23 @@ def namespace(array: Array) -> ModuleType:
     if kind not in _BY_TYPE:
         _BY_TYPE[kind] = numpy if issubclass(kind, numpy.generic) else array_api_compat.array_namespace(array)
     return _BY_TYPE[kind]
+
+
+def lane_arrays(values: Any) -> list[Array]:
+    """Arrays with axes that stand among the numbers of nested lists."""
+    if isinstance(values, list | tuple):
+        return [array for value in values for array in lane_arrays(value)]
+    return [values] if getattr(values, "ndim", 0) else []
+
+
+def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
+    """Array of nested lists of numbers and arrays ``(N,)``, ``(..., N)``.
+
+    Args:
+        values: nested lists.
+        zero: ``(N,)``, added to every number.
+        xp: array namespace.
+    """
+    if isinstance(values, list | tuple):
+        return xp.stack([stack_nested(value, zero, xp) for value in values])
+    return values + zero

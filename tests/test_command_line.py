@@ -75,6 +75,7 @@ REFUSED = {
     "report": ("missing.json", "--out", "new/report.html"),
     "tune": (ENV, "--policy", "imm", "--budget", "0", "--out", "new"),
     "reproduce": ("imm-alpha-beta", "--episodes", "0", "--out", "new"),
+    "advise": ("missing.csv", "--out", "new/mine.filter.json"),
     "animate": (ENV, "--policy", "known-turn", "--out", "new"),
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
     "search": (ENV, "--trials", "0", "--out", "new"),

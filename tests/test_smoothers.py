@@ -243,6 +243,7 @@ def test_episodes_of_a_recording_are_smoothed_each_to_its_end_without_truth(name
             seconds=made.seconds[n : n + 1, :length],
             lengths=lengths[n : n + 1],
             names=("alone",),
+            started=made.started[n : n + 1],
         )
         single = evaluate(TARGET, [name], scenario=alone, tracks=True)
         for field in ("estimate", "covariance"):

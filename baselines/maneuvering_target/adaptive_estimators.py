@@ -122,15 +122,12 @@ class VariationalBayes(KalmanModel):
             residual = xp.where(available > 0.0, measurement.position - result.mean[:2], 0.0)
             return residual / xp.sqrt(variance), updated / variance, result
 
-        noise, result = noise_adaptation.variational_bayes(
-            noise_adaptation.forget(memory.noise, self.forgetting, available),
-            update,
-            self.iterations,
-            available,
-        )
+        before = noise_adaptation.forget(memory.noise, self.forgetting, available)
+        noise, result = noise_adaptation.variational_bayes(before, update, self.iterations, available)
         track = MeasurementNoiseTrack(result.mean, result.covariance, noise)
-        # With the noise that this scan was used with, which it has a part in.
-        return result.mean, result.covariance, track, self.likelihood(measurement, *result[2:])
+        # With the noise known before this scan: with that of its own update, it would have predicted itself.
+        nominal = self.update_estimate(predicted, measurement._replace(variance=before.variance * variance))
+        return result.mean, result.covariance, track, self.likelihood(measurement, *nominal[2:])
 
 
 class VariationalBayesPrediction(KalmanModel):

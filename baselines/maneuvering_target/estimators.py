@@ -16,6 +16,8 @@ from ...filters import coordinated_turn, imm, kalman, unscented
 from ...filters.ordered_sums import weighted_sum
 from ...filters.small_matrices import outer
 
+DEGREE = math.pi / 180.0
+
 
 class KalmanModel:
     """The constant-velocity model in x and y."""
@@ -121,7 +123,8 @@ class KalmanInteractingMultipleModel(KalmanModel):
         return KalmanBank(
             xp.stack([mean] * M, axis=1),
             xp.stack([covariance] * M, axis=2),
-            self.probabilities[:, None] + 0.0 * mean[:1],
+            (self.probabilities[:, None] if self.probabilities.ndim == 1 else self.probabilities)
+            + 0.0 * mean[:1],
         )
 
     def update(
@@ -158,7 +161,7 @@ class TurnModel(KalmanModel):
     def __init__(self, task: ManeuveringTarget, acceleration: float, turn_rate_change: float) -> None:
         super().__init__(task)
         self.variance = acceleration**2
-        self.change = math.radians(turn_rate_change) / task.parameters.sampling_interval
+        self.change = DEGREE * turn_rate_change / task.parameters.sampling_interval
         self.H = task.constant([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]])
 
     def noise(self, T: Array) -> Array:
@@ -197,7 +200,7 @@ class KalmanTurnInteractingMultipleModel(KalmanInteractingMultipleModel):
     ) -> None:
         super().__init__(task, accelerations[:2], stay)
         self.turn = TurnModel(task, accelerations[2], turn_rate_change)
-        self.turn_variance = math.radians(turn_rate_start) ** 2
+        self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
     def augment(self, mean: Array, covariance: Array) -> tuple[Array, Array]:
         """Add the turn rate of straight flight."""
@@ -237,7 +240,7 @@ class UnscentedTurn(TurnModel):
         turn_rate_start: float = 2.0,
     ) -> None:
         super().__init__(task, acceleration, turn_rate_change)
-        self.turn_variance = math.radians(turn_rate_start) ** 2
+        self.turn_variance = (DEGREE * turn_rate_start) ** 2
 
     def start(self, initial: Initial, N: int) -> Initial:
         """Start where everyone starts, with a turn rate about zero."""

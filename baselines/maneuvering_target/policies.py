@@ -15,6 +15,7 @@ from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...filters import imm
 from ..table import Baselines, PaperAction, Tunable, tunable
 from .alarm import RadarAlarm
+from .log_families import log_families
 from .references import KnownInputBound, KnownTurn
 from .smoothers import SMOOTHERS
 from .tunable_estimators import ESTIMATORS
@@ -189,6 +190,7 @@ BASELINES = Baselines(
     bounds={"known-input-bound": KnownInputBound},
     score_paper="imm",
     score_reference="known-turn",
+    log_families=log_families,
     tunable=TUNABLE,
     alarm=RadarAlarm,
     best_constant="fixed-best",

@@ -275,11 +275,24 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
     return {"interval": numpy.diff(time), "elapsed": time[1:] - last}
 
 
+def scale_noise(measurement: Any, factor: Any) -> Any:
+    """Multiply the deviations stated in a measurement by a factor."""
+    return measurement._replace(variance=measurement.variance * factor**2)
+
+
+def predict_position(mean: Any, measurement: Any) -> tuple[Any, Any]:
+    """Position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2, N)`` each."""
+    predicted = mean[:2] + measurement.interval * mean[2:4]
+    return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
+
+
 LOG_FORMAT = LogFormat(
     COLUMNS,
     read_log,
     start_track,
     targets_move=True,
+    scale_noise=scale_noise,
+    predict=predict_position,
     plane=("x", "y", "truth_position_x", "truth_position_y"),
     longest_interval=60.0,
 )

@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import xarray
 from rich.table import Table
 
+from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
-from ..evaluation.competitors import TOLD_MORE, kind_of
+from ..evaluation.competitors import RandomPolicy
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
 from ..evaluation.estimates import check_estimates, write_estimates
@@ -24,7 +25,7 @@ from ..evaluation.parallel import Workers
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
-from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
+from ..names import competitors_of, evaluation_requests, tidy_records
 from ..reports.benchmark import result_of
 from ..reports.export import latex_table, records_as_csv
 from ..reports.records import write_records
@@ -124,14 +125,22 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
 
     Args:
         problem: whose they are.
-        data: of :func:`find_data`. References and bounds are told what a recording does not hold.
+        data: of :func:`find_data`. To a recording all that could run on it is asked, tuned and learned ones, too;
+            references and bounds are told what it does not hold.
         policies: names that are given.
     """
     known = problem.baselines
-    names = list(policies or known.benchmark or known.names)
     if policies or not isinstance(data, Recording):
-        return names
-    return [name for name in names if kind_of(find_competitor(problem, name)) not in TOLD_MORE]
+        return list(policies or known.benchmark or known.names)
+    return [*causal_names(problem), *known.smoothers]
+
+
+def causal_names(problem: Problem) -> list[str]:
+    """Return the names of all that can run on a recording as it comes: classical, tuned and learned."""
+    # What is drawn by lot says nothing of anybody's sensors.
+    known = problem.baselines
+    classical = [name for name in known.policies if problem.competitor(name) is not RandomPolicy]
+    return [*classical, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
 class Outcome(NamedTuple):

@@ -17,6 +17,7 @@ from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store
 from ..reports.tables import tuning_table
+from .advise import fit_to_recording
 from .terminal import (
     Backend,
     Cluster,
@@ -27,6 +28,7 @@ from .terminal import (
     Trust,
     complete_policy,
     console,
+    pair,
     progress_bar,
     whole_numbers,
 )
@@ -43,12 +45,26 @@ def tune_policy(
     backend: Backend = "auto",
     jobs: Jobs = 1,
     cluster: Cluster = None,
+    recording: Annotated[
+        str | None,
+        typer.Option(help="What sensors really said, NetCDF or tables (CSV): fit an estimator to it."),
+    ] = None,
+    speeds: Annotated[
+        str,
+        typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
+    ] = "0.01,1000",
 ) -> None:
     """Search a policy's parameters on training episodes; afterwards --policy NAME-tuned uses them.
+
+    With a recording an estimator's parameters are fitted to it by maximum likelihood, with their intervals: one of the
+    filters that filtergym advise names, or module:Class. The file is written into the folder of --out.
 
     Example: filtergym tune filtergym/ManeuveringTarget-v0 --policy imm --budget 4000000
     """
     problem = problem_of(environment)
+    if recording is not None:
+        fit_to_recording(problem, policy, recording, pair("--speeds", speeds), out, seed)
+        return
     tunable = problem.baselines.tunable
     if policy not in tunable:
         raise nearest("tunable policy", policy, tunable)

@@ -252,8 +252,8 @@ def recording_table(records: Sequence[Any]) -> Table:
         table.add_row(*row)
     table.caption = (
         "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
-        "predicted, nats; the higher the better.\nmean NIS: normalised innovation squared over its dimension; in the "
-        "band if the innovations are as large as predicted; - : it reports none."
+        "predicted, nats; the higher the better, if errors are white.\nmean NIS: normalised innovation squared over "
+        "its dimension; in the band if the innovations are as large as predicted; - : it reports none."
     )
     if any(record.kind == "smoother" for record in records):
         table.caption += (

@@ -1,0 +1,198 @@
+"""Filters whose parameters are fitted to a log of positions, and how far they may go.
+
+Limits follow from the log: an acceleration of ``r / T^2`` moves a target by the deviation r of a measurement within an
+interval T. What is far below is a straight line to the sensor, what is far above follows every measurement.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy
+
+from ...envs.filter import Initial
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.world import Measurement
+from ...envs.observation import Array
+from ...envs.recording import Recording
+from ...evaluation.competitors import Likelihood
+from ...filters import kalman
+from ..table import Tunable, tunable, without_logarithms
+from .adaptive_estimators import SageHusa, VariationalBayes
+from .estimators import (
+    KalmanInteractingMultipleModel,
+    KalmanModel,
+    KalmanTurnInteractingMultipleModel,
+    UnscentedTurn,
+)
+
+
+class ConstantVelocity(KalmanModel):
+    """One Kalman filter of constant velocity.
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0) -> None:
+        super().__init__(task)
+        self.variance = acceleration**2
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """One cycle of the filter."""
+        F, Q = self.motion(measurement.interval)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
+        state = Initial(result.mean, result.covariance)
+        return *state, state, self.likelihood(measurement, *result[2:])
+
+
+class ConstantAcceleration(KalmanModel):
+    """One Kalman filter of constant acceleration.
+
+    Args:
+        task: the problem.
+        jerk: standard deviation of the change of the acceleration a second, constant from scan to scan, m/s^3.
+        acceleration: of the acceleration at the start, m/s^2.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, task: ManeuveringTarget, jerk: float = 0.3, acceleration: float = 1.0) -> None:
+        super().__init__(task)
+        self.variance, self.start_variance = jerk**2, acceleration**2
+        self.H = task.constant([[float(i == j) for j in range(6)] for i in range(2)])
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts, with an acceleration about zero."""
+        xp = self.xp
+        zero = 0.0 * initial.mean
+        right = xp.concat([initial.covariance, zero[:, None][:, :, :] + 0.0 * zero[None, :2]], axis=1)
+        variance = self.start_variance + 0.0 * zero[0]
+        none = 0.0 * variance
+        rows = [[*([none] * 4), *(variance if i == j else none for j in range(2))] for i in range(2)]
+        below = xp.stack([xp.stack(row) for row in rows])
+        return Initial(xp.concat([initial.mean, zero[:2]], axis=0), xp.concat([right, below], axis=0))
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """One cycle of the filter."""
+        xp, T = self.xp, measurement.interval
+        none, one = 0.0 * T, 1.0 + 0.0 * T
+        half = 0.5 * T**2
+        kinematic = [[one, T, half], [none, one, T], [none, none, one]]
+        gain = [T**3 / 6.0, half, T]
+        # States are position x, y, velocity x, y, acceleration x, y.
+        F = xp.stack(
+            [
+                xp.stack([kinematic[i // 2][j // 2] if i % 2 == j % 2 else none for j in range(6)])
+                for i in range(6)
+            ]
+        )
+        Q = xp.stack(
+            [
+                xp.stack([gain[i // 2] * gain[j // 2] if i % 2 == j % 2 else none for j in range(6)])
+                for i in range(6)
+            ]
+        )
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
+        state = Initial(result.mean, result.covariance)
+        return (
+            result.mean[:4],
+            result.covariance[:4, :4],
+            state,
+            self.likelihood(measurement, *result[2:]),
+        )
+
+
+def _imm(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+    v = without_logarithms(values)
+    quiet = v["acceleration_quiet"]
+    accelerations = quiet, quiet * v["ratio"]
+    stay = 1.0 - v["leave_quiet"], 1.0 - v["leave_noisy"]
+    return {}, lambda task: KalmanInteractingMultipleModel(task, accelerations, stay)
+
+
+def _imm_turn(values: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+    v = without_logarithms(values)
+    quiet = v["acceleration_quiet"]
+    accelerations = quiet, quiet * v["ratio"], quiet
+    leave = v["leave_quiet"], v["leave_noisy"], v["leave_noisy"]
+    stay = [1.0 - each for each in leave]
+    return {}, lambda task: KalmanTurnInteractingMultipleModel(
+        task, accelerations, v["turn_rate"], 0.15 * v["turn_rate"], stay
+    )
+
+
+UNITS = {
+    **dict.fromkeys(("acceleration", "acceleration_quiet", "least"), "m/s^2"),
+    "jerk": "m/s^3",
+    **dict.fromkeys(("turn_rate", "turn_rate_start", "turn_rate_change"), "degrees/s"),
+}
+"""Of the parameters of all families."""
+
+
+def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
+    """Return what can be fitted to a log of positions, the simplest first.
+
+    Args:
+        recording: of ManeuveringTarget, whose intervals and deviations set the limits; None: 1 s and 1 m.
+    """
+    T = r = 1.0
+    if recording is not None:
+        there = recording.measurements["available"] > 0.0
+        T = float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
+        r = float(numpy.sqrt(numpy.median(recording.measurements["variance"][there])))
+    usual = math.log10(r / T**2)
+    acceleration = usual - 3.5, usual - 1.5, usual + 1.5
+    jerk = usual - math.log10(T) - 4.5, usual - math.log10(T) - 2.0, usual - math.log10(T) + 1.5
+    # Degrees a second: from what nobody sees over a hundred scans to a quarter turn within one.
+    turn = math.log10(0.05 / T), math.log10(2.0 / T), math.log10(90.0 / T)
+    leave = {"log10_leave_quiet": (-2.7, -1.5, -0.3), "log10_leave_noisy": (-2.3, -1.0, -0.3)}
+    ratio = math.log10(2.0), math.log10(8.0), 3.5
+    families = {
+        "constant-velocity": tunable(ConstantVelocity, log10_acceleration=acceleration),
+        "constant-acceleration": tunable(
+            ConstantAcceleration, log10_jerk=jerk, log10_acceleration=acceleration
+        ),
+        "imm-two": tunable(
+            KalmanInteractingMultipleModel,
+            _imm,
+            log10_acceleration_quiet=acceleration,
+            log10_ratio=ratio,
+            **leave,
+        ),
+        "imm-turn": tunable(
+            KalmanTurnInteractingMultipleModel,
+            _imm_turn,
+            log10_acceleration_quiet=acceleration,
+            log10_ratio=ratio,
+            log10_turn_rate=turn,
+            **leave,
+        ),
+        "unscented-turn": tunable(
+            UnscentedTurn,
+            log10_acceleration=acceleration,
+            log10_turn_rate_change=(turn[0] - 1.0, turn[1] - 1.0, turn[2] - 1.0),
+            log10_turn_rate_start=turn,
+        ),
+        "sage-husa": tunable(
+            SageHusa,
+            log10_acceleration=acceleration,
+            forgetting=(0.3, 0.9, 0.995),
+            log10_least=acceleration,
+        ),
+        "variational-bayes": tunable(
+            VariationalBayes,
+            log10_acceleration=acceleration,
+            forgetting=(0.5, 0.95, 1.0),
+            log10_shape=(-0.3, 0.7, 3.0),
+        ),
+    }
+    return {name: dataclasses.replace(family, units=UNITS) for name, family in families.items()}

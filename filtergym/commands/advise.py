@@ -1,0 +1,128 @@
+"""The command that advises which filter to take for a log."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..agents.named_policies import pretrained_agents
+from ..baselines.advice import advise, fit_all
+from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
+from ..baselines.problem import Problem, problem_of
+from ..envs.catalogue import check_names, nearest, read_recording, short_name
+from ..evaluation.files import writable_file
+from ..names import find_competitor
+from ..reports.advice import advice_lines, advice_table, parameter_lines
+from .evaluation import causal_names
+from .terminal import command_line, console, pair, parse_settings, progress_bar
+
+OWN = "The class is your own: put these values into it. A file that names a module would run its code."
+
+
+def fit_to_recording(
+    problem: Problem, name: str, recording: str, speeds: tuple[float, float], folder: Path, seed: int
+) -> None:
+    """Fit one filter to all of a recording, say its parameters, and write them.
+
+    Args:
+        problem: of the recording.
+        name: of what can be fitted, or ``module:Class``.
+        recording: files of it.
+        speeds: that are possible, m/s.
+        folder: for the file.
+        seed: of the starts of the fit.
+    """
+    found = read_recording(recording, problem.id, speeds=speeds)
+    families = families_of(problem, found)
+    if ":" not in name and name not in families:
+        raise nearest("filter that can be fitted to a recording", name, families)
+    family = families[name] if name in families else own_family(name, find_competitor(problem, name))
+    out = folder / f"{short_name(problem.id)}.{name}{SUFFIX}"
+    if name in families:
+        writable_file(out)
+    tunable, fitted, intervals = fit_all(problem, found, family, seed=seed)
+    likelihood = fitted.log_likelihood / fitted.measurements
+    console.print(
+        f"{name}, fitted to {fitted.measurements:,} measurements, {likelihood:.3f} nats per measurement:",
+        highlight=False,
+    )
+    for line in parameter_lines(tunable, fitted, intervals):
+        console.print(f"  {line}", highlight=False, soft_wrap=True)
+    if name not in families:
+        console.print(OWN)
+        return
+    write_fitted(out, problem, name, fitted, intervals, command_line())
+    console.print(f"saved in {out}; filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True)
+
+
+def advise_on_log(
+    recording: Annotated[
+        str,
+        typer.Argument(
+            help="What sensors really said, NetCDF or tables (CSV): a file, a folder, or a pattern in quotes."
+        ),
+    ],
+    environment: Annotated[
+        str, typer.Option(help="Environment whose measurements they are; NetCDF names its own.")
+    ] = "filtergym/ManeuveringTarget-v0",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
+        ),
+    ] = None,
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Estimator of your own, module:Class, whose attribute parameters gives limits; repeat for several."
+        ),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
+    ] = None,
+    noise: Annotated[bool, typer.Option(help="Fit the scale of the measurement noise, too.")] = True,
+    seed: Annotated[int, typer.Option(help="Of the starts of the fits.")] = 0,
+    speeds: Annotated[
+        str, typer.Option(help="Speeds that are possible, m/s, from the lowest to the highest.")
+    ] = "0.01,1000",
+) -> None:
+    """Fit every family of filters to a log, and say which one to take, with which numbers.
+
+    Example: filtergym advise log.csv --out mine.filter.json
+    """
+    keywords = parse_settings(settings or [])
+    if out is not None:
+        if not out.name.endswith(SUFFIX):
+            raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
+        writable_file(out)
+    found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
+    problem = problem_of(found.environment)
+    check_names(problem.task, keywords)
+    learned = list(pretrained_agents(problem.id))
+    shipped = {name: find_competitor(problem, name) for name in causal_names(problem)}
+    own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
+    with progress_bar() as bar:
+        line = bar.add_task("advising", total=1.0)
+        advice = advise(
+            problem,
+            found,
+            shipped,
+            own,
+            noise=noise,
+            seed=seed,
+            progress=lambda what, share: bar.update(line, description=what, completed=share),
+            **keywords,
+        )
+    for note in found.notes:
+        console.print(note, highlight=False, soft_wrap=True)
+    console.print(advice_table(advice, learned))
+    for sentence in advice_lines(advice, learned):
+        console.print(sentence, highlight=False, soft_wrap=True)
+    if out is not None and advice.fitted.name in own:
+        console.print(OWN)
+    elif out is not None:
+        name = advice.fitted.name
+        write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
+        console.print(
+            f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
+        )

@@ -1,0 +1,293 @@
+"""Filters fitted to recordings: likelihood, maximum, intervals, choice, and what is said of it."""
+
+import itertools
+import json
+import math
+
+import numpy as np
+import pytest
+from filtergym.baselines import fitting
+from filtergym.baselines.advice import advise, share_out
+from filtergym.baselines.fitted_filters import read_fitted
+from filtergym.baselines.fitting import fit, profile_intervals, with_noise_scale
+from filtergym.baselines.maneuvering_target.log_families import log_families
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.catalogue import make_task, read_recording, task_class
+from filtergym.evaluation import likelihood as likelihood_module
+from filtergym.evaluation.likelihood import Span, WindowLikelihood, cut_windows
+
+from filtergym import evaluate
+from filtergym.reports.advice import advice_lines
+
+ID = "filtergym/ManeuveringTarget-v0"
+PROBLEM = problem_of(ID)
+
+
+def write_log(
+    folder, count=240, acceleration=0.8, sigma=1.0, T=0.5, seed=0, missed=0.0, truth=True, stated=None
+):
+    """Write a log of a target of white acceleration, constant in every interval; return its path."""
+    rng = np.random.default_rng(seed)
+    position, velocity = np.zeros((count, 2)), np.zeros((count, 2))
+    velocity[0] = 3.0, -1.0
+    for k in range(1, count):
+        a = acceleration * rng.standard_normal(2)
+        position[k] = position[k - 1] + T * velocity[k - 1] + 0.5 * T**2 * a
+        velocity[k] = velocity[k - 1] + T * a
+    plots = position + sigma * rng.standard_normal(position.shape)
+    plots[3:][rng.random(count - 3) < missed] = math.nan
+    stated = np.full_like(plots, sigma if stated is None else stated)
+    columns = [T * np.arange(count), plots, stated, *([position, velocity] if truth else [])]
+    names = "time,x,y,sigma_x,sigma_y" + truth * (
+        ",truth_position_x,truth_position_y,truth_velocity_x,truth_velocity_y"
+    )
+    path = folder / f"log{seed}.csv"
+    np.savetxt(path, np.column_stack(columns), "%.6f", ",", header=names, comments="")
+    return path
+
+
+def read(path):
+    return read_recording(path, ID, speeds=(0.001, 1000.0))
+
+
+def likelihood_of(recording, name, spans=None, warm_up=10, noise=False):
+    """Likelihood of a family, and its tunable."""
+    task = make_task(task_class(ID), None, **recording.parameters)
+    tunable = log_families(recording)[name]
+    if noise:
+        tunable = with_noise_scale(tunable, task.log_format.scale_noise)
+    spans = spans or [Span(0, 10, int(recording.rows[0]))]
+    windows = cut_windows(recording, task, spans, warm_up)
+    return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes), tunable
+
+
+def naive_log_likelihood(recording, acceleration, scale, first):
+    """One Kalman filter of constant velocity with dense matrices, from the recording's initial estimate."""
+    said = {name: values[0] for name, values in recording.measurements.items()}
+    m, P = recording.initial["mean"][0], recording.initial["covariance"][0]
+    H, total = np.eye(2, 4), 0.0
+    for k in range(int(recording.rows[0])):
+        T = said["interval"][k]
+        F = np.eye(4) + T * np.eye(4, k=2)
+        g = np.concatenate([0.5 * T**2 * np.eye(2), T * np.eye(2)])
+        m, P = F @ m, F @ P @ F.T + acceleration**2 * g @ g.T
+        if said["available"][k] == 0.0:
+            continue
+        S = H @ P @ H.T + scale**2 * np.diag(said["variance"][k])
+        nu = said["position"][k] - H @ m
+        if k >= first:
+            total -= 0.5 * (nu @ np.linalg.solve(S, nu) + math.log(np.linalg.det(2.0 * math.pi * S)))
+        K = P @ H.T @ np.linalg.inv(S)
+        m, P = m + K @ nu, (np.eye(4) - K @ H) @ P
+    return total
+
+
+@pytest.mark.parametrize("missed", [0.0, 0.2])
+def test_likelihood_is_that_of_a_kalman_filter(tmp_path, missed):
+    """Of all candidates at once, by dense matrices one after the other; rounding of 240 updates."""
+    recording = read(write_log(tmp_path, missed=missed))
+    found, _ = likelihood_of(recording, "constant-velocity", noise=True)
+    candidates = np.array([[-1.0, 0.0, 0.4, 1.0], [0.0, -0.3, 0.2, 0.0]])
+    expected = [naive_log_likelihood(recording, 10.0**a, 10.0**s, 10) for a, s in candidates.T]
+    np.testing.assert_allclose(found(candidates), expected, rtol=1e-11)
+    seen = recording.measurements["available"][0, 10 : int(recording.rows[0])] > 0.0
+    assert found.count == seen.sum()
+
+
+@pytest.mark.parametrize("name", list(log_families()))
+def test_candidates_side_by_side_are_those_alone(tmp_path, name, monkeypatch):
+    """In lanes, compiled, one by one, and with NumPy; 60 updates of an iterated filter round by 1e-9 at most."""
+    recording = read(write_log(tmp_path, count=70, missed=0.1))
+    found, tunable = likelihood_of(recording, name)
+    low, high = np.array(list(tunable.limits.values())).T
+    candidates = low[:, None] + (high - low)[:, None] * np.random.default_rng(1).uniform(
+        0.2, 0.8, (len(low), 5)
+    )
+    together = found(candidates)
+    assert np.isfinite(together).all()
+    np.testing.assert_allclose([found(candidates[:, [i]])[0] for i in range(5)], together, rtol=1e-9)
+    monkeypatch.setattr(likelihood_module, "AVAILABLE", False)
+    with_numpy, _ = likelihood_of(recording, name)
+    np.testing.assert_allclose(with_numpy(candidates), together, rtol=1e-9)
+    with_numpy.in_lanes = False
+    np.testing.assert_allclose(with_numpy(candidates), together, rtol=1e-9)
+
+
+def test_windows_count_every_measurement_once_and_forget_their_start(tmp_path):
+    """Apart from the start of their tracks, which a long warm-up forgets."""
+    recording = read(write_log(tmp_path, count=400, missed=0.1))
+    rows = int(recording.rows[0])
+    whole, _ = likelihood_of(recording, "constant-velocity", [Span(0, 60, rows)], 60)
+    cuts = [60, 130, 131, 250, rows]
+    spans = [Span(0, a, b) for a, b in itertools.pairwise(cuts)]
+    values = np.array([[0.0]])
+    for warm_up, within in ((60, 1e-6), (3, 5.0)):
+        pieces, _ = likelihood_of(recording, "constant-velocity", spans, warm_up)
+        assert pieces.count == whole.count
+        assert abs(pieces(values)[0] - whole(values)[0]) < within
+
+
+def test_gradient_is_the_slope(tmp_path):
+    recording = read(write_log(tmp_path))
+    found, _ = likelihood_of(recording, "imm-two", noise=True)
+    at = np.array([-0.5, 0.9, -1.5, -1.0, 0.1])
+    value, gradient = found.gradient(at)
+    assert value == pytest.approx(found(at[:, None])[0], rel=1e-12)
+    for i, slope in enumerate(gradient):
+        move = 1e-2 * np.eye(5)[i]
+        # Of fourth order, whose error is 1e-8 of the fifth derivative.
+        points = np.stack([at - 2 * move, at - move, at + move, at + 2 * move], axis=1)
+        a, b, c, d = found(points)
+        assert slope == pytest.approx((a - 8 * b + 8 * c - d) / 0.12, rel=1e-3, abs=1e-3)
+
+
+def test_fit_finds_what_made_the_log_and_its_intervals_are_those_of_the_profile(tmp_path):
+    """Against the profile computed anew, value by value, by another search."""
+    from scipy.optimize import brentq, minimize_scalar
+
+    recording = read(write_log(tmp_path, count=200, stated=0.5))
+    spans = [Span(0, first, first + 30) for first in range(10, 190, 30)]
+    found, tunable = likelihood_of(recording, "constant-velocity", spans, noise=True)
+    best = fit(found, tunable)
+    assert best.spread < 1e-3
+    assert best.at_limit == ()
+    intervals = profile_intervals(found, tunable, best)
+    for name, true in {"log10_acceleration": math.log10(0.8), "log10_noise_scale": math.log10(2.0)}.items():
+        assert intervals[name].low < true < intervals[name].high  # of this seed; coverage is a command
+    for i, name in enumerate(tunable.limits):
+
+        def drop(value, i=i):
+            def other(x):
+                point = np.array([x, x])
+                point[i] = value
+                return -found(point[:, None])[0]
+
+            return -minimize_scalar(other, bracket=(-0.5, 0.5)).fun - best.log_likelihood + fitting.DROP
+
+        value = best.values[name]
+        for end, far in ((intervals[name].low, -1.0), (intervals[name].high, 1.0)):
+            exact = brentq(drop, value, value + far, xtol=1e-3)
+            # Interpolated between distances of half a deviation, of which an end is two.
+            assert end == pytest.approx(exact, abs=0.05 * abs(exact - value))
+
+
+def test_what_the_log_says_nothing_of_is_open(tmp_path):
+    """A target that never turns says nothing of turns; one that flies straight, only how small its acceleration is."""
+    recording = read(write_log(tmp_path, acceleration=0.0, count=160))
+    found, tunable = likelihood_of(recording, "constant-velocity", noise=True)
+    best = fit(found, tunable)
+    intervals = profile_intervals(found, tunable, best)
+    assert intervals["log10_acceleration"].open_low
+    assert not intervals["log10_acceleration"].open_high
+    assert not intervals["log10_noise_scale"].open_low
+    assert not intervals["log10_noise_scale"].open_high
+    found, tunable = likelihood_of(read(write_log(tmp_path, count=160, seed=1)), "imm-turn")
+    intervals = profile_intervals(found, tunable, fit(found, tunable))
+    assert any(interval.open_low and interval.open_high for interval in intervals.values())
+
+
+def test_shares_are_apart_and_are_all(tmp_path):
+    recording = read(write_log(tmp_path))
+    share = share_out(recording)
+    taken = np.zeros(int(recording.rows[0]), dtype=int)
+    for spans in (share.fitted, share.chosen, share.judged):
+        for span in spans:
+            taken[span.first : span.last] += 1
+    assert (taken[share.warm_up :] == 1).all()
+    judged = sum(span.last - span.first for span in share.judged)
+    assert judged == pytest.approx(len(taken) / 4, abs=2)
+
+
+@pytest.fixture(scope="module")
+def advice(tmp_path_factory):
+    """Of a log whose stated deviations are half of the true ones, so that what is shipped is wrong."""
+    folder = tmp_path_factory.mktemp("logs")
+    recording = read(write_log(folder, count=600, acceleration=2.0, sigma=2.0, stated=1.0, seed=3))
+    shipped = {name: PROBLEM.competitor(name) for name in ("imm", "kalman-imm", "fixed-low")}
+    return advise(PROBLEM, recording, shipped)
+
+
+def test_the_filter_of_the_log_is_advised_and_is_better(advice):
+    assert advice.advised.fitted
+    assert advice.advised.name == "constant-velocity"
+    assert advice.advised.relative_error.value < 0.0
+    assert advice.advised.difference.low > 0.0
+    assert abs(advice.advised.nis - 1.0) < 0.2
+    assert abs(advice.advised.correlation.value) < 4.0 / math.sqrt(150.0)  # of as many judged measurements
+    values, intervals = advice.fits["constant-velocity"].values, advice.intervals
+    assert 10.0 ** values["log10_noise_scale"] == pytest.approx(2.0, rel=0.1)
+    assert intervals["log10_acceleration"].low < math.log10(2.0) < intervals["log10_acceleration"].high
+
+
+def test_errors_and_likelihoods_are_those_of_an_evaluation(advice):
+    """Judged measurements alone, of the filter with the values that are handed on."""
+    name = "kalman-imm"
+    run = evaluate(ID, [name], advice.recording).sel(policy=name)
+    mask = np.zeros(run.sizes["time"], dtype=bool)
+    for span in advice.share.judged:
+        mask[span.first : span.last] = True
+    errors = run["error"].sel(component=["position_x", "position_y"]).values[0, mask]
+    row = next(c for c in advice.competitors if c.name == name)
+    assert row.error == pytest.approx(math.sqrt((errors**2).sum(axis=1).mean()), rel=1e-12)
+
+
+def test_it_ends_in_sentences(advice):
+    lines = list(advice_lines(advice, ["fixed-low"]))
+    text = "\n".join(lines)
+    assert lines[0].startswith("Take constant-velocity, with the parameters below: ")
+    assert "% less error [" in lines[0]
+    assert f"than the best shipped filter there, {advice.best_shipped}" in lines[0]
+    assert "acceleration" in text
+    assert "m/s^2" in text
+    assert "times as large as stated, if they are white" in text
+    assert "The learned agents were never trained on such data: fixed-low" in text
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_filter_that_evaluates(tmp_path, command, monkeypatch):
+    log = write_log(tmp_path, count=300, acceleration=2.0, sigma=2.0, stated=0.7, seed=4)
+    path = tmp_path / "mine.filter.json"
+    code, out, err = command("advise", log, "--out", path)
+    assert code == 0, err
+    assert "Take " in out
+    table = json.loads(path.read_text())
+    assert table["environment"] == ID
+    found = evaluate(ID, [str(path)], read(log))
+    assert float(np.nanmean(found["nis"].values / found["nis_degrees"].values)) == pytest.approx(
+        1.0, abs=0.25
+    )
+    code, out, err = command("evaluate", ID, "--recording", log, "--policy", path, "--policy", "imm")
+    assert code == 0, err
+    assert "imm" in out
+    assert command("advise", log, "--out", tmp_path / "mine.json")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"environment": "filtergym/UavAutopilot-v0"}, "is fitted to filtergym/UavAutopilot-v0, not to"),
+        ({"filter": "nobody"}, "has no filter 'nobody' that can be fitted"),
+        (
+            {"values": {"log10_jerk": 1.0}},
+            "must give 'constant-velocity' a number for each of log10_acceleration",
+        ),
+        ({"values": [1.0]}, "is no fitted filter"),
+    ],
+)
+def test_files_that_are_no_fitted_filter_are_refused(tmp_path, change, message):
+    table = {"environment": ID, "filter": "constant-velocity", "values": {"log10_acceleration": 0.0}}
+    path = tmp_path / "some.filter.json"
+    path.write_text(json.dumps(table))
+    read_fitted(path, PROBLEM)
+    path.write_text(json.dumps(table | change))
+    with pytest.raises(ValueError, match=message):
+        read_fitted(path, PROBLEM)
+
+
+@pytest.mark.parametrize("count", [6, 12, 30])
+def test_a_short_log_says_that_it_is_short(tmp_path, count):
+    recording = read(write_log(tmp_path, count=count))
+    found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})
+    text = "\n".join(advice_lines(found, []))
+    assert "measurements are few" in text
+    assert "which flatters it" in text or found.advised.name == "imm"
