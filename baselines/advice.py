@@ -26,6 +26,8 @@ from .problem import Problem
 from .table import Tunable
 from .tuned_values import tuned_policy
 
+LEAST = 5
+"""Measurements after the start of the track that anything can be fitted to."""
 FEWEST = 40
 """Measurements of a recording from which on it is cut into blocks; of fewer everything is fitted to all of it."""
 BLOCK_MEASUREMENTS = 40
@@ -48,8 +50,17 @@ class Share(NamedTuple):
 
 
 def share_out(recording: Recording) -> Share:
-    """Cut a recording into what filters are fitted to, chosen on and judged on: half of its blocks and two quarters."""
+    """Cut a recording into what filters are fitted to, chosen on and judged on: half of its blocks and two quarters.
+
+    Raises:
+        ValueError: if it has too few measurements for anything.
+    """
     total = int(recording.rows.sum())
+    if total < LEAST:
+        raise ValueError(
+            f"recording {recording.name!r} has {total} measurements after the start of its track: to fit anything takes "
+            f"{LEAST}"
+        )
     blocks = min(MOST_BLOCKS, max(8, total // BLOCK_MEASUREMENTS)) // 4 * 4
     warm_up = max(2, min(LONGEST_WARM_UP, total // 20))
     if total < FEWEST:

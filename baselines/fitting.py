@@ -71,8 +71,8 @@ class ScaledNoise:
         self.traceable = getattr(own, "traceable", False)
 
     def start(self, initial: Any, N: int) -> Any:
-        """Start where everyone starts."""
-        return self.own.start(initial, N)
+        """Start where everyone starts, as much less sure of it: a track starts from measurements."""
+        return self.own.start(initial._replace(covariance=initial.covariance * self.factor**2), N)
 
     def update(self, measurement: Any, memory: Any) -> Any:
         """Update with the measurement as it is taken."""

@@ -64,7 +64,7 @@ def likelihood_of(recording, name, spans=None, warm_up=10, noise=False):
 def naive_log_likelihood(recording, acceleration, scale, first):
     """One Kalman filter of constant velocity with dense matrices, from the recording's initial estimate."""
     said = {name: values[0] for name, values in recording.measurements.items()}
-    m, P = recording.initial["mean"][0], recording.initial["covariance"][0]
+    m, P = recording.initial["mean"][0], scale**2 * recording.initial["covariance"][0]
     H, total = np.eye(2, 4), 0.0
     for k in range(int(recording.rows[0])):
         T = said["interval"][k]
@@ -92,6 +92,15 @@ def test_likelihood_is_that_of_a_kalman_filter(tmp_path, missed):
     np.testing.assert_allclose(found(candidates), expected, rtol=1e-11)
     seen = recording.measurements["available"][0, 10 : int(recording.rows[0])] > 0.0
     assert found.count == seen.sum()
+
+
+def test_half_the_stated_deviation_is_twice_the_scale(tmp_path):
+    """Also of the start of the track, which is made of measurements."""
+    one, _ = likelihood_of(read(write_log(tmp_path)), "imm-turn", noise=True)
+    other, _ = likelihood_of(read(write_log(tmp_path, stated=0.5)), "imm-turn", noise=True)
+    values = np.array([[-0.5], [1.0], [0.5], [-1.5], [-1.0], [0.0]])
+    twice = values + np.log10(2.0) * np.eye(6)[:, [5]]
+    assert other(twice)[0] == pytest.approx(one(values)[0], rel=1e-10)
 
 
 @pytest.mark.parametrize("name", list(log_families()))
@@ -284,7 +293,15 @@ def test_files_that_are_no_fitted_filter_are_refused(tmp_path, change, message):
         read_fitted(path, PROBLEM)
 
 
-@pytest.mark.parametrize("count", [6, 12, 30])
+def test_too_few_measurements_are_refused(tmp_path):
+    recording = read(write_log(tmp_path, count=5))
+    with pytest.raises(
+        ValueError, match="has 3 measurements after the start of its track: to fit anything takes 5"
+    ):
+        advise(PROBLEM, recording, {})
+
+
+@pytest.mark.parametrize("count", [12, 30])
 def test_a_short_log_says_that_it_is_short(tmp_path, count):
     recording = read(write_log(tmp_path, count=count))
     found = advise(PROBLEM, recording, {"imm": PROBLEM.competitor("imm")})

@@ -11,6 +11,12 @@ from ..baselines.table import Tunable
 from ..evaluation.bootstrap import Estimate
 
 MOST_ROWS = 12
+LEAST_CORRELATION = 0.1
+"""Of successive prediction errors, from which on it is spoken of."""
+SMALL_SCALE = 0.3
+"""Of the noise, below which most of the error must last longer than a measurement, or is not as stated."""
+LARGE_SCALE = 5.0
+"""Above which what was measured may be no motion."""
 FEW = 80
 """Measurements below which an advice warns."""
 
@@ -164,6 +170,16 @@ def _noise(advice: Advice) -> Iterator[str]:
             f"The measurements' errors are {scale:.2f} times as large as stated, if they are white: errors that last "
             "longer than the motion are invisible without a second sensor, whatever the NIS."
         )
+        if scale > LARGE_SCALE:
+            yield (
+                "That is far more than stated: the stated deviations are wrong, or what was measured moves like nothing "
+                "that was fitted."
+            )
+        if scale < SMALL_SCALE:
+            yield (
+                "That is far less than stated: either the stated deviations are wrong, or most of the error lasts from "
+                "one measurement to the next. Then no filter of this sensor alone comes closer to the truth."
+            )
     else:
         yield (
             "NIS and likelihood say nothing of errors that last longer than the motion: those are invisible without a "
@@ -177,7 +193,8 @@ def _warnings(advice: Advice) -> Iterator[str]:
     if count < FEW:
         yield f"{count} measurements are few: below {FEW} the parameters are known badly, and so is who is best."
     correlation = one.correlation
-    if not math.isnan(correlation.low) and not correlation.low <= 0.0 <= correlation.high:
+    sure = not math.isnan(correlation.low) and not correlation.low <= 0.0 <= correlation.high
+    if sure and abs(correlation.value) > LEAST_CORRELATION:
         yield (
             f"Successive prediction errors are correlated ({correlation.value:+.2f}): the errors of measurements are "
             "not white, or the motion is none of the models'. The likelihood then misleads."
