@@ -13,13 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
-import xarray
 
 from ..envs.catalogue import make_task
 from ..envs.recording import Recording
 from ..envs.task import Task
-from ..evaluation.bootstrap import Bootstrap, Estimate, ratio
+from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
+from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from .fitted_filters import families_of
 from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
 from .problem import Problem
@@ -33,9 +33,6 @@ FEWEST = 40
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
-STRETCHES = 30
-"""Into which judged measurements are cut for intervals, at most; a stretch has at least ``SHORTEST_STRETCH``."""
-SHORTEST_STRETCH = 8
 
 
 class Share(NamedTuple):
@@ -50,7 +47,7 @@ class Share(NamedTuple):
 
 
 def share_out(recording: Recording) -> Share:
-    """Cut a recording into what filters are fitted to, chosen on and judged on: half of its blocks and two quarters.
+    """Cut a recording into what filters are fitted to, chosen on and judged on: a half and two quarters of it.
 
     Raises:
         ValueError: if it has too few measurements for anything.
@@ -171,7 +168,7 @@ def advise(
     progress("replaying the recording", 0.6)
     with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
         dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-    judged = _Judged(dataset, task, share)
+    judged = _Judgement(Predictions(dataset, task), share)
     competitors, best = judged.competitors({name: len(found.values) for name, found in fits.items()})
     progress("computing intervals", 0.9)
     chosen = _likeliest([c for c in competitors if c.fitted])
@@ -183,7 +180,7 @@ def advise(
         fits[name] = fit(likelihoods[name], begin, seed, starts=1)
         makers = {name: tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
         dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        again, _ = _Judged(dataset, task, share).competitors({name: chosen.parameters})
+        again, _ = _Judgement(Predictions(dataset, task), share).competitors({name: chosen.parameters})
         refitted = next(c for c in again if c.name == name)
         refitted = refitted._replace(log_likelihood=chosen.log_likelihood)
         competitors = [refitted if c.name == name else c for c in competitors]
@@ -245,179 +242,61 @@ def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
     return with_noise_scale(family, log_format.scale_noise)
 
 
-class _Judged:
+class _Judgement:
     """What all competitors did on the measurements that chose and on those that judge.
 
     Args:
-        dataset: of all, with tracks.
-        task: of the recording.
+        predictions: of all.
         share: which measurements they are.
     """
 
-    def __init__(self, dataset: xarray.Dataset, task: Task, share: Share) -> None:
-        self.dataset, self.task = dataset, task
+    def __init__(self, predictions: Predictions, share: Share) -> None:
+        self.predictions = predictions
         choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
         self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
-        self.names = [str(name) for name in dataset["policy"].values]
-        self.has_truth = bool(dataset.attrs["truth"])
-        self.stretches = {id(mask): _stretches(mask) for mask in (self.chosen, self.judged)}
 
     def _mask(self, spans: Sequence[Span]) -> numpy.ndarray:
         """Measurements, ``(episodes, time)``."""
-        mask = numpy.zeros((self.dataset.sizes["episode"], self.dataset.sizes["time"]), dtype=bool)
+        mask = numpy.zeros(self.predictions.shape, dtype=bool)
         for span in spans:
             mask[span.episode, span.first : span.last] = True
         return mask
 
-    def log_likelihood(self, name: str) -> numpy.ndarray:
-        """Of every measurement, ``(episodes, time)``; NaN where it is not known."""
-        if "log_likelihood" not in self.dataset:
-            return numpy.full(self.judged.shape, math.nan)
-        found: numpy.ndarray = self.dataset["log_likelihood"].sel(policy=name).values
-        return found
-
-    def squared_error(self, name: str) -> numpy.ndarray:
-        """Squared error of the first group of components, ``(episodes, time)``."""
-        groups = self.task.groups
-        parts = list(next(iter(groups.values()))) if groups else [self.task.components[0].name]
-        error = self.dataset["error"].sel(policy=name, component=parts)
-        found: numpy.ndarray = (error**2).sum("component", skipna=False).values
-        return found
-
-    def prediction_error(self, name: str) -> numpy.ndarray | None:
-        """Measured less predicted, ``(m, episodes, time)``; None where it cannot be told."""
-        log_format = type(self.task).log_format
-        if log_format is None or log_format.predict is None:
-            return None
-        estimate = numpy.moveaxis(self.dataset["estimate"].sel(policy=name).values, -1, 0)
-        before = numpy.roll(estimate, 1, axis=2)
-        before[:, :, 0] = math.nan
-        predicted, measured = log_format.predict(before, _Measured(self.dataset, name))
-        found: numpy.ndarray = measured - predicted
-        return found
-
     def competitors(self, fitted: Mapping[str, int]) -> tuple[list[Competitor], str]:
-        """Judge everybody; the second is the best of those that were not fitted."""
-        squares, predictions, correlations = {}, {}, {}
-        for name in self.names:
-            errors = self.prediction_error(name)
-            if errors is not None:
-                predictions[name] = (errors**2).sum(axis=0)
-                correlations[name] = self._correlation(errors)
-            if self.has_truth:
-                squares[name] = self.squared_error(name)
-        judged_by = squares if self.has_truth else predictions
-        shipped = [name for name in self.names if name not in fitted]
-        worth = {
-            name: _mean(judged_by[name], self.judged) if judged_by else -self._mean(name) for name in shipped
+        """Judge everybody; the second is the best of those that were not fitted.
+
+        Args:
+            fitted: how many parameters of whom.
+        """
+        found, judged = self.predictions, self.judged
+        errors = {name: found.prediction_error(name) for name in found.names}
+        predicted = {name: (each**2).sum(axis=0) for name, each in errors.items() if each is not None}
+        squares = {name: found.squared_error(name) for name in found.names} if found.has_truth else {}
+        judged_by = squares or predicted
+        shipped = {
+            name: -mean_of(found.log_likelihood(name), judged) for name in found.names if name not in fitted
         }
-        best = min(shipped, key=lambda name: (math.isnan(worth[name]), worth[name]))
+        if judged_by:
+            shipped = {name: mean_of(judged_by[name], judged) for name in shipped}
+        best = min(shipped, key=lambda name: (math.isnan(shipped[name]), shipped[name]))
         rows = []
-        for name in self.names:
-            relative = Estimate(math.nan, math.nan, math.nan)
-            if judged_by:
-                relative = self._ratio(judged_by[name], judged_by[best])
+        for name in found.names:
+            each, penalty = errors[name], fitted.get(name, 0) / self.chosen.sum()
             rows.append(
                 Competitor(
                     name,
                     name in fitted,
                     fitted.get(name, 0),
-                    _mean(self.log_likelihood(name), self.chosen) - fitted.get(name, 0) / self.chosen.sum(),
-                    self.difference(name, best, self.judged),
-                    math.sqrt(_mean(predictions[name], self.judged)) if predictions else math.nan,
-                    math.sqrt(_mean(squares[name], self.judged)) if squares else math.nan,
-                    relative,
-                    self._nis(name),
-                    correlations.get(name, Estimate(math.nan, math.nan, math.nan)),
+                    mean_of(found.log_likelihood(name), self.chosen) - penalty,
+                    found.difference(name, best, judged),
+                    math.sqrt(mean_of(predicted[name], judged)) if predicted else math.nan,
+                    math.sqrt(mean_of(squares[name], judged)) if squares else math.nan,
+                    relative_error(judged_by[name], judged_by[best], judged) if judged_by else UNKNOWN,
+                    found.nis(name, judged),
+                    UNKNOWN if each is None else correlation(each, judged),
                 )
             )
         return rows, best
-
-    def _mean(self, name: str) -> float:
-        return _mean(self.log_likelihood(name), self.judged)
-
-    def _nis(self, name: str) -> float:
-        """Mean over the dimension."""
-        if "nis" not in self.dataset:
-            return math.nan
-        nis, degrees = (self.dataset[key].sel(policy=name).values for key in ("nis", "nis_degrees"))
-        there = self.judged & (degrees > 0.0) & numpy.isfinite(nis)
-        return float(nis[there].sum() / degrees[there].sum()) if there.any() else math.nan
-
-    def difference(self, name: str, other: str, mask: numpy.ndarray) -> Estimate:
-        """Mean difference of log-likelihoods, paired, with its interval over stretches of measurements."""
-        values = self.log_likelihood(name) - self.log_likelihood(other)
-        return self._interval(
-            mask, numpy.stack([values, numpy.ones_like(values)], axis=-1), lambda sums: ratio(sums)
-        )
-
-    def _ratio(self, squares: numpy.ndarray, others: numpy.ndarray) -> Estimate:
-        """Relative difference of root mean squares, paired."""
-        values = numpy.stack([squares, others], axis=-1)
-        return self._interval(self.judged, values, lambda sums: numpy.sqrt(ratio(sums)) - 1.0)
-
-    def _correlation(self, errors: numpy.ndarray) -> Estimate:
-        """Of successive prediction errors."""
-        now, before = errors, numpy.roll(errors, 1, axis=2)
-        before[:, :, 0] = math.nan
-        values = numpy.stack([(now * before).sum(axis=0), 0.5 * (now**2 + before**2).sum(axis=0)], axis=-1)
-        return self._interval(self.judged, values, lambda sums: ratio(sums))
-
-    def _interval(
-        self, mask: numpy.ndarray, values: numpy.ndarray, function: Callable[[numpy.ndarray], numpy.ndarray]
-    ) -> Estimate:
-        """Value and interval of a function of two means over the measurements of a mask.
-
-        Args:
-            mask: ``(episodes, time)``.
-            values: ``(episodes, time, 2)``; what is NaN anywhere is left out.
-            function: of means ``(n, 2)``.
-        """
-        there = mask & numpy.isfinite(values).all(axis=-1)
-        if not there.any():
-            return Estimate(math.nan, math.nan, math.nan)
-        stretch = self.stretches[id(mask)]
-        count = int(stretch.max()) + 1
-        sums = numpy.stack(
-            [numpy.bincount(stretch[there], values[there][:, i], minlength=count) for i in range(2)], axis=1
-        )
-        sums = sums[numpy.bincount(stretch[there], minlength=count) > 0]
-        if len(sums) < 2:
-            value = float(function(sums.sum(axis=0, keepdims=True))[0])
-            return Estimate(value, math.nan, math.nan)
-        bootstrap = Bootstrap(len(sums))
-        return bootstrap.interval(function(bootstrap.means(sums)))
-
-
-class _Measured:
-    """Measurements of a dataset by attribute, ``(..., episodes, time)``."""
-
-    def __init__(self, dataset: xarray.Dataset, name: str) -> None:
-        self._dataset, self._name = dataset, name
-
-    def __getattr__(self, name: str) -> numpy.ndarray:
-        key = f"measurement_{name}"
-        if name.startswith("_") or key not in self._dataset:
-            raise AttributeError(name)
-        values = self._dataset[key]
-        if "policy" in values.dims:
-            values = values.sel(policy=self._name)
-        array: numpy.ndarray = values.values
-        return numpy.moveaxis(array, -1, 0) if array.ndim > 2 else array
-
-
-def _stretches(mask: numpy.ndarray) -> numpy.ndarray:
-    """Number of the stretch that each measurement of a mask lies in, ``(episodes, time)``."""
-    total = int(mask.sum())
-    length = max(SHORTEST_STRETCH, -(-total // STRETCHES))
-    number = numpy.zeros(mask.shape, dtype=int)
-    number[mask] = numpy.arange(total) // length
-    return number
-
-
-def _mean(values: numpy.ndarray, mask: numpy.ndarray) -> float:
-    there = mask & numpy.isfinite(values)
-    return float(values[there].mean()) if there.any() else math.nan
 
 
 def _likeliest(competitors: Sequence[Competitor]) -> Competitor:

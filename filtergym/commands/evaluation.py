@@ -1,18 +1,21 @@
 """The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy
 import xarray
 from rich.table import Table
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import read_recording
+from ..envs.catalogue import make_task, read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
+from ..evaluation.bootstrap import Estimate
 from ..evaluation.competitors import RandomPolicy
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
@@ -22,6 +25,7 @@ from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_files, writable_file, writable_folder, write_text
 from ..evaluation.metrics import flight_records
 from ..evaluation.parallel import Workers
+from ..evaluation.predictions import Predictions, mean_of
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
@@ -168,11 +172,20 @@ class Outcome(NamedTuple):
             each = self.dataset.sizes["episode"] <= MOST_RECORDINGS
         return flight_records(self.dataset) if each else []
 
+    def differences(self, problem: Problem) -> dict[str, Estimate]:
+        """Log-likelihood per measurement less that of the best, by name."""
+        predictions = Predictions(self.dataset, make_task(problem.task))
+        everywhere = numpy.ones(predictions.shape, dtype=bool)
+        means = {name: mean_of(predictions.log_likelihood(name), everywhere) for name in predictions.names}
+        known = [name for name, mean in means.items() if not math.isnan(mean)]
+        best = max(known, key=means.__getitem__, default=None)
+        return {} if best is None else {name: predictions.difference(name, best) for name in known}
+
     def tables(self, problem: Problem, flights: list[Any]) -> list[Table]:
         """Return what is printed, widest first."""
         tables = [flights_table(self.dataset, flights, self.records, console.width)] if flights else []
         if not self.has_truth:
-            return [*tables, recording_table(self.records)]
+            return [*tables, recording_table(self.records, self.differences(problem))]
         return [*tables, *results_tables(self.records, problem.knows, console.width)]
 
 

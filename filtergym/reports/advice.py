@@ -172,13 +172,13 @@ def _noise(advice: Advice) -> Iterator[str]:
         )
         if scale > LARGE_SCALE:
             yield (
-                "That is far more than stated: the stated deviations are wrong, or what was measured moves like nothing "
-                "that was fitted."
+                "That is far more than stated: the stated deviations are wrong, or what was measured moves like "
+                "nothing that was fitted."
             )
         if scale < SMALL_SCALE:
             yield (
-                "That is far less than stated: either the stated deviations are wrong, or most of the error lasts from "
-                "one measurement to the next. Then no filter of this sensor alone comes closer to the truth."
+                "That is far less than stated: either the stated deviations are wrong, or most of the error lasts "
+                "from one measurement to the next. Then no filter of this sensor alone comes closer to the truth."
             )
     else:
         yield (

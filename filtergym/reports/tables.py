@@ -219,11 +219,13 @@ def _widest(table: Table) -> int:
 _MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False)
 
 
-def recording_table(records: Sequence[Any]) -> Table:
+def recording_table(records: Sequence[Any], differences: Mapping[str, Any] | None = None) -> Table:
     """Compare competitors on measurements whose truth nobody knows: what they expected of each.
 
     Args:
         records: tidy records of one recording.
+        differences: of the log-likelihood per measurement to that of the best, by name, with intervals over stretches
+            of measurements.
     """
     first = records[0]
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
@@ -234,7 +236,10 @@ def recording_table(records: Sequence[Any]) -> Table:
     )
     table.add_column("policy", no_wrap=True)
     table.add_column("control")
-    for title in ("log-likelihood per measurement", "mean NIS", "95 % band", "inside 95 %, %"):
+    titles = ["log-likelihood per measurement", "mean NIS", "95 % band", "inside 95 %, %"]
+    if differences is not None:
+        titles.insert(1, "less the best's")
+    for title in titles:
         table.add_column(title, justify="right")
 
     def place(entry: tuple[str, str, str]) -> float:
@@ -246,13 +251,20 @@ def recording_table(records: Sequence[Any]) -> Table:
     ):
         band, inside = found.get((name, "anis_band")), found.get((name, "nis_inside"))
         row = [name, control if kind == "policy" else f"({kind})"]
-        row += [with_interval(found.get((name, metric))) for metric in ("log_likelihood", "anis")]
+        row.append(with_interval(found.get((name, "log_likelihood"))))
+        if differences is not None:
+            least = differences.get(name)
+            row.append(
+                "-" if least is None or math.isnan(least.value) else with_interval(least, negligible=5e-4)
+            )
+        row.append(with_interval(found.get((name, "anis"))))
         row.append("-" if band is None or band.low is None else f"{band.low:.3g} to {band.high:.3g}")
         row.append(with_interval(inside, 100.0))
         table.add_row(*row)
     table.caption = (
         "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
-        "predicted, nats; the higher the better, if errors are white.\nmean NIS: normalised innovation squared over "
+        "predicted, nats; the higher the better, if errors are white; less the best's: paired, "
+        "95 % intervals over stretches of measurements.\nmean NIS: normalised innovation squared over "
         "its dimension; in the band if the innovations are as large as predicted; - : it reports none."
     )
     if any(record.kind == "smoother" for record in records):
