@@ -24,7 +24,7 @@ from .fitted_filters import families_of
 from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
 from .problem import Problem
 from .table import Tunable
-from .tuned_values import tuned_policy
+from .tuned_values import make_tuned_policy
 
 LEAST = 5
 """Measurements after the start of the track that anything can be fitted to."""
@@ -162,7 +162,8 @@ def advise(
     makers = {
         **shipped,
         **{
-            name: tuned_policy(f"fitted {name}", tunables[name], found.values) for name, found in fits.items()
+            name: make_tuned_policy(f"fitted {name}", tunables[name], found.values)
+            for name, found in fits.items()
         },
     }
     progress("replaying the recording", 0.6)
@@ -178,7 +179,7 @@ def advise(
         begin = dataclasses.replace(tunable, start=fits[name].values)
         likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
         fits[name] = fit(likelihoods[name], begin, seed, starts=1)
-        makers = {name: tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
+        makers = {name: make_tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
         dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
         again, _ = _Judgement(Predictions(dataset, task), share).competitors({name: chosen.parameters})
         refitted = next(c for c in again if c.name == name)

@@ -11,7 +11,7 @@ from ..evaluation.stored import fits, read_json
 from .fitting import NOISE_SCALE, Fit, Interval, with_noise_scale
 from .problem import Problem
 from .table import Tunable, tunable
-from .tuned_values import TunedPolicy, round_value, tuned_policy
+from .tuned_values import TunedPolicy, make_tuned_policy, round_value
 
 SUFFIX = ".filter.json"
 """Of the names of such files."""
@@ -116,4 +116,4 @@ def read_fitted(path: Path, problem: Problem) -> TunedPolicy:
             f"{path} must give {table['filter']!r} a number for each of {', '.join(family.limits)}, got "
             f"{', '.join(values)}"
         )
-    return tuned_policy(f"{problem.id} fitted {table['filter']}", family, values)
+    return make_tuned_policy(f"{problem.id} fitted {table['filter']}", family, values)

@@ -134,10 +134,10 @@ class TunedValues:
             raise nearest("tunable policy", policy, self.tunable)
         tunable = self.tunable[policy]
         values = self.values(policy)[0]
-        return tuned_policy(f"{self.environment} {policy}", tunable, values)
+        return make_tuned_policy(f"{self.environment} {policy}", tunable, values)
 
 
-def tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
+def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) -> TunedPolicy:
     """Return what makes a policy or estimator with these values.
 
     Args:

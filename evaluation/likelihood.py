@@ -72,16 +72,14 @@ def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up
     for column, count in enumerate(counted):
         counts[: len(count), column] = count
     arrays = {
-        name: numpy.stack([_lengthened(piece[name], longest) for piece in pieces], axis=-1)
+        name: numpy.stack([_extend(piece[name], longest) for piece in pieces], axis=-1)
         for name in recording.measurements
     }
     initial_arrays = {
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
-    measurements = [
-        _filled(like, {name: values[k] for name, values in arrays.items()}) for k in range(longest)
-    ]
-    return Windows(_filled(template, initial_arrays), measurements, counts)
+    measurements = [_fill(like, {name: values[k] for name, values in arrays.items()}) for k in range(longest)]
+    return Windows(_fill(template, initial_arrays), measurements, counts)
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
@@ -115,13 +113,13 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
     return {name: values[0] for name, values in begun.initial.items()}, first + begun.used
 
 
-def _lengthened(values: numpy.ndarray, length: int) -> numpy.ndarray:
+def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
     """Repeat the last measurement up to a length; what is repeated never counts."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
 
 
-def _filled(like: Any, arrays: Mapping[str, numpy.ndarray]) -> Any:
+def _fill(like: Any, arrays: Mapping[str, numpy.ndarray]) -> Any:
     """A NamedTuple with arrays by name in place of its own, in their types."""
     names = iter([name for name, _ in named_arrays(like)])
     return map_arrays(lambda old: arrays[next(names)].astype(old.dtype), like)
@@ -206,7 +204,7 @@ class WindowLikelihood:
         if not self.in_lanes and count > 1:
             return numpy.concatenate([self._by_measurement(values[:, [i]]) for i in range(count)], axis=2)
         W = self._counts.shape[1]
-        initial, measurements = self._tiled(count)
+        initial, measurements = self._tile_windows(count)
         lanes = numpy.minimum(numpy.arange(round_up_lanes(count * W)) // W, count - 1)
         with numpy.errstate(all="ignore"):
             found = self._run(numpy.ascontiguousarray(values[:, lanes]), initial, measurements)
@@ -254,7 +252,7 @@ class WindowLikelihood:
             call.replace(last, found[k])
             call(0, lanes)
 
-    def _tiled(self, count: int) -> tuple[Any, list[Any]]:
+    def _tile_windows(self, count: int) -> tuple[Any, list[Any]]:
         """Initial estimates and measurements of so many candidates, one after another."""
         if count not in self._tiles:
             W = self._counts.shape[1]

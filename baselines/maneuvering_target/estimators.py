@@ -65,6 +65,32 @@ class KalmanModel:
         return Likelihood(log_likelihood, nis, 2.0 * measurement.available)
 
 
+class ConstantVelocity(KalmanModel):
+    """One Kalman filter of constant velocity.
+
+    Args:
+        task: the problem.
+        acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
+    """
+
+    kind = "estimator"
+
+    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0) -> None:
+        super().__init__(task)
+        self.variance = acceleration**2
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts."""
+        return Initial(initial.mean, initial.covariance)
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """One cycle of the filter."""
+        F, Q = self.motion(measurement.interval)
+        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
+        state = Initial(result.mean, result.covariance)
+        return *state, state, self.likelihood(measurement, *result[2:])
+
+
 class KalmanBank(NamedTuple):
     """Memory of the IMM over Kalman filters."""
 

@@ -21,37 +21,12 @@ from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes
 from .estimators import (
+    ConstantVelocity,
     KalmanInteractingMultipleModel,
     KalmanModel,
     KalmanTurnInteractingMultipleModel,
     UnscentedTurn,
 )
-
-
-class ConstantVelocity(KalmanModel):
-    """One Kalman filter of constant velocity.
-
-    Args:
-        task: the problem.
-        acceleration: standard deviation of the acceleration, constant from scan to scan, m/s^2.
-    """
-
-    kind = "estimator"
-
-    def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0) -> None:
-        super().__init__(task)
-        self.variance = acceleration**2
-
-    def start(self, initial: Initial, N: int) -> Initial:
-        """Start where everyone starts."""
-        return Initial(initial.mean, initial.covariance)
-
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
-        """One cycle of the filter."""
-        F, Q = self.motion(measurement.interval)
-        result = self.update_estimate(kalman.predict(*memory, F, self.variance * Q), measurement)
-        state = Initial(result.mean, result.covariance)
-        return *state, state, self.likelihood(measurement, *result[2:])
 
 
 class ConstantAcceleration(KalmanModel):

@@ -11,19 +11,18 @@ from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...envs.maneuvering_target.world import Measurement
 from ...envs.observation import Array
-from ...evaluation.competitors import Likelihood
-from ...filters import coordinated_turn, imm, kalman, smoothing
+from ...filters import coordinated_turn, imm, smoothing
 from ...filters.small_matrices import apply
 from ..table import Variant
 from .estimators import (
+    ConstantVelocity,
     KalmanBank,
     KalmanInteractingMultipleModel,
-    KalmanModel,
     KalmanTurnInteractingMultipleModel,
 )
 
 
-class ConstantVelocitySmoother(KalmanModel):
+class ConstantVelocitySmoother(ConstantVelocity):
     """One Kalman filter of constant velocity with white acceleration, smoothed (Rauch, Tung and Striebel 1965).
 
     Args:
@@ -35,19 +34,8 @@ class ConstantVelocitySmoother(KalmanModel):
     kind = "smoother"
 
     def __init__(self, task: ManeuveringTarget, acceleration: float = 1.0, lag: int | None = None) -> None:
-        super().__init__(task)
-        self.variance, self.lag = acceleration**2, lag
-
-    def start(self, initial: Initial, N: int) -> Initial:
-        """Start where everyone starts."""
-        return Initial(initial.mean, initial.covariance)
-
-    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
-        """Predict and update."""
-        F, unit = self.motion(measurement.interval)
-        result = self.update_estimate(kalman.predict(*memory, F, self.variance * unit), measurement)
-        filtered = Initial(result.mean, result.covariance)
-        return *filtered, filtered, self.likelihood(measurement, *result[2:])
+        super().__init__(task, acceleration)
+        self.lag = lag
 
     def _motion(self, mean: Array, measurement: Measurement) -> smoothing.Motion:
         F, unit = self.motion(measurement.interval)
