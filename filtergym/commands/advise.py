@@ -13,7 +13,7 @@ from ..envs.catalogue import check_names, nearest, read_recording, short_name
 from ..evaluation.files import writable_file
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table, parameter_lines
-from .evaluation import causal_names
+from .evaluation import causal_names, say_departures
 from .terminal import command_line, console, pair, parse_settings, progress_bar
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
@@ -118,6 +118,7 @@ def advise_on_log(
     console.print(advice_table(advice, learned))
     for sentence in advice_lines(advice, learned):
         console.print(sentence, highlight=False, soft_wrap=True)
+    say_departures(problem, found, learned, keywords)
     if out is not None and advice.fitted.name in own:
         console.print(OWN)
     elif out is not None:

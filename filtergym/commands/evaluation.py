@@ -9,6 +9,7 @@ import numpy
 import xarray
 from rich.table import Table
 
+from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import make_task, read_recording
@@ -29,7 +30,7 @@ from ..evaluation.predictions import Predictions, mean_of
 from ..evaluation.print_layout import check_columns, check_formats, save
 from ..evaluation.store import UNFINISHED, Store
 from ..evaluation.summary import combine_summaries, summaries
-from ..names import competitors_of, evaluation_requests, tidy_records
+from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.benchmark import result_of
 from ..reports.export import latex_table, records_as_csv
 from ..reports.records import write_records
@@ -284,6 +285,24 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
             console.print(f"results.nc is left out: {refusal}", soft_wrap=True)
     if outputs.estimates is not None:
         console.print(f"estimates in {outputs.estimates}", soft_wrap=True)
+
+
+def say_departures(
+    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
+) -> None:
+    """Say of every agent, in a line, how what it is shown departs from what it was trained on.
+
+    Args:
+        problem: whose agents they are.
+        data: scenario, flights or recording.
+        learned: their names.
+        keywords: parameters of the task.
+        trust: load models that can execute code.
+    """
+    for name in learned:
+        found = departure(problem.task, find_competitor(problem, name, trust), data, keywords)
+        if found is not None:
+            console.print(f"{name}: {found}", highlight=False, soft_wrap=True)
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:

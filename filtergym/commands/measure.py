@@ -24,7 +24,7 @@ from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
-from .evaluation import FlightOptions, Outputs, find_data, find_names, run, write
+from .evaluation import FlightOptions, Outputs, find_data, find_names, run, say_departures, write
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -184,6 +184,7 @@ def evaluate_policies(
     with Workers(jobs, cluster) as workers:
         outcome = run(problem, experiment, names, outputs, workers, trust)
     write(problem, outcome, outputs, learned)
+    say_departures(problem, data, learned, keywords, trust)
 
 
 def record_scenario(
