@@ -1,6 +1,7 @@
 """The steps of ``filtergym evaluate``: find what is evaluated, run it, make tables, write and print."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -300,7 +301,10 @@ def say_departures(
         trust: load models that can execute code.
     """
     for name in learned:
-        found = departure(problem.task, find_competitor(problem, name, trust), data, keywords)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it was loaded before, and has warned
+            maker = find_competitor(problem, name, trust)
+        found = departure(problem.task, maker, data, keywords)
         if found is not None:
             console.print(f"{name}: {found}", highlight=False, soft_wrap=True)
 
