@@ -166,11 +166,15 @@ def advise(
             for name, found in fits.items()
         },
     }
+
+    def judge(makers: Mapping[str, Any]) -> tuple[list[Competitor], str]:
+        with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
+            dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
+        counts = {name: len(fits[name].values) for name in makers if name in fits}
+        return _Judgement(Predictions(dataset, task), share).competitors(counts)
+
     progress("replaying the recording", 0.6)
-    with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
-        dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-    judged = _Judgement(Predictions(dataset, task), share)
-    competitors, best = judged.competitors({name: len(found.values) for name, found in fits.items()})
+    competitors, best = judge(makers)
     progress("computing intervals", 0.9)
     chosen = _likeliest([c for c in competitors if c.fitted])
     name, tunable = chosen.name, tunables[chosen.name]
@@ -180,12 +184,9 @@ def advise(
         likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
         fits[name] = fit(likelihoods[name], begin, seed, starts=1)
         makers = {name: make_tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
-        dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        again, _ = _Judgement(Predictions(dataset, task), share).competitors({name: chosen.parameters})
-        refitted = next(c for c in again if c.name == name)
-        refitted = refitted._replace(log_likelihood=chosen.log_likelihood)
-        competitors = [refitted if c.name == name else c for c in competitors]
-        chosen = refitted
+        refitted = next(c for c in judge(makers)[0] if c.name == name)
+        before, chosen = chosen, refitted._replace(log_likelihood=chosen.log_likelihood)
+        competitors = [chosen if c is before else c for c in competitors]
     intervals = profile_intervals(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     advised = _likeliest(competitors)

@@ -14,12 +14,13 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy
 
+from ..compiler.functions import map_arrays
 from .draws import Draws
 from .model import Model
 from .observation import Array
@@ -452,6 +453,25 @@ def measure_once(task: Task) -> tuple[Any, Any]:
     return initial, world.advance(truth, row, None)[1]
 
 
+def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:
+    """Put other arrays into nested NamedTuples, in the types of their own.
+
+    Args:
+        like: a measurement, or an initial estimate.
+        values: array of a name, as of :func:`~.task.named_arrays`.
+        xp: array namespace.
+    """
+    names = iter([name for name, _ in named_arrays(like)])
+
+    def fill(part: Any) -> Any:
+        array = values(next(names))
+        if part.dtype.kind == "b":
+            return array > 0.5
+        return xp.astype(array, xp.int64) if part.dtype.kind in "iu" else array
+
+    return map_arrays(fill, like)
+
+
 class RecordedWorld(World[Task, Replayed, Any]):
     """What the sensors said, in place of a task's own world."""
 
@@ -480,13 +500,13 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Draw a recording, and tell of its start."""
         number = draws.integer("recording", (0, len(self.recording.names) - 1))
         first, last = self._at(self.tables.first, number), self._at(self.tables.last, number)
-        initial = self._filled(self._initial, self.tables.initial, number)
+        initial = self._fill(self._initial, self.tables.initial, number)
         return Replayed(number, 0.0 * number, first, last), initial
 
     def advance(self, truth: Replayed, noise: Array, feedback: None) -> tuple[Replayed, Any]:
         """Go on to the next measurement; at the end the last one is said again."""
         truth = truth._replace(count=truth.count + 1.0)
-        return truth, self._filled(self._measurement, self.tables.measurements, self._column(truth))
+        return truth, self._fill(self._measurement, self.tables.measurements, self._column(truth))
 
     def mask_missing(self, measurement: Any) -> Any:
         """Return a measurement with NaN in place of what was not received, as the task's own world does."""
@@ -497,7 +517,7 @@ class RecordedWorld(World[Task, Replayed, Any]):
         ``(C, measurements)``; None where it is no component.
         """
         columns = self.xp.arange(self.tables.seconds.shape[-1])
-        measurement = self._filled(self._measurement, self.tables.measurements, columns)
+        measurement = self._fill(self._measurement, self.tables.measurements, columns)
         return self.simulated.component_readings(measurement), self.simulated.component_deviations(
             measurement
         )
@@ -511,22 +531,9 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Entries of a table, ``(..., N)``."""
         return self.xp.take(table, self.xp.astype(column, self.xp.int64), axis=-1)
 
-    def _filled(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
+    def _fill(self, like: Any, tables: Mapping[str, Array], column: Array) -> Any:
         """A NamedTuple of arrays as one that was measured, from the tables."""
-        xp = self.xp
-        names = iter([name for name, _ in named_arrays(like)])
-
-        def filled(part: Any) -> Any:
-            if isinstance(part, tuple):
-                return type(part)(*map(filled, part))
-            if part is None:
-                return None
-            values = self._at(tables[next(names)], column)
-            if part.dtype.kind == "b":
-                return values > 0.5
-            return xp.astype(values, xp.int64) if part.dtype.kind in "iu" else values
-
-        return filled(like)
+        return fill_arrays(like, lambda name: self._at(tables[name], column), self.xp)
 
     def state(self, truth: Replayed) -> Array:
         """True values of the task's components, ``(C, N)``.

@@ -18,8 +18,8 @@ from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
 from ..envs.compiled import AVAILABLE, warn_of
 from ..envs.observation import Array
-from ..envs.recording import Recording, measure_once
-from ..envs.task import Task, named_arrays
+from ..envs.recording import Recording, fill_arrays, measure_once
+from ..envs.task import Task
 from .competitors import Likelihood
 
 Apply = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Task], Any]]]
@@ -78,8 +78,9 @@ def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up
     initial_arrays = {
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
-    measurements = [_fill(like, {name: values[k] for name, values in arrays.items()}) for k in range(longest)]
-    return Windows(_fill(template, initial_arrays), measurements, counts)
+    rows = [{name: values[k] for name, values in arrays.items()} for k in range(longest)]
+    measurements = [fill_arrays(like, row.__getitem__, numpy) for row in rows]
+    return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts)
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:
@@ -90,14 +91,13 @@ def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[
         return own, 0
     first = span.first - warm_up
     available = recording.measurements.get("available")
-    # A track starts from what was measured: the window begins later where its first measurements are missing.
+    # A track starts from what was measured: the window begins earlier where its first measurements are missing.
     while (
         available is not None and first > 0 and not (available[span.episode, first : first + 2] > 0.0).all()
     ):
         first -= 1
     if first == 0:
         return own, 0
-    # The row before says when the first of them was: intervals are counted from it.
     rows = slice(first, first + 3)
     try:
         begun = log_format.start(
@@ -117,12 +117,6 @@ def _extend(values: numpy.ndarray, length: int) -> numpy.ndarray:
     """Repeat the last measurement up to a length; what is repeated never counts."""
     missing = length - len(values)
     return values if missing == 0 else numpy.concatenate([values, numpy.repeat(values[-1:], missing, axis=0)])
-
-
-def _fill(like: Any, arrays: Mapping[str, numpy.ndarray]) -> Any:
-    """A NamedTuple with arrays by name in place of its own, in their types."""
-    names = iter([name for name, _ in named_arrays(like)])
-    return map_arrays(lambda old: arrays[next(names)].astype(old.dtype), like)
 
 
 def _update(

@@ -18,6 +18,8 @@ SMALL = 3.0
 @pytest.mark.parametrize("name", ["bptt", "ppo", "kalman-net"])
 def test_in_training_nothing_is_said(name):
     assert departure(TARGET.task, find_competitor(TARGET, name), None, {}) is None
+    flown = TARGET.task.scenarios["random"]  # by itself, and not by its name
+    assert departure(TARGET.task, find_competitor(TARGET, name), flown, {}) is None
 
 
 def test_a_parameter_that_was_another_is_named():
