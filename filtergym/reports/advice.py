@@ -1,6 +1,7 @@
 """An advice in words and as a table: which filter, which numbers, and why."""
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 
 from rich.table import Table
@@ -17,6 +18,10 @@ SMALL_SCALE = 0.3
 """Of the noise, below which most of the error must last longer than a measurement, or is not as stated."""
 LARGE_SCALE = 5.0
 """Above which what was measured may be no motion."""
+NAME_WIDTH = 16
+"""Columns of a name; longer ones go on below."""
+COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
+"""Of the table, and how wide they are at least, so that no number is cut."""
 FEW = 80
 """Measurements below which an advice warns."""
 
@@ -35,10 +40,8 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
         title=f"{recording.name}: {judged:,} measurements that judge (95 % intervals)", title_justify="left"
     )
     table.add_column("filter", no_wrap=True)
-    titles = ["log-likelihood", f"vs {advice.best_shipped}", "mean NIS", "correlation"]
-    errors = ["RMSE", "vs, %"] if has_truth else ["prediction RMSE", "vs, %"]
-    for title in (*titles[:2], *errors, *titles[2:]):
-        table.add_column(title, justify="right")
+    for title, width in COLUMNS.items():
+        table.add_column(title, justify="right", min_width=width)
     keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name == advice.best_shipped)]
     room = MOST_ROWS - len(keep)
     rest = [c for c in advice.competitors if c not in keep]
@@ -46,7 +49,7 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
     for one in [c for c in advice.competitors if c in keep]:
         table.add_row(
-            f"{one.name}{' (advised)' if one is advice.advised else ' (fitted)' if one.fitted else ''}",
+            "\n".join(textwrap.wrap(_label(advice, one), NAME_WIDTH)),
             _number(one.log_likelihood),
             _interval(one.difference, "+.3f"),
             _number(one.error if has_truth else one.prediction),
@@ -54,12 +57,21 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
             _number(one.nis, ".2f"),
             _interval(one.correlation, "+.2f"),
         )
+    what = "estimates" if has_truth else "predictions"
     table.caption = (
-        "log-likelihood: nats per measurement where filters were chosen, less one nat in all for each fitted "
-        "parameter; vs: on the measurements that judge.\nmean NIS: 1 where innovations are as large as predicted; "
-        "correlation: of successive prediction errors, 0 where they are white."
+        "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
+        f"\nless, against: paired with {advice.best_shipped}, the best shipped, on the measurements that judge; "
+        f"RMSE: of {what}.\nNIS: mean, 1 where innovations are as large as predicted; correlation: of successive "
+        "prediction errors, 0 where they are white."
     )
+    table.caption_justify = "left"
     return table
+
+
+def _label(advice: Advice, one: Competitor) -> str:
+    """Name of a filter, and what it is here."""
+    role = "advised" if one is advice.advised else "fitted" if one.fitted else ""
+    return f"{one.name} ({role})" if role else one.name
 
 
 def _percent(estimate: Estimate) -> Estimate:
