@@ -60,7 +60,6 @@ class Traced:
     """
 
     __slots__ = ("dtype", "nodes")
-    __array_priority__ = 1  # NumPy leaves mixed arithmetic to the methods below
     device = None
     __bool__ = __float__ = __int__ = __index__ = __complex__ = _refuse
 
@@ -70,6 +69,16 @@ class Traced:
 
     def __array__(self, *_: Any, **__: Any) -> Any:
         raise NotTraceable("an array is handed to a function of NumPy: call that of its namespace")
+
+    def __array_ufunc__(self, function: Any, method: str, *arguments: Any, **keywords: Any) -> "Traced":
+        from .numpy_functions import call_ufunc
+
+        return call_ufunc(function, method, arguments, keywords)
+
+    def __array_function__(self, function: Any, types: Any, arguments: Any, keywords: Any) -> "Traced":
+        from .numpy_functions import call_function
+
+        return call_function(function, arguments, keywords)
 
     def __array_namespace__(self, api_version: str | None = None) -> ModuleType:
         return importlib.import_module(__name__)
@@ -129,9 +138,35 @@ class Traced:
         """Sum over an axis, or all."""
         return sum(self, axis=axis)
 
+    def min(self, axis: int | None = None) -> "Traced":
+        """Smallest entry along an axis, or of all."""
+        return min(self, axis=axis)
+
+    def max(self, axis: int | None = None) -> "Traced":
+        """Largest entry along an axis, or of all."""
+        return max(self, axis=axis)
+
+    def any(self, axis: int | None = None) -> "Traced":
+        """Whether an entry along an axis is true."""
+        return any(self, axis=axis)
+
+    def all(self, axis: int | None = None) -> "Traced":
+        """Whether all entries along an axis are true."""
+        return all(self, axis=axis)
+
+    def mean(self, axis: int | None = None) -> "Traced":
+        """Mean along an axis, or of all."""
+        from .numpy_functions import mean
+
+        return mean(self, axis)
+
     def reshape(self, *shape: Any) -> "Traced":
         """Return the same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
+
+    def astype(self, dtype: Any) -> "Traced":
+        """Return the entries as another type."""
+        return astype(self, dtype)
 
     def copy(self) -> "Traced":
         """Return the array itself, as nothing changes it."""
