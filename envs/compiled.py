@@ -331,29 +331,33 @@ class CompiledModel(Model):
                 warn_of(f"{function.__qualname__} of {self.task.id}", error)
         return function(self._plain, *parts)
 
+    def start_filter(self, initial: Any, truth: Any = None) -> Any:
+        """State of the filter at the start of the track."""
+        if self.filter.in_python:
+            return super().start_filter(initial, truth)
+        return self.run(_start_filter, initial, truth)[0]
+
+    def predict_filter(self, state: Any, measurement: Any) -> Any:
+        """State of the filter when a measurement has come."""
+        return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
+
+    def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
+        """State of the filter when the measurement is taken in."""
+        if self.filter.in_python:
+            return super().update_filter(state, measurement, action, truth)
+        return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
+
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
         truth, initial = self.run(_begin_world, uniforms, normals)
-        known = self.truth_for_filter(truth)
-        if self.filter.in_python:
-            return Episode(truth, initial, self.filter.begin(Input(initial, known)))
-        return Episode(truth, initial, self.run(_start_filter, initial, known)[0])
+        return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
-        functions, threads = self.programs, self.threads
         given = episode.filter, episode.measurement
         feedback = self.filter.feedback(*given) if self.filter.in_python else self.run(_feedback, *given)
-        truth, measurement = functions.world_advance(episode.truth, feedback, noise, threads=threads)
-        state, _ = functions.filter_prediction(episode.filter, measurement, threads=threads)
-        return Episode(truth, measurement, state)
-
-    def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4."""
-        if self.filter.in_python:
-            return super().act(episode, action)
-        arguments = (self.truth_for_filter(episode.truth), episode.filter, episode.measurement, action)
-        return episode._replace(filter=self.programs.filter_update(*arguments, threads=self.threads)[0])
+        truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
+        return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
 
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
