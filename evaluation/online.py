@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy
 
 from ..compiler.functions import map_arrays, round_up_lanes
+from ..envs.compiled import filter_stepper
 from ..envs.live_input import merge_tracks
 from ..envs.model import Episode, Model
 from ..envs.recording import measure_examples
@@ -148,7 +149,9 @@ class OnlineFilter:
         averaged = [i for i, f in enumerate(self.model.fields) if f.over_interval == "mean"]
         self._interval, self._averaged = interval, averaged if interval > 1 else []
         self._pad = numpy.minimum(numpy.arange(round_up_lanes(tracks)), tracks - 1)
+        self._stepper = filter_stepper(self.model, report_estimate, len(self._pad))
         self._state: OnlineState | None = None
+        """Without the filter's, which the stepper holds."""
 
     def __repr__(self) -> str:
         takes = ", ".join(f"{name} ({text})" for name, text in self.input.values.items())
@@ -182,7 +185,7 @@ class OnlineFilter:
             begun = self._merge(begun, tracks)
         elif self._policy is not None:
             begun = begun._replace(policy=self._policy.begin(range(self.tracks)))
-        self._state = begun
+        self._go_on(begun)
 
     def update(self, time: Any = None, **values: Any) -> Estimate:
         """Take a measurement in.
@@ -206,15 +209,15 @@ class OnlineFilter:
                 f"time must increase: the last measurement was at {_plain(last)} s, got {time!r}"
             )
         measurement, memory = self.input.measure(before.input, at, values)
-        measurement = self._padded(measurement)
-        state = self.model.predict_filter(before.filter, measurement)
         after = before._replace(input=memory, measurements=before.measurements + 1)
-        action = numpy.zeros(len(self._pad), dtype=numpy.int64)
+        stepper = self._stepper
+        stepper.predict(self._padded(measurement))
+        action = numpy.zeros(stepper.width, dtype=numpy.int64)
         if self._policy is not None:
-            after, action = self._decide(after, Episode(None, measurement, state))
-        state = self.model.update_filter(state, measurement, action)
-        self._state = after._replace(filter=state)
-        return self._estimate(at, Episode(None, measurement, state))
+            after, action = self._decide(after, stepper.observe())
+        stepper.update(action)
+        self._state = after
+        return self._estimate(at, stepper.report())
 
     def predict(self, time: Any = None, **values: Any) -> Estimate:
         """Estimate of a time at which nothing is received; the filter stays where it is.
@@ -238,6 +241,7 @@ class OnlineFilter:
         own = getattr(self.model.filter, "own", None) if self.model.filter.in_python else None
         return copy.deepcopy(
             state._replace(
+                filter=self._stepper.state,
                 python=None if own is None else (own.memory, own.step),
                 watch=None if self.watch is None else self.watch.memory,
             )
@@ -250,14 +254,18 @@ class OnlineFilter:
             self.model.filter.own.memory, self.model.filter.own.step = state.python
         if self.watch is not None:
             self.watch.memory = state.watch
-        self._state = state
+        self._go_on(state)
+
+    def _go_on(self, state: OnlineState) -> None:
+        self._stepper.state = state.filter
+        self._state = state._replace(filter=None)
 
     # --- one measurement
 
-    def _decide(self, state: OnlineState, episode: Episode) -> tuple[OnlineState, numpy.ndarray]:
+    def _decide(self, state: OnlineState, observation: numpy.ndarray) -> tuple[OnlineState, numpy.ndarray]:
         """Ask the policy where a decision is due; the action is ``(A, width)`` or ``(width,)``."""
         assert self._policy is not None
-        observation, number = self.model.observe(episode), state.measurements - 1
+        number = state.measurements - 1
         if self._averaged:
             observation, state = self._average(observation, state, number)
         if number % self._interval == 0:
@@ -281,8 +289,7 @@ class OnlineFilter:
         observation[self._averaged] = total / self._interval
         return observation, state._replace(total=0.0)
 
-    def _estimate(self, time: numpy.ndarray, episode: Episode) -> Estimate:
-        found = self.model.run(report_estimate, episode)
+    def _estimate(self, time: numpy.ndarray, found: dict[str, numpy.ndarray]) -> Estimate:
         cut: Callable[[Any], Any] = lambda array: array[..., : self.tracks]  # noqa: E731
         if self.tracks == 1:
             cut = lambda array: array[..., 0]  # noqa: E731
@@ -343,7 +350,7 @@ class OnlineFilter:
             raise ValueError(f"tracks are numbers from 0 to {self.tracks - 1}, got {tracks!r}") from None
         old = self._running()
         return old._replace(
-            filter=merge_tracks(old.filter, begun.filter, chosen[self._pad]),
+            filter=merge_tracks(self._stepper.state, begun.filter, chosen[self._pad]),
             input=merge_tracks(old.input, begun.input, chosen),
             fresh=chosen | old.fresh,
         )
