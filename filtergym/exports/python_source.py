@@ -1,0 +1,345 @@
+"""A filter as one Python file that needs NumPy only.
+
+The file is put together from the definitions of this package that the filter uses, as they are written, with their
+equations (:mod:`.definitions`), and from the constants in force (:mod:`.constants`): the same functions on the same
+numbers, so the same mathematics. Worlds, Gymnasium and the compiler stay behind.
+"""
+
+import ast
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..agents.learned_estimator import EstimatorMaker
+from ..baselines.problem import Problem
+from ..baselines.table import ConstantMode
+from ..envs.catalogue import make_task
+from ..envs.task import Task
+from ..envs.world import World
+from ..evaluation.competitors import (
+    RANKED,
+    ConstantPolicy,
+    RandomPolicy,
+    check_competitor,
+    kind_of,
+    make_competitor,
+)
+from ..evaluation.evaluate import control_of
+from ..names import find_competitor
+from .constants import Constants, ConstantsText, ReadModel, call_text, word
+from .definition_text import WIDTH, DefinitionText
+from .definitions import CannotExport, Definitions, External, Key, class_statement, source_of
+from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
+
+CLASS = "OnlineFilter"
+"""Name of the class that a user of the file calls."""
+MAKES_OBJECTS = '''def with_constants(kind: type, **constants: Any) -> Any:
+    """Return an object of a class with these attributes."""
+    made = kind.__new__(kind)
+    vars(made).update(constants)
+    return made'''
+TEMPLATES = {
+    "Model": '''class Model:
+    """What a policy knows of the filter that it steers."""''',
+    "Box": '''class Box(NamedTuple):
+    """Actions that are numbers between limits."""
+
+    low: Array
+    high: Array''',
+    "Discrete": '''class Discrete(NamedTuple):
+    """Actions that are one of some numbers."""
+
+    n: int''',
+}
+"""What stands for objects of the engine, written where it is used."""
+ALWAYS = (
+    External("typing", "Any", "Any"),
+    External("typing", "NamedTuple", "NamedTuple"),
+    External("numpy", None, "numpy"),
+)
+RESERVED = {CLASS, "Array", "with_constants", *TEMPLATES}
+
+
+def clean(text: str) -> str:
+    """Return a stranger's words so that they stay within a docstring, on their line."""
+    printable = "".join(c if c.isprintable() else " " for c in str(text))
+    return " ".join(printable.replace("\\", "/").replace('"', "'").split())
+
+
+class Exported(NamedTuple):
+    """What is written out."""
+
+    task: Task
+    track: type[Track]
+    parts: dict[str, Any]
+    """Objects that the track is made with, by the names of its arguments."""
+    attributes: tuple[str, ...]
+    """Names of the methods that it calls."""
+    measurement: Any
+    """One, for the shapes."""
+    initial: Any
+    """Likewise an initial estimate."""
+
+
+def export_python(
+    problem: Problem,
+    name: str | Path,
+    scenario: Any = None,
+    *,
+    trust: bool = False,
+    **keywords: Any,
+) -> str:
+    """Return the text of a Python file that is a filter.
+
+    Args:
+        problem: of the filter.
+        name: of a policy or an estimator, as of :func:`~filtergym.names.competitor`.
+        scenario: whose parameters it is made for; default: the environment's training distribution.
+        trust: import what can execute code.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for what is not ranked, draws numbers, or takes more than NumPy.
+    """
+    exported = _find_parts(problem, name, scenario, trust, keywords)
+    try:
+        return _write(problem, str(name), exported)
+    except CannotExport as error:
+        raise ValueError(f"{str(name)!r} cannot be written as one Python file: {error}") from None
+
+
+def _find_parts(
+    problem: Problem, name: str | Path, scenario: Any, trust: bool, keywords: Mapping[str, Any]
+) -> Exported:
+    maker = find_competitor(problem, name, trust)
+    kind = kind_of(maker)
+    if kind not in RANKED:
+        raise ValueError(f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone")
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
+    task = make_task(problem.task, scenario, **keywords)
+    learned = isinstance(maker, EstimatorMaker)
+    control = maker.bank if learned else control_of(maker, kind, None, problem.task, str(name))
+    model = ReadModel(task, control)
+    initial, measurement = _first_measurement(model)
+    if kind == "estimator" and not learned:
+        own = check_competitor(str(name), make_competitor(maker, task), kind)
+        own_mask = type(task.world).mask_missing is not World.mask_missing
+        mask = task.world.mask_missing if own_mask else NotReceived(task.world.received_field)
+        parts = {"filter": own, "mask": mask}
+        called = "start", "update"
+        return Exported(task, EstimatorTrack, parts, called, measurement, initial)
+    policy = make_competitor(maker.policy if learned else maker, model)
+    if isinstance(policy, RandomPolicy):
+        raise ValueError(f"{str(name)!r} draws its actions: there is nothing to write out")
+    called = "start", "predict", "act", "mean", "covariance", "records"
+    if isinstance(policy, ConstantPolicy | ConstantMode):
+        action = policy.mode if isinstance(policy, ConstantMode) else numpy.array(policy.action, dtype=float)
+        parts = {"filter": model.filter, "action": action}
+        return Exported(task, ConstantTrack, parts, called, measurement, initial)
+    parts = {
+        "filter": model.filter,
+        "policy": policy,
+        "observation": model._blocks,
+        "decision_interval": task.decision_interval,
+    }
+    return Exported(task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial)
+
+
+def _first_measurement(model: ReadModel) -> tuple[Any, Any]:
+    """Return an initial estimate and a measurement of an average episode, for their shapes."""
+    noise = model.task.noise
+    episode = model.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
+    after = model.measure(episode, numpy.full((noise.normals + noise.row_uniforms, 8), 0.5))
+    return episode.measurement, after.measurement
+
+
+def _write(problem: Problem, name: str, exported: Exported) -> str:
+    packages = {"filtergym", type(exported.task).__module__.partition(".")[0]}
+    packages |= {type(part).__module__.partition(".")[0] for part in exported.parts.values()}
+    definitions = Definitions(packages - {"builtins", "numpy"})
+    definitions.externals |= set(ALWAYS)
+    definitions.attributes |= {*exported.attributes, "begin", "take", "arrays", "count_tracks", "named"}
+    definitions.instantiated.add(exported.track)
+    definitions.add(Key(exported.track.__module__, exported.track.__name__))
+    for example in (exported.initial, exported.measurement):
+        definitions.add_class(type(example))
+    collected, size = Constants(definitions), -1
+    while size != definitions.size:
+        size = definitions.size
+        for part, value in exported.parts.items():
+            collected.collect(value, part)
+        definitions.add_members()
+    text = DefinitionText(definitions, RESERVED)
+    constants = ConstantsText(definitions, text, "OBSERVATION", exported.parts["filter"])
+    made = {part: constants.expression(value, part) for part, value in exported.parts.items()}
+    body = [text.text(), *constants.statements, _online_filter(text, exported, made)]
+    used = {node.id for node in ast.walk(ast.parse("\n".join(body))) if isinstance(node, ast.Name)}
+    engine = [template for name, template in TEMPLATES.items() if name in used]
+    imports = [found for found in definitions.externals if found.name in used | {"Any", "NamedTuple"}]
+    sections = [
+        'Array = Any\n"""A NumPy array."""',
+        body[0],
+        "\n\n\n".join([_rule("constants"), MAKES_OBJECTS, *engine]),
+        "\n".join(constants.statements) + "\n" + body[-1],
+    ]
+    head = [_docstring(problem, name, exported), "from __future__ import annotations", _imports(imports)]
+    written = "\n\n".join([*head, "\n\n\n".join(sections)]) + "\n"
+    compile(written, "<export>", "exec", dont_inherit=True)
+    return written
+
+
+def _rule(title: str) -> str:
+    return f"# --- {title} ".ljust(WIDTH - 1, "-")
+
+
+def _imports(externals: list[External]) -> str:
+    """Return the statements that import, NumPy's last."""
+    whole = sorted(str(found) for found in externals if found.attribute is None)
+    names: dict[str, list[str]] = {}
+    for found in sorted(externals, key=str):
+        if found.attribute is not None:
+            names.setdefault(found.module, []).append(str(found).partition(" import ")[2])
+    lines = [*whole, *(f"from {module} import {', '.join(names[module])}" for module in sorted(names))]
+    python = [line for line in lines if not line.split()[1].startswith("numpy")]
+    return "\n".join(python) + "\n\n" + "\n".join(line for line in lines if line not in python)
+
+
+def _field_text(cls: type, field: str) -> str:
+    """Describe a field of a measurement, as its class does."""
+    body = class_statement(cls).body
+    for statement, following in zip(body, [*body[1:], None], strict=True):
+        if getattr(getattr(statement, "target", None), "id", "") == field and isinstance(following, ast.Expr):
+            return clean(ast.literal_eval(following.value))
+    return ""
+
+
+class Argument(NamedTuple):
+    """One array that a filter is given."""
+
+    text: str
+    """What it is."""
+    dtype: str
+    shape: tuple[int, ...]
+    """For one track."""
+
+
+def _arguments(given: Any, prefix: str = "") -> dict[str, Argument]:
+    """Arrays that a filter is given, by name; what it does without is left out."""
+    found: dict[str, Argument] = {}
+    for field, value in given._asdict().items():
+        if isinstance(value, tuple):
+            found |= _arguments(value, f"{prefix}{field}_")
+        elif value is not None:
+            text = _field_text(type(given), field)
+            found[prefix + field] = Argument(text, value.dtype.name, value.shape[:-1])
+    return found
+
+
+def _given(text: DefinitionText, given: Any, prefix: str = "") -> str:
+    """Expression of what a filter is given, of its arrays by name."""
+    parts = []
+    for field, value in given._asdict().items():
+        if isinstance(value, tuple):
+            parts.append(f"{field}={_given(text, value, f'{prefix}{field}_')}")
+        else:
+            parts.append(f"{field}={'None' if value is None else f'given[{word(prefix + field)}]'}")
+    return call_text(f"{text.name_of(type(given).__module__, type(given).__name__)}(", parts, ")")
+
+
+def _wrapped(text: str, indent: str, hanging: str = "") -> str:
+    return "\n".join(
+        textwrap.wrap(
+            text, WIDTH, initial_indent=indent, subsequent_indent=indent + hanging, break_on_hyphens=False
+        )
+    )
+
+
+def _docstring(problem: Problem, name: str, exported: Exported) -> str:
+    task, C = exported.task, len(exported.task.components)
+    components = ", ".join(f"{clean(c.name)} ({clean(c.unit)})" for c in task.components)
+    fields = list(_arguments(exported.measurement))
+    more = "".join(f", {field}" for field in list(_arguments(exported.initial))[2:])
+    call = f"    estimate = filter.update({', '.join(f'{field}=...' for field in fields)})"
+    lines = [
+        f'"""{clean(name)}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
+        "",
+        _wrapped(
+            "Written by filtergym. The equations are those of the package, function by function; the parameters in "
+            "force stand at the end. One track is estimated, or N side by side with N as last axis of every array.",
+            "",
+        ),
+        "",
+        f"    filter = {CLASS}()",
+        f"    filter.start(mean, covariance{more})",
+        call if len(call) < WIDTH else "    estimate = filter.update(...)  # see there",
+        "    estimate.named(), estimate.covariance, estimate.statistics",
+        "",
+        _wrapped(f"Estimated are {C}: {components}.", ""),
+        "",
+        _wrapped(f"Source of the problem: {clean(task.paper_source)}.", ""),
+        '"""',
+    ]
+    return "\n".join(lines)
+
+
+def _online_filter(text: DefinitionText, exported: Exported, made: Mapping[str, str]) -> str:
+    """Class with the names of what it is given and says."""
+    arguments = {**_arguments(exported.initial), **_arguments(exported.measurement)}
+    components = tuple((c.name, c.unit) for c in exported.task.components)
+    base = text.name_of(exported.track.__module__, exported.track.__name__)
+    parts = "".join(f", {expression}" for part, expression in made.items() if part != "filter")
+    table = "".join(f"    {word(field)}: ({word(each.dtype)}, {each.shape}),\n" for field, each in arguments.items())
+    rows = "".join(f"    ({word(name)}, {word(unit)}),\n" for name, unit in components)
+    return "\n".join(
+        [
+            f"COMPONENTS = (\n{rows})",
+            '"""What is estimated, and its units."""',
+            f"SHAPES = {{\n{table}}}",
+            '"""What the filter is given: type of the numbers, and shape for one track."""',
+            "",
+            "",
+            _rule("the filter"),
+            "",
+            "",
+            f"class {CLASS}({base}):",
+            '    """The filter in a loop of your own."""',
+            "",
+            "    def __init__(self) -> None:",
+            f"        super().__init__({made['filter']}, COMPONENTS, SHAPES{parts})",
+            "",
+            _method(text, "start", exported.initial, exported),
+            "",
+            _method(text, "update", exported.measurement, exported),
+        ]
+    )
+
+
+def _method(text: DefinitionText, method: str, given: Any, exported: Exported) -> str:
+    """One of the two methods that a user calls, with what each argument is."""
+    described = {field: each.text for field, each in _arguments(given).items()}
+    if method == "start":
+        C = len(exported.task.components)
+        described |= {"mean": f"of COMPONENTS, ``({C},)``, or ``({C}, N)`` of N tracks."}
+        described |= {"covariance": f"of its errors, ``({C}, {C})`` or ``({C}, {C}, N)``."}
+    signature = ", ".join(f"{field}: Any" for field in described)
+    returned, title = (
+        ("None", "Start the track at an initial estimate.")
+        if method == "start"
+        else ("Estimate", "Predict to the time of a measurement, take it in, and estimate.")
+    )
+    lines = [f"    def {method}(self, {signature}) -> {returned}:", f'        """{title}', ""]
+    if len(lines[0]) > WIDTH:
+        lines[0] = f"    def {method}(\n        self, {signature}\n    ) -> {returned}:"
+    lines += ["        Args:"]
+    lines += [_wrapped(f"{field}: {words}", " " * 12, "    ") for field, words in described.items()]
+    lines += ["", "        Raises:", "            ValueError: for an array of another shape.", '        """']
+    pairs = call_text("given = self.arrays(", [f"{field}={field}" for field in described], ")")
+    if method == "start":
+        lines.append("        self.count_tracks(mean)")
+    call = "self.begin" if method == "start" else "return self.take"
+    lines.append(textwrap.indent(pairs, " " * 8))
+    lines.append(textwrap.indent(f"{call}({_given(text, given)})", " " * 8))
+    return "\n".join(lines)
