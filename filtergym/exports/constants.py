@@ -157,6 +157,7 @@ class Constants:
         else:
             if isinstance(value, Task | World):
                 self.definitions.tasks.add(cls)
+                self.definitions.task_names.add(path.rpartition(".")[2])
             if isinstance(value, TaskParameters):
                 self.definitions.parameters.add(cls)
                 self.definitions.externals.add(External("dataclasses", "dataclass", "dataclass"))
@@ -194,6 +195,8 @@ def array_text(array: numpy.ndarray) -> str:
     order = ', order="F"' if array.flags.f_contiguous and not array.flags.c_contiguous else ""
     if array.size == 0:
         return f"numpy.zeros({array.shape}{dtype}{order})"
+    if array.size > LONG and array.ndim > 2 and not order:
+        return f"numpy.array(\n{_rows_text(array.reshape(-1))}{dtype}\n).reshape{array.shape}"
     return f"numpy.array({_rows_text(array)}{dtype}{order})"
 
 

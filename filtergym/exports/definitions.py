@@ -220,8 +220,12 @@ class Definitions:
         self.externals: set[External] = set()
         self.attributes: set[str] = set()
         """Names of attributes that are read."""
+        self.reads: set[tuple[str, str]] = set()
+        """Names before a dot, and of the attribute after it."""
+        self.task_names = {"task"}
+        """Names that stand for tasks, and for worlds: what is read of these is written, and nothing else."""
         self.shared_attributes: set[str] = set()
-        """Names of attributes that are read of a task."""
+        """Names of attributes that are read of them."""
         self.words: set[str] = set()
         """Strings that could be names of attributes."""
         self.members: set[tuple[type, str]] = set()
@@ -237,8 +241,8 @@ class Definitions:
     @property
     def size(self) -> int:
         """Of what was found; it no longer grows when all is."""
-        found = self.keys, self.attributes, self.shared_attributes, self.words, self.members, self.concrete
-        return sum(map(len, found)) + len(self.externals) + len(self.instantiated)
+        names = self.keys, self.attributes, self.shared_attributes, self.task_names, self.words, self.members
+        return sum(map(len, names)) + len(self.concrete) + len(self.externals) + len(self.instantiated)
 
     def is_own(self, module: str) -> bool:
         """Whether definitions of a module are written out."""
@@ -303,9 +307,9 @@ class Definitions:
         if node.attr.startswith("__"):
             return  # what is overridden is found with what overrides it
         self.attributes.add(node.attr)
-        of_task = "task" in (getattr(owner, "id", None), getattr(owner, "attr", None))
-        of_itself = getattr(owner, "id", None) == "self" and own_class in self.tasks
-        if of_task or of_itself:
+        self.reads.add((getattr(owner, "id", None) or getattr(owner, "attr", ""), node.attr))
+        is_task = own_class is not None and any(issubclass(task, own_class) for task in self.tasks)
+        if getattr(owner, "id", None) == "self" and is_task:
             self.shared_attributes.add(node.attr)
 
     def _add_call(self, module: str, function: ast.expr, names: set[str]) -> None:
@@ -366,6 +370,7 @@ class Definitions:
 
     def add_members(self) -> None:
         """Add the members of the classes that the attributes name."""
+        self.shared_attributes |= {name for owner, name in self.reads if owner in self.task_names}
         for cls in sorted(self.concrete, key=lambda cls: (cls.__module__, cls.__name__)):
             named = self.shared_attributes if cls in self.tasks else self.attributes
             names = {*named, "__call__"} | ({"__init__"} if cls in self.instantiated else set())

@@ -6,6 +6,7 @@ numbers, so the same mathematics. Worlds, Gymnasium and the compiler stay behind
 """
 
 import ast
+import itertools
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from ..agents.learned_estimator import EstimatorMaker
 from ..baselines.problem import Problem
 from ..baselines.table import ConstantMode
 from ..envs.catalogue import make_task
+from ..envs.model import Episode, Model
 from ..envs.task import Task
 from ..envs.world import World
 from ..evaluation.competitors import (
@@ -28,12 +30,15 @@ from ..evaluation.competitors import (
     make_competitor,
 )
 from ..evaluation.evaluate import control_of
+from ..evaluation.rollout import rollout, start_lanes
 from ..names import find_competitor
 from .constants import Constants, ConstantsText, ReadModel, call_text, word
 from .definition_text import WIDTH, DefinitionText
 from .definitions import CannotExport, Definitions, External, Key, class_statement, source_of
 from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
 
+CHECKED = 25
+"""Measurements on which a written filter is tried."""
 CLASS = "OnlineFilter"
 """Name of the class that a user of the file calls."""
 MAKES_OBJECTS = '''def with_constants(kind: type, **constants: Any) -> Any:
@@ -82,6 +87,10 @@ class Exported(NamedTuple):
     """One, for the shapes."""
     initial: Any
     """Likewise an initial estimate."""
+    model: Model
+    """In which it runs."""
+    maker: Any
+    """Of the competitor."""
 
 
 def export_python(
@@ -106,9 +115,56 @@ def export_python(
     """
     exported = _find_parts(problem, name, scenario, trust, keywords)
     try:
-        return _write(problem, str(name), exported)
+        text = _write(problem, str(name), exported)
+        _check_text(text, exported, str(name))
     except CannotExport as error:
         raise ValueError(f"{str(name)!r} cannot be written as one Python file: {error}") from None
+    return text
+
+
+def _check_text(text: str, exported: Exported, name: str) -> None:
+    """Run the file on the measurements of an episode, beside the filter that it is written from.
+
+    Raises:
+        CannotExport: if it fails, or says something else.
+    """
+    model, starts = exported.model, []
+    start_lanes(model, [0], starts.append)
+    answers = rollout(model, exported.maker, [0], _answer, name=name)
+    namespace: dict[str, Any] = {"__name__": __name__}
+    try:
+        exec(compile(text, "<export>", "exec", dont_inherit=True), namespace)
+        track = namespace[CLASS]()
+        track.start(**lane_of(starts[0].measurement))
+        for (measurement, mean, covariance), _ in itertools.islice(answers, CHECKED):
+            estimate = track.update(**lane_of(measurement))
+            for own, other in ((mean, estimate.mean), (covariance, estimate.covariance)):
+                if not numpy.array_equal(own[..., 0], other, equal_nan=True):
+                    raise CannotExport("what was written estimates something else: this is a mistake of filtergym's")
+    except (ArithmeticError, AttributeError, LookupError, NameError, TypeError) as error:
+        raise CannotExport(f"what was written does not run: {error}") from error
+
+
+def _answer(model: Model, episode: Episode) -> tuple[Any, Any, Any]:
+    """Report what the written filter is compared with."""
+    return episode.measurement, model.mean(episode), model.covariance(episode)
+
+
+def lane_of(given: Any, lane: int = 0, prefix: str = "") -> dict[str, Any]:
+    """Return what one of N filters is given, by the names of the arguments of the written one.
+
+    Args:
+        given: a measurement or an initial estimate, arrays ``(..., N)``.
+        lane: which of the N.
+        prefix: of the names.
+    """
+    found: dict[str, Any] = {}
+    for field, value in given._asdict().items():
+        if isinstance(value, tuple):
+            found |= lane_of(value, lane, f"{prefix}{field}_")
+        elif value is not None:
+            found[prefix + field] = value[..., lane]
+    return found
 
 
 def _find_parts(
@@ -130,7 +186,7 @@ def _find_parts(
         mask = task.world.mask_missing if own_mask else NotReceived(task.world.received_field)
         parts = {"filter": own, "mask": mask}
         called = "start", "update"
-        return Exported(task, EstimatorTrack, parts, called, measurement, initial)
+        return Exported(task, EstimatorTrack, parts, called, measurement, initial, model, maker)
     policy = make_competitor(maker.policy if learned else maker, model)
     if isinstance(policy, RandomPolicy):
         raise ValueError(f"{str(name)!r} draws its actions: there is nothing to write out")
@@ -138,14 +194,14 @@ def _find_parts(
     if isinstance(policy, ConstantPolicy | ConstantMode):
         action = policy.mode if isinstance(policy, ConstantMode) else numpy.array(policy.action, dtype=float)
         parts = {"filter": model.filter, "action": action}
-        return Exported(task, ConstantTrack, parts, called, measurement, initial)
+        return Exported(task, ConstantTrack, parts, called, measurement, initial, model, maker)
     parts = {
         "filter": model.filter,
-        "policy": policy,
         "observation": model._blocks,
+        "policy": policy,
         "decision_interval": task.decision_interval,
     }
-    return Exported(task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial)
+    return Exported(task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial, model, maker)
 
 
 def _first_measurement(model: ReadModel) -> tuple[Any, Any]:

@@ -11,6 +11,11 @@ import numpy
 Array = Any
 
 
+LANES = 8
+"""Arrays are filled up to a multiple of this width: matrix products round by their shape, and a track is to be what it is
+in any company."""
+
+
 class Estimate(NamedTuple):
     """What a filter says after a measurement."""
 
@@ -46,11 +51,13 @@ class Track:
     ) -> None:
         self.filter, self.components, self.shapes = filter, components, shapes
         self.single, self.count = True, 1
+        self.lanes = numpy.zeros(LANES, dtype=int)
+        """Track of each lane; those beyond the tracks repeat the last."""
         self.memory: Any = None
         """All that later estimates depend on: keep it to go back to this measurement, pickle it to go on elsewhere."""
 
     def arrays(self, **given: Any) -> dict[str, Array]:
-        """Return what is given as arrays ``(..., N)``.
+        """Return what is given as arrays with a last axis of lanes.
 
         Raises:
             ValueError: for an array of another shape.
@@ -62,17 +69,19 @@ class Track:
             expected = shape if self.single else (*shape, self.count)
             if array.shape != expected:
                 raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
-            found[name] = array[..., None] if self.single else array
+            found[name] = (array[..., None] if self.single else array)[..., self.lanes]
         return found
 
     def count_tracks(self, mean: Any) -> None:
         """Learn from the first mean how many tracks there are."""
         self.single = numpy.ndim(mean) == 1
         self.count = 1 if self.single else numpy.shape(mean)[-1]
+        width = -(-self.count // LANES) * LANES
+        self.lanes = numpy.minimum(numpy.arange(width), self.count - 1)
 
     def estimate(self, mean: Array, covariance: Array, statistics: Mapping[str, Array]) -> Estimate:
         """Return an estimate, of one track without their axis."""
-        lane: Any = (..., 0) if self.single else ...
+        lane: Any = (..., 0) if self.single else (..., slice(self.count))
         said = {name: values[lane] for name, values in statistics.items()}
         return Estimate(mean[lane].copy(), covariance[lane].copy(), said, self.components)
 
@@ -111,7 +120,7 @@ class EstimatorTrack(Track):
 
     def begin(self, initial: Any) -> None:
         """Start at an initial estimate."""
-        self.memory = self.filter.start(initial, self.count)
+        self.memory = self.filter.start(initial, len(self.lanes))
 
     def take(self, measurement: Any) -> Estimate:
         """Predict to a measurement and take it in."""
@@ -145,7 +154,7 @@ class ConstantTrack(Track):
     def take(self, measurement: Any) -> Estimate:
         """Predict to a measurement and take it in."""
         state = self.filter.predict(self.memory, measurement)
-        action = numpy.repeat(self.action[..., None], self.count, axis=-1)
+        action = numpy.repeat(self.action[..., None], len(self.lanes), axis=-1)
         self.memory = state = self.filter.act(state, measurement, action)
         said = self.filter.records(state, measurement)
         return self.estimate(self.filter.mean(state), self.filter.covariance(state), said)
@@ -173,13 +182,13 @@ class SteeredTrack(Track):
         filter: the bank.
         components: as of :class:`Track`, likewise what follows.
         shapes: likewise.
+        observation: what the policy is shown.
         policy: chooses an action by ``predict``.
-        observation: what it is shown.
         decision_interval: measurements for which an action holds.
     """
 
     def __init__(
-        self, filter: Any, components: Any, shapes: Any, policy: Any, observation: Any, decision_interval: int
+        self, filter: Any, components: Any, shapes: Any, observation: Any, policy: Any, decision_interval: int
     ) -> None:
         super().__init__(filter, components, shapes)
         self.policy, self.observation, self.decision_interval = policy, observation, decision_interval
@@ -201,7 +210,7 @@ class SteeredTrack(Track):
             if self.averaged and number:
                 shown = shown.copy()
                 shown[self.averaged] = total / self.decision_interval
-            start = numpy.full(self.count, number == 0)
+            start = numpy.full(len(self.lanes), number == 0)
             chosen, policy = self.policy.predict(numpy.ascontiguousarray(shown.T), policy, start)
             # In double: arithmetic with constants would stay in a network's precision.
             action = chosen if chosen.ndim == 1 else chosen.T.astype(numpy.float64)
