@@ -4,7 +4,6 @@ import ast
 import dataclasses
 import functools
 import inspect
-import sys
 import textwrap
 import types
 from collections.abc import Mapping
@@ -19,7 +18,7 @@ from ..envs.parameters import TaskParameters
 from ..envs.task import Task
 from ..envs.world import World
 from .definition_text import WIDTH, DefinitionText
-from .definitions import SPACE, CannotExport, Definitions, External, Key, is_named_tuple, source_of
+from .definitions import SPACE, Definitions, ExportError, External, Key, is_named_tuple, source_of
 
 LONG = 30
 """Numbers beyond which an array is a constant of its own."""
@@ -101,7 +100,7 @@ class Constants:
             path: that leads to it, in errors.
 
         Raises:
-            CannotExport: for what cannot be written.
+            ExportError: for what cannot be written.
         """
         self._visited = set()
         self._collect(value, path)
@@ -145,7 +144,7 @@ class Constants:
             return
         name = value.__qualname__
         if "." in name or not self.definitions.is_own(value.__module__):
-            raise CannotExport(f"{path} is {name} of {value.__module__}, which cannot be written as text")
+            raise ExportError(f"{path} is {name} of {value.__module__}, which cannot be written as text")
         self.definitions.add(Key(value.__module__, name))
 
     def _collect_object(self, value: Any, path: str) -> None:
@@ -153,7 +152,9 @@ class Constants:
         if isinstance(value, Model):
             pass
         elif not self.definitions.is_own(cls.__module__) or not hasattr(value, "__dict__"):
-            raise CannotExport(f"{path} is a {cls.__name__} of {cls.__module__}, which cannot be written as text")
+            raise ExportError(
+                f"{path} is a {cls.__name__} of {cls.__module__}, which cannot be written as text"
+            )
         else:
             if isinstance(value, Task | World):
                 self.definitions.tasks.add(cls)
@@ -325,7 +326,7 @@ class ConstantsText:
             return f"{self._definition(type(value))}()"
         invalid = [name for name in found if not name.isidentifier()]
         if invalid:
-            raise CannotExport(f"{type(value).__name__} has an attribute {invalid[0]!r}, which is no name")
+            raise ExportError(f"{type(value).__name__} has an attribute {invalid[0]!r}, which is no name")
         cls = "Model" if isinstance(value, Model) else self._definition(type(value))
         parts = [f"{name}={self.expression(part, name)}" for name, part in found.items()]
         if dataclasses.is_dataclass(value):
@@ -334,6 +335,7 @@ class ConstantsText:
 
 
 def call_text(opening: str, parts: list[str], closing: str) -> str:
+    """Return a call with its arguments, each on a line of its own where they do not fit into one."""
     flat = f"{opening}{', '.join(parts)}{closing}"
     if len(flat) <= WIDTH - 20 and "\n" not in flat:
         return flat

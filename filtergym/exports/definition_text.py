@@ -8,6 +8,7 @@ from typing import Any
 from .definitions import (
     DROPPED_BASES,
     SIMPLER,
+    SIMPLER_METHODS,
     Definitions,
     External,
     Key,
@@ -91,7 +92,7 @@ class DefinitionText:
 
     def _pieces(self) -> list[tuple[str, ast.stmt]]:
         """Every piece of code that is written, with its module."""
-        pieces = []
+        pieces: list[tuple[str, ast.stmt]] = []
         for key in self.definitions.keys - SIMPLER.keys():
             statement = source_of(key.module).definitions[key.name][0]
             if isinstance(statement, ast.ClassDef):
@@ -126,10 +127,16 @@ class DefinitionText:
         lines[0] = lines[0].encode()[node.col_offset :].decode()
         return "\n".join(lines)
 
+    def parameters_text(self) -> str:
+        """Return the classes of parameters, with the values in force."""
+        classes = sorted(self.definitions.parameters, key=lambda cls: cls.__name__)
+        return "\n\n\n".join(self._class(cls, source_of(cls.__module__)) for cls in classes)
+
     def text(self) -> str:
-        """Return all definitions, a section for each module."""
+        """Return all other definitions, a section for each module."""
         by_module: dict[str, list[Key]] = defaultdict(list)
-        for key in self.definitions.keys:
+        elsewhere = {Key(cls.__module__, cls.__name__) for cls in self.definitions.parameters}
+        for key in self.definitions.keys - elsewhere:
             by_module[key.module].append(key)
         sections = []
         for module in module_order(set(by_module), self.definitions):
@@ -163,7 +170,11 @@ class DefinitionText:
         bases = [] if constant else self.written_bases(cls)
         decorators = [self._edited(source, d, d.lineno, d.end_lineno or 0) for d in statement.decorator_list]
         head = f"class {self.name_of(cls.__module__, cls.__name__)}"
-        lines = ["@dataclass(frozen=True)"] if constant else [f"@{text.strip().lstrip('@')}" for text in decorators]
+        lines = (
+            ["@dataclass(frozen=True)"]
+            if constant
+            else [f"@{text.strip().lstrip('@')}" for text in decorators]
+        )
         lines.append(f"{head}({', '.join(bases)}):" if bases else f"{head}:")
         lines.append(self._class_docstring(cls, statement, source))
         if constant:
@@ -172,7 +183,9 @@ class DefinitionText:
         for owner, (member, last) in self._members(cls):
             if isinstance(member, ast.FunctionDef) or isinstance(before, ast.FunctionDef | None):
                 lines.append("")
-            lines.append(self._edited(source_of(owner.__module__), member, first_line(member), last))
+            simpler = SIMPLER_METHODS.get((owner.__module__, owner.__name__, getattr(member, "name", "")))
+            written = self._edited(source_of(owner.__module__), member, first_line(member), last)
+            lines.append(simpler or written)
             before = member
         return "\n".join(lines)
 
@@ -258,7 +271,9 @@ class DefinitionText:
             return [] if external else [_edit(node, "Any")]
         if isinstance(node, ast.Name):
             return self._annotated_name(module, node)
-        return [edit for child in ast.iter_child_nodes(node) for edit in self._annotation_edits(module, child)]
+        return [
+            edit for child in ast.iter_child_nodes(node) for edit in self._annotation_edits(module, child)
+        ]
 
     def _annotated_name(self, module: str, node: ast.Name) -> list[tuple[int, int, int, str]]:
         try:

@@ -2,8 +2,8 @@
 
 Code is followed statically. A name leads to the function, class or constant that it stands for, in whatever module; an
 attribute to every method and property of that name in the classes of the objects at hand (rapid type analysis). What
-is found is written out as it stands in its module, with docstrings, equations and comments, and with the names of modules
-dropped: ``imm.mix`` becomes ``mix``, or ``imm_mix`` where two modules have one. Nothing else of a class is written.
+is found is written as it stands in its module, with docstrings, equations and comments; of a class nothing else is
+written. Names of modules become part of those of their functions: ``imm.mix`` is ``imm_mix``.
 """
 
 import __future__
@@ -17,23 +17,27 @@ import inspect
 import sys
 import types
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+ARRAYS = "filtergym.filters.array_namespace"
 SIMPLER = {
-    (
-        "filtergym.filters.array_namespace",
-        "namespace",
-    ): '''def namespace(array: Array) -> Any:
+    (ARRAYS, "namespace"): '''def namespace(array: Array) -> Any:
     """Return the functions of arrays: NumPy's."""
-    return numpy'''
+    return numpy''',
 }
-"""Definitions that are simpler where there is NumPy alone, by module and name."""
+"""Functions that are simpler where there is NumPy alone, by module and name."""
+SIMPLER_METHODS = {
+    ("filtergym.envs.task", "Task", "constant"): '''    def constant(self, values: Any) -> Array:
+        """Turn numbers into an array."""
+        return numpy.asarray(values, dtype=numpy.float64)''',
+}
+"""Methods likewise, by module, class and name."""
 DROPPED_BASES = ("ABC", "Generic", "Protocol", "object")
 SPACE = "action_space"
 """Property whose value is written, not its code, which takes Gymnasium."""
 
 
-class CannotExport(ValueError):
+class ExportError(ValueError):
     """What is reached takes more than Python and NumPy."""
 
 
@@ -136,12 +140,12 @@ def source_of(name: str) -> Source:
     """Return the source of a module.
 
     Raises:
-        CannotExport: if there is none, as of a module that was typed in.
+        ExportError: if there is none, as of a module that was typed in.
     """
     try:
         return Source(name)
     except (OSError, TypeError, ModuleNotFoundError) as error:
-        raise CannotExport(f"the source of module {name} cannot be read: {error}") from None
+        raise ExportError(f"the source of module {name} cannot be read: {error}") from None
 
 
 def _defined_names(statement: ast.stmt) -> list[str]:
@@ -189,11 +193,13 @@ def class_statement(cls: type) -> ast.ClassDef:
     """Return where a class is defined.
 
     Raises:
-        CannotExport: if that is no statement of a module.
+        ExportError: if that is no statement of a module.
     """
     found = source_of(cls.__module__).definitions.get(cls.__qualname__)
     if found is None or not isinstance(found[0], ast.ClassDef):
-        raise CannotExport(f"class {cls.__qualname__} of {cls.__module__} is not defined at the top of its module")
+        raise ExportError(
+            f"class {cls.__qualname__} of {cls.__module__} is not defined at the top of its module"
+        )
     return found[0]
 
 
@@ -253,7 +259,7 @@ class Definitions:
         name, or None for what Python itself has.
 
         Raises:
-            CannotExport: for what another library has.
+            ExportError: for what another library has.
         """
         source = source_of(module)
         if name == "Array":
@@ -268,7 +274,7 @@ class Definitions:
             return origin if attribute is None else self.resolve(origin, attribute)
         root = origin.partition(".")[0]
         if root != "numpy" and root not in sys.stdlib_module_names:
-            raise CannotExport(f"{module} takes {root}, and the file is to need NumPy only")
+            raise ExportError(f"{module} takes {root}, and the file is to need NumPy only")
         return External(origin, attribute, name)
 
     def add_code(self, module: str, node: ast.stmt | ast.expr, own_class: type | None = None) -> None:
@@ -291,11 +297,13 @@ class Definitions:
             elif isinstance(each, ast.Call):
                 self._add_call(module, each.func, names)
             elif isinstance(each, ast.Import | ast.ImportFrom):
-                raise CannotExport(f"{module} imports inside a function: {ast.unparse(each)}")
+                raise ExportError(f"{module} imports inside a function: {ast.unparse(each)}")
         for name in names:
             self._add_found(self.resolve(module, name))
 
-    def _add_attribute(self, module: str, node: ast.Attribute, names: set[str], own_class: type | None) -> None:
+    def _add_attribute(
+        self, module: str, node: ast.Attribute, names: set[str], own_class: type | None
+    ) -> None:
         owner = node.value
         if isinstance(owner, ast.Name) and owner.id in names:
             found = self.resolve(module, owner.id)
@@ -403,6 +411,8 @@ class Definitions:
             return
         self.members.add((cls, name))
         self.keys.add(Key(cls.__module__, cls.__name__))
+        if (cls.__module__, cls.__name__, name) in SIMPLER_METHODS:
+            return
         if isinstance(statement, ast.AnnAssign):
             if statement.value is not None:
                 self.add_code(cls.__module__, statement.value)
@@ -412,6 +422,8 @@ class Definitions:
     def written_members(self, cls: type) -> list[tuple[ast.stmt, int]]:
         """Statements of a class that are written, in their order."""
         found = {
-            id(members_of(cls)[name][0]): members_of(cls)[name] for owner, name in self.members if owner is cls
+            id(members_of(cls)[name][0]): members_of(cls)[name]
+            for owner, name in self.members
+            if owner is cls
         }
         return sorted(found.values(), key=lambda member: member[0].lineno)

@@ -1,8 +1,8 @@
 """The network of an agent as an ONNX graph: observation and memory in, action and memory out.
 
-The graph is that of :class:`~filtergym.agents.learned_policy.LearnedPolicy`, in the primitive operators that every runtime
-has: normalisation, the gates of the recurrent unit as matrix products, the layers, and what makes an action of the last
-one. Everything is float32. Estimation is not in it: the observation is that of the environment's filter.
+The graph is that of :class:`~filtergym.agents.learned_policy.LearnedPolicy`, in the primitive operators that every
+runtime has: normalisation, the gates of the recurrent unit as matrix products, the layers, and what makes an action of
+the last one. Everything is float32. Estimation is not in it: the observation is that of the environment's filter.
 """
 
 import json
@@ -103,9 +103,9 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
     if output == "argmax":
         graph.node("ArgMax", [x], "action", axis=1, keepdims=0)
         return
-    # Limits of a box that differ from action to action cannot stand in Clip.
-    low, high = (graph.constant(f"action_{n}", getattr(space, n)) for n in ("low", "high"))
     if output == "clip":
+        # Limits of a box may differ from number to number, and those of Clip may not.
+        low, high = (graph.constant(f"action_{n}", getattr(space, n)) for n in ("low", "high"))
         graph.node("Min", [graph.node("Max", [x, low]), high], "action")
         return
     half = graph.constant("action_half_range", 0.5 * (space.high - space.low))
@@ -145,7 +145,9 @@ def network_metadata(stored: StoredPolicy, model: Model) -> dict[str, str]:
     around = [f"corrects the actions of {corrected}"] if corrected else []
     around += ["acts behind a gate"] if gated else []
     box: Any = space
-    limits = {"low": box.low.tolist(), "high": box.high.tolist()} if hasattr(box, "low") else {"n": int(box.n)}
+    limits = (
+        {"low": box.low.tolist(), "high": box.high.tolist()} if hasattr(box, "low") else {"n": int(box.n)}
+    )
     return {
         "environment": header["environment"],
         "interface": str(header["interface"]),

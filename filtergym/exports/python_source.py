@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy
 
+from .. import __version__
 from ..agents.learned_estimator import EstimatorMaker
 from ..baselines.problem import Problem
 from ..baselines.table import ConstantMode
@@ -34,7 +35,7 @@ from ..evaluation.rollout import rollout, start_lanes
 from ..names import find_competitor
 from .constants import Constants, ConstantsText, ReadModel, call_text, word
 from .definition_text import WIDTH, DefinitionText
-from .definitions import CannotExport, Definitions, External, Key, class_statement, source_of
+from .definitions import Definitions, ExportError, External, Key, class_statement
 from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
 
 CHECKED = 25
@@ -117,7 +118,7 @@ def export_python(
     try:
         text = _write(problem, str(name), exported)
         _check_text(text, exported, str(name))
-    except CannotExport as error:
+    except ExportError as error:
         raise ValueError(f"{str(name)!r} cannot be written as one Python file: {error}") from None
     return text
 
@@ -126,7 +127,7 @@ def _check_text(text: str, exported: Exported, name: str) -> None:
     """Run the file on the measurements of an episode, beside the filter that it is written from.
 
     Raises:
-        CannotExport: if it fails, or says something else.
+        ExportError: if it fails, or says something else.
     """
     model, starts = exported.model, []
     start_lanes(model, [0], starts.append)
@@ -140,9 +141,11 @@ def _check_text(text: str, exported: Exported, name: str) -> None:
             estimate = track.update(**lane_of(measurement))
             for own, other in ((mean, estimate.mean), (covariance, estimate.covariance)):
                 if not numpy.array_equal(own[..., 0], other, equal_nan=True):
-                    raise CannotExport("what was written estimates something else: this is a mistake of filtergym's")
+                    raise ExportError(
+                        "what was written estimates something else: this is a mistake of filtergym's"
+                    )
     except (ArithmeticError, AttributeError, LookupError, NameError, TypeError) as error:
-        raise CannotExport(f"what was written does not run: {error}") from error
+        raise ExportError(f"what was written does not run: {error}") from error
 
 
 def _answer(model: Model, episode: Episode) -> tuple[Any, Any, Any]:
@@ -173,7 +176,9 @@ def _find_parts(
     maker = find_competitor(problem, name, trust)
     kind = kind_of(maker)
     if kind not in RANKED:
-        raise ValueError(f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone")
+        raise ValueError(
+            f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone"
+        )
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     task = make_task(problem.task, scenario, **keywords)
     learned = isinstance(maker, EstimatorMaker)
@@ -201,7 +206,9 @@ def _find_parts(
         "policy": policy,
         "decision_interval": task.decision_interval,
     }
-    return Exported(task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial, model, maker)
+    return Exported(
+        task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial, model, maker
+    )
 
 
 def _first_measurement(model: ReadModel) -> tuple[Any, Any]:
@@ -217,7 +224,14 @@ def _write(problem: Problem, name: str, exported: Exported) -> str:
     packages |= {type(part).__module__.partition(".")[0] for part in exported.parts.values()}
     definitions = Definitions(packages - {"builtins", "numpy"})
     definitions.externals |= set(ALWAYS)
-    definitions.attributes |= {*exported.attributes, "begin", "take", "arrays", "count_tracks", "named"}
+    definitions.attributes |= {
+        *exported.attributes,
+        "start_track",
+        "update_track",
+        "arrays",
+        "count_tracks",
+        "named",
+    }
     definitions.instantiated.add(exported.track)
     definitions.add(Key(exported.track.__module__, exported.track.__name__))
     for example in (exported.initial, exported.measurement):
@@ -231,14 +245,15 @@ def _write(problem: Problem, name: str, exported: Exported) -> str:
     text = DefinitionText(definitions, RESERVED)
     constants = ConstantsText(definitions, text, "OBSERVATION", exported.parts["filter"])
     made = {part: constants.expression(value, part) for part, value in exported.parts.items()}
-    body = [text.text(), *constants.statements, _online_filter(text, exported, made)]
+    parameters = text.parameters_text()
+    body = [text.text(), parameters, *constants.statements, _online_filter(text, exported, made)]
     used = {node.id for node in ast.walk(ast.parse("\n".join(body))) if isinstance(node, ast.Name)}
     engine = [template for name, template in TEMPLATES.items() if name in used]
     imports = [found for found in definitions.externals if found.name in used | {"Any", "NamedTuple"}]
     sections = [
         'Array = Any\n"""A NumPy array."""',
         body[0],
-        "\n\n\n".join([_rule("constants"), MAKES_OBJECTS, *engine]),
+        "\n\n\n".join([_rule("constants"), *filter(None, [parameters]), MAKES_OBJECTS, *engine]),
         "\n".join(constants.statements) + "\n" + body[-1],
     ]
     head = [_docstring(problem, name, exported), "from __future__ import annotations", _imports(imports)]
@@ -268,7 +283,7 @@ def _field_text(cls: type, field: str) -> str:
     body = class_statement(cls).body
     for statement, following in zip(body, [*body[1:], None], strict=True):
         if getattr(getattr(statement, "target", None), "id", "") == field and isinstance(following, ast.Expr):
-            return clean(ast.literal_eval(following.value))
+            return clean(ast.literal_eval(following.value)).partition(" Reading: ")[0]
     return ""
 
 
@@ -323,8 +338,9 @@ def _docstring(problem: Problem, name: str, exported: Exported) -> str:
         f'"""{clean(name)}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
         "",
         _wrapped(
-            "Written by filtergym. The equations are those of the package, function by function; the parameters in "
-            "force stand at the end. One track is estimated, or N side by side with N as last axis of every array.",
+            f"Written by filtergym {__version__}. The equations are those of the package, function by function; the "
+            "parameters in force stand behind them, under 'constants'. One track is estimated, or N side by side with "
+            "N as last axis of every array.",
             "",
         ),
         "",
@@ -347,7 +363,9 @@ def _online_filter(text: DefinitionText, exported: Exported, made: Mapping[str, 
     components = tuple((c.name, c.unit) for c in exported.task.components)
     base = text.name_of(exported.track.__module__, exported.track.__name__)
     parts = "".join(f", {expression}" for part, expression in made.items() if part != "filter")
-    table = "".join(f"    {word(field)}: ({word(each.dtype)}, {each.shape}),\n" for field, each in arguments.items())
+    table = "".join(
+        f"    {word(field)}: ({word(each.dtype)}, {each.shape}),\n" for field, each in arguments.items()
+    )
     rows = "".join(f"    ({word(name)}, {word(unit)}),\n" for name, unit in components)
     return "\n".join(
         [
@@ -389,13 +407,15 @@ def _method(text: DefinitionText, method: str, given: Any, exported: Exported) -
     lines = [f"    def {method}(self, {signature}) -> {returned}:", f'        """{title}', ""]
     if len(lines[0]) > WIDTH:
         lines[0] = f"    def {method}(\n        self, {signature}\n    ) -> {returned}:"
+    if method == "update":
+        lines += ["        Shapes are those of N tracks; of one, they are without the N.", ""]
     lines += ["        Args:"]
     lines += [_wrapped(f"{field}: {words}", " " * 12, "    ") for field, words in described.items()]
     lines += ["", "        Raises:", "            ValueError: for an array of another shape.", '        """']
     pairs = call_text("given = self.arrays(", [f"{field}={field}" for field in described], ")")
     if method == "start":
         lines.append("        self.count_tracks(mean)")
-    call = "self.begin" if method == "start" else "return self.take"
+    call = "self.start_track" if method == "start" else "return self.update_track"
     lines.append(textwrap.indent(pairs, " " * 8))
     lines.append(textwrap.indent(f"{call}({_given(text, given)})", " " * 8))
     return "\n".join(lines)

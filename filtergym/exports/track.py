@@ -12,8 +12,8 @@ Array = Any
 
 
 LANES = 8
-"""Arrays are filled up to a multiple of this width: matrix products round by their shape, and a track is to be what it is
-in any company."""
+"""Arrays are filled up to a multiple of this width: matrix products round by their shape, and a track is to be what it
+is in any company."""
 
 
 class Estimate(NamedTuple):
@@ -101,7 +101,9 @@ class NotReceived:
         if not self.field:
             return measurement
         values = getattr(measurement, self.field)
-        return measurement._replace(**{self.field: numpy.where(measurement.available > 0.0, values, numpy.nan)})
+        return measurement._replace(
+            **{self.field: numpy.where(measurement.available > 0.0, values, numpy.nan)}
+        )
 
 
 class EstimatorTrack(Track):
@@ -118,11 +120,11 @@ class EstimatorTrack(Track):
         super().__init__(filter, components, shapes)
         self.mask = mask
 
-    def begin(self, initial: Any) -> None:
+    def start_track(self, initial: Any) -> None:
         """Start at an initial estimate."""
         self.memory = self.filter.start(initial, len(self.lanes))
 
-    def take(self, measurement: Any) -> Estimate:
+    def update_track(self, measurement: Any) -> Estimate:
         """Predict to a measurement and take it in."""
         mean, covariance, self.memory, *reported = self.filter.update(self.mask(measurement), self.memory)
         likelihood = reported[0] if reported else {}
@@ -147,11 +149,11 @@ class ConstantTrack(Track):
         super().__init__(filter, components, shapes)
         self.action = numpy.asarray(action)
 
-    def begin(self, initial: Any) -> None:
+    def start_track(self, initial: Any) -> None:
         """Start at an initial estimate."""
         self.memory = self.filter.start(initial)
 
-    def take(self, measurement: Any) -> Estimate:
+    def update_track(self, measurement: Any) -> Estimate:
         """Predict to a measurement and take it in."""
         state = self.filter.predict(self.memory, measurement)
         action = numpy.repeat(self.action[..., None], len(self.lanes), axis=-1)
@@ -195,11 +197,11 @@ class SteeredTrack(Track):
         fields = enumerate(observation.fields)
         self.averaged = [i for i, field in fields if field.over_interval == "mean" and decision_interval > 1]
 
-    def begin(self, initial: Any) -> None:
+    def start_track(self, initial: Any) -> None:
         """Start at an initial estimate."""
         self.memory = SteeredMemory(self.filter.start(initial), None, None, 0, 0.0)
 
-    def take(self, measurement: Any) -> Estimate:
+    def update_track(self, measurement: Any) -> Estimate:
         """Predict to a measurement, show the policy what comes of it, and take the measurement in by its action."""
         before = self.memory
         state = self.filter.predict(before.state, measurement)
