@@ -16,6 +16,7 @@ import numpy
 
 from .. import __version__
 from ..agents.learned_estimator import EstimatorMaker
+from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem
 from ..baselines.table import ConstantMode
 from ..envs.catalogue import make_task
@@ -73,6 +74,13 @@ def clean(text: str) -> str:
     """Return a stranger's words so that they stay within a docstring, on their line."""
     printable = "".join(c if c.isprintable() else " " for c in str(text))
     return " ".join(printable.replace("\\", "/").replace('"', "'").split())
+
+
+def shown_name(name: str | Path) -> str:
+    """Return the name of a competitor without the folders of a file."""
+    text = str(name)
+    is_file = isinstance(name, Path) or text.endswith((SUFFIX, ".safetensors"))
+    return Path(text).name if is_file else text
 
 
 class Exported(NamedTuple):
@@ -335,7 +343,7 @@ def _docstring(problem: Problem, name: str, exported: Exported) -> str:
     more = "".join(f", {field}" for field in list(_arguments(exported.initial))[2:])
     call = f"    estimate = filter.update({', '.join(f'{field}=...' for field in fields)})"
     lines = [
-        f'"""{clean(name)}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
+        f'"""{clean(shown_name(name))}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
         "",
         _wrapped(
             f"Written by filtergym {__version__}. The equations are those of the package, function by function; the "
