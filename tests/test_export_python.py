@@ -13,6 +13,7 @@ from filtergym.envs.backend import make_model
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import rollout, start_lanes
+
 from filtergym.exports.python_source import clean, export_python, lane_of
 from filtergym.names import find_competitor
 
@@ -119,7 +120,11 @@ def test_files_say_the_same_bits_where_there_is_numpy_alone(written, tmp_path):
         lanes[f"filter_{i}"] = replay(*case)
     (alone / "replay.pickle").write_bytes(pickle.dumps(lanes))
     run = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", ALONE, str(alone)], cwd=alone, capture_output=True, text=True
+        [sys.executable, "-I", "-S", "-c", ALONE, str(alone)],
+        check=False,
+        cwd=alone,
+        capture_output=True,
+        text=True,
     )
     assert run.stdout == "same\n", run.stderr
     missed = [m["available"] for _, each in lanes["filter_0"] for m, *_ in each]
@@ -137,7 +142,7 @@ def test_every_ranked_competitor_says_the_same_bits(env):
     names = [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(env)]
     for name in names:
         if name != "random":
-            check_replay(export_python(problem, name), replay(env, name, 3, 150))
+            check_replay(export_python(problem, name), replay(env, name, 3, 60))
 
 
 def test_only_numpy_and_python_are_imported(written):

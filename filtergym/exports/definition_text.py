@@ -15,12 +15,12 @@ from .definitions import (
     Source,
     annotations,
     class_statement,
+    code_nodes,
     first_line,
     global_names,
     is_named_tuple,
     members_of,
     source_of,
-    walk_code,
 )
 
 WIDTH = 110
@@ -86,7 +86,7 @@ class DefinitionText:
         found = set()
         for module, node in self._pieces():
             names = global_names(node)
-            keys = {self._attribute_key(module, each, names) for each in walk_code(node)} - {None}
+            keys = {self._attribute_key(module, each, names) for each in code_nodes(node)} - {None}
             found |= {key for key in keys if key is not None and not key.name[:1].isupper()}
         return found
 
@@ -102,7 +102,7 @@ class DefinitionText:
                 pieces.append((key.module, statement))
         return pieces
 
-    def _attribute_key(self, module: str, node: ast.AST, names: set[str]) -> Key | None:
+    def _attribute_key(self, module: str, node: ast.AST, names: frozenset[str]) -> Key | None:
         """Definition that an attribute of a module is."""
         if not (isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)):
             return None
@@ -247,7 +247,7 @@ class DefinitionText:
         if not isinstance(node, ast.stmt | ast.expr):
             return []
         names, edits = global_names(node), []
-        for each in walk_code(node):
+        for each in code_nodes(node):
             key = self._attribute_key(module, each, names)
             if isinstance(each, ast.Name) and each.id in names:
                 found = self.definitions.resolve(module, each.id)
@@ -264,7 +264,7 @@ class DefinitionText:
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             return [_edit(node, "Any")]
         if isinstance(node, ast.Attribute):
-            key = self._attribute_key(module, node, {getattr(node.value, "id", "")})
+            key = self._attribute_key(module, node, frozenset([getattr(node.value, "id", "")]))
             if key in self.names:
                 return [_edit(node, self.names[key])]
             external = getattr(node.value, "id", "") == "numpy"

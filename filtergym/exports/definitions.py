@@ -63,15 +63,20 @@ class External(NamedTuple):
         return f"from {self.module} import {self.attribute}{alias}"
 
 
-def walk_code(node: ast.AST) -> Iterator[ast.AST]:
+@functools.cache
+def code_nodes(node: ast.AST) -> tuple[ast.AST, ...]:
     """Nodes that are executed: all but annotations."""
+    return tuple(_walk_code(node))
+
+
+def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
     yield node
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns"):
             continue
         for child in value if isinstance(value, list) else [value]:
             if isinstance(child, ast.AST):
-                yield from walk_code(child)
+                yield from _walk_code(child)
 
 
 def annotations(node: ast.AST) -> Iterator[ast.AST]:
@@ -83,7 +88,8 @@ def annotations(node: ast.AST) -> Iterator[ast.AST]:
                 yield found
 
 
-def global_names(node: ast.stmt | ast.expr) -> set[str]:
+@functools.cache
+def global_names(node: ast.stmt | ast.expr) -> frozenset[str]:
     """Names that a piece of code looks up outside of itself."""
     statement = ast.Expr(node) if isinstance(node, ast.expr) else node
     module = ast.fix_missing_locations(ast.Module([statement], []))
@@ -95,7 +101,7 @@ def global_names(node: ast.stmt | ast.expr) -> set[str]:
         for instruction in dis.get_instructions(code):
             if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS"):
                 found.add(instruction.argval)
-    return found
+    return frozenset(found)
 
 
 class Source:
@@ -289,7 +295,7 @@ class Definitions:
             return
         self._seen.add((module, id(node)))
         names = global_names(node)
-        for each in walk_code(node):
+        for each in code_nodes(node):
             if isinstance(each, ast.Attribute):
                 self._add_attribute(module, each, names, own_class)
             elif isinstance(each, ast.Constant) and isinstance(each.value, str):
@@ -302,7 +308,7 @@ class Definitions:
             self._add_found(self.resolve(module, name))
 
     def _add_attribute(
-        self, module: str, node: ast.Attribute, names: set[str], own_class: type | None
+        self, module: str, node: ast.Attribute, names: frozenset[str], own_class: type | None
     ) -> None:
         owner = node.value
         if isinstance(owner, ast.Name) and owner.id in names:
@@ -320,14 +326,14 @@ class Definitions:
         if getattr(owner, "id", None) == "self" and is_task:
             self.shared_attributes.add(node.attr)
 
-    def _add_call(self, module: str, function: ast.expr, names: set[str]) -> None:
+    def _add_call(self, module: str, function: ast.expr, names: frozenset[str]) -> None:
         key = self._key_of(module, function, names)
         if key is not None:
             made = getattr(sys.modules[key.module], key.name, None)
             if isinstance(made, type):
                 self.instantiated.add(made)
 
-    def _key_of(self, module: str, node: ast.expr, names: set[str]) -> Key | None:
+    def _key_of(self, module: str, node: ast.expr, names: frozenset[str]) -> Key | None:
         """Definition that an expression names; None where it is none."""
         if isinstance(node, ast.Name) and node.id in names:
             found = self.resolve(module, node.id)
