@@ -14,7 +14,8 @@ from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import rollout, start_lanes
 
-from filtergym.exports.python_source import clean, export_python, lane_of
+from filtergym.exports.exported_filter import lane_of
+from filtergym.exports.python_source import clean, export_python
 from filtergym.names import find_competitor
 
 RADAR = "filtergym/ManeuveringTarget-v0"

@@ -45,6 +45,11 @@ class NamedReader:
 class ReadModel(Model):
     """A model whose readers know their names, for policies that are to be written out."""
 
+    @property
+    def observation(self) -> Blocks:
+        """What the observation is made of."""
+        return self._blocks
+
     def reader(self, name: str) -> NamedReader:
         """Return what reads a block or quantity."""
         return NamedReader(self._blocks, name)

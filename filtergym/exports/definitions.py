@@ -303,9 +303,19 @@ class Definitions:
             elif isinstance(each, ast.Call):
                 self._add_call(module, each.func, names)
             elif isinstance(each, ast.Import | ast.ImportFrom):
-                raise ExportError(f"{module} imports inside a function: {ast.unparse(each)}")
+                self._check_import(module, each)
         for name in names:
             self._add_found(self.resolve(module, name))
+
+    def _check_import(self, module: str, node: ast.Import | ast.ImportFrom) -> None:
+        """Refuse an import inside a function of anything but NumPy and Python's library."""
+        relative = isinstance(node, ast.ImportFrom) and (node.level or not node.module)
+        names = (
+            [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+        )
+        roots = {name.partition(".")[0] for name in names}
+        if relative or not roots <= {"numpy", *sys.stdlib_module_names}:
+            raise ExportError(f"{module} imports inside a function: {ast.unparse(node)}")
 
     def _add_attribute(
         self, module: str, node: ast.Attribute, names: frozenset[str], own_class: type | None

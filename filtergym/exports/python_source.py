@@ -15,29 +15,14 @@ from typing import Any, NamedTuple
 import numpy
 
 from .. import __version__
-from ..agents.learned_estimator import EstimatorMaker
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem
-from ..baselines.table import ConstantMode
-from ..envs.catalogue import make_task
 from ..envs.model import Episode, Model
-from ..envs.task import Task
-from ..envs.world import World
-from ..evaluation.competitors import (
-    RANKED,
-    ConstantPolicy,
-    RandomPolicy,
-    check_competitor,
-    kind_of,
-    make_competitor,
-)
-from ..evaluation.evaluate import control_of
 from ..evaluation.rollout import rollout, start_lanes
-from ..names import find_competitor
-from .constants import Constants, ConstantsText, ReadModel, call_text, word
+from .constants import Constants, ConstantsText, call_text, word
 from .definition_text import WIDTH, DefinitionText
 from .definitions import Definitions, ExportError, External, Key, class_statement
-from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
+from .exported_filter import Exported, find_exported, lane_of
 
 CHECKED = 25
 """Measurements on which a written filter is tried."""
@@ -67,6 +52,8 @@ ALWAYS = (
     External("typing", "NamedTuple", "NamedTuple"),
     External("numpy", None, "numpy"),
 )
+OF_A_TRACK = ("start_track", "update_track", "arrays", "count_tracks", "named")
+"""Methods that the class calls, or a user."""
 RESERVED = {CLASS, "Array", "with_constants", *TEMPLATES}
 
 
@@ -81,25 +68,6 @@ def shown_name(name: str | Path) -> str:
     text = str(name)
     is_file = isinstance(name, Path) or text.endswith((SUFFIX, ".safetensors"))
     return Path(text).name if is_file else text
-
-
-class Exported(NamedTuple):
-    """What is written out."""
-
-    task: Task
-    track: type[Track]
-    parts: dict[str, Any]
-    """Objects that the track is made with, by the names of its arguments."""
-    attributes: tuple[str, ...]
-    """Names of the methods that it calls."""
-    measurement: Any
-    """One, for the shapes."""
-    initial: Any
-    """Likewise an initial estimate."""
-    model: Model
-    """In which it runs."""
-    maker: Any
-    """Of the competitor."""
 
 
 def export_python(
@@ -122,7 +90,7 @@ def export_python(
     Raises:
         ValueError: for what is not ranked, draws numbers, or takes more than NumPy.
     """
-    exported = _find_parts(problem, name, scenario, trust, keywords)
+    exported = find_exported(problem, name, scenario, trust, keywords)
     try:
         text = _write(problem, str(name), exported)
         _check_text(text, exported, str(name))
@@ -161,113 +129,49 @@ def _answer(model: Model, episode: Episode) -> tuple[Any, Any, Any]:
     return episode.measurement, model.mean(episode), model.covariance(episode)
 
 
-def lane_of(given: Any, lane: int = 0, prefix: str = "") -> dict[str, Any]:
-    """Return what one of N filters is given, by the names of the arguments of the written one.
-
-    Args:
-        given: a measurement or an initial estimate, arrays ``(..., N)``.
-        lane: which of the N.
-        prefix: of the names.
-    """
-    found: dict[str, Any] = {}
-    for field, value in given._asdict().items():
-        if isinstance(value, tuple):
-            found |= lane_of(value, lane, f"{prefix}{field}_")
-        elif value is not None:
-            found[prefix + field] = value[..., lane]
-    return found
-
-
-def _find_parts(
-    problem: Problem, name: str | Path, scenario: Any, trust: bool, keywords: Mapping[str, Any]
-) -> Exported:
-    maker = find_competitor(problem, name, trust)
-    kind = kind_of(maker)
-    if kind not in RANKED:
-        raise ValueError(
-            f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone"
-        )
-    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
-    task = make_task(problem.task, scenario, **keywords)
-    learned = isinstance(maker, EstimatorMaker)
-    control = maker.bank if learned else control_of(maker, kind, None, problem.task, str(name))
-    model = ReadModel(task, control)
-    initial, measurement = _first_measurement(model)
-    if kind == "estimator" and not learned:
-        own = check_competitor(str(name), make_competitor(maker, task), kind)
-        own_mask = type(task.world).mask_missing is not World.mask_missing
-        mask = task.world.mask_missing if own_mask else NotReceived(task.world.received_field)
-        parts = {"filter": own, "mask": mask}
-        called = "start", "update"
-        return Exported(task, EstimatorTrack, parts, called, measurement, initial, model, maker)
-    policy = make_competitor(maker.policy if learned else maker, model)
-    if isinstance(policy, RandomPolicy):
-        raise ValueError(f"{str(name)!r} draws its actions: there is nothing to write out")
-    called = "start", "predict", "act", "mean", "covariance", "records"
-    if isinstance(policy, ConstantPolicy | ConstantMode):
-        action = policy.mode if isinstance(policy, ConstantMode) else numpy.array(policy.action, dtype=float)
-        parts = {"filter": model.filter, "action": action}
-        return Exported(task, ConstantTrack, parts, called, measurement, initial, model, maker)
-    parts = {
-        "filter": model.filter,
-        "observation": model._blocks,
-        "policy": policy,
-        "decision_interval": task.decision_interval,
-    }
-    return Exported(
-        task, SteeredTrack, parts, (*called, "observe", "fields"), measurement, initial, model, maker
-    )
-
-
-def _first_measurement(model: ReadModel) -> tuple[Any, Any]:
-    """Return an initial estimate and a measurement of an average episode, for their shapes."""
-    noise = model.task.noise
-    episode = model.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
-    after = model.measure(episode, numpy.full((noise.normals + noise.row_uniforms, 8), 0.5))
-    return episode.measurement, after.measurement
+def _collect(exported: Exported) -> Definitions:
+    """Find all definitions that the file takes."""
+    track, arguments, called = exported.parts
+    roots = [type(exported.task), *map(type, arguments.values())]
+    packages = {"filtergym", *(cls.__module__.partition(".")[0] for cls in roots)}
+    definitions = Definitions(packages - {"builtins", "numpy"})
+    definitions.externals |= set(ALWAYS)
+    definitions.attributes |= {*called, *OF_A_TRACK}
+    definitions.instantiated.add(track)
+    definitions.add(Key(track.__module__, track.__name__))
+    for example in (exported.initial, exported.measurement):
+        definitions.add_class(type(example))
+    constants, size = Constants(definitions), -1
+    while size != definitions.size:
+        size = definitions.size
+        for part, value in arguments.items():
+            constants.collect(value, part)
+        definitions.add_members()
+    return definitions
 
 
 def _write(problem: Problem, name: str, exported: Exported) -> str:
-    packages = {"filtergym", type(exported.task).__module__.partition(".")[0]}
-    packages |= {type(part).__module__.partition(".")[0] for part in exported.parts.values()}
-    definitions = Definitions(packages - {"builtins", "numpy"})
-    definitions.externals |= set(ALWAYS)
-    definitions.attributes |= {
-        *exported.attributes,
-        "start_track",
-        "update_track",
-        "arrays",
-        "count_tracks",
-        "named",
-    }
-    definitions.instantiated.add(exported.track)
-    definitions.add(Key(exported.track.__module__, exported.track.__name__))
-    for example in (exported.initial, exported.measurement):
-        definitions.add_class(type(example))
-    collected, size = Constants(definitions), -1
-    while size != definitions.size:
-        size = definitions.size
-        for part, value in exported.parts.items():
-            collected.collect(value, part)
-        definitions.add_members()
+    """Put the sections of the file together."""
+    definitions, arguments = _collect(exported), exported.parts.arguments
     text = DefinitionText(definitions, RESERVED)
-    constants = ConstantsText(definitions, text, "OBSERVATION", exported.parts["filter"])
-    made = {part: constants.expression(value, part) for part, value in exported.parts.items()}
-    parameters = text.parameters_text()
-    body = [text.text(), parameters, *constants.statements, _online_filter(text, exported, made)]
-    used = {node.id for node in ast.walk(ast.parse("\n".join(body))) if isinstance(node, ast.Name)}
-    engine = [template for name, template in TEMPLATES.items() if name in used]
-    imports = [found for found in definitions.externals if found.name in used | {"Any", "NamedTuple"}]
-    sections = [
-        'Array = Any\n"""A NumPy array."""',
-        body[0],
-        "\n\n\n".join([_rule("constants"), *filter(None, [parameters]), MAKES_OBJECTS, *engine]),
-        "\n".join(constants.statements) + "\n" + body[-1],
-    ]
+    constants = ConstantsText(definitions, text, "OBSERVATION", arguments["filter"])
+    made = {part: constants.expression(value, part) for part, value in arguments.items()}
+    equations, parameters = text.text(), text.parameters_text()
+    statements = "\n".join(constants.statements)
+    called = _online_filter(text, exported, made)
+    whole = ast.parse("\n".join([equations, parameters, statements, called]))
+    used = {node.id for node in ast.walk(whole) if isinstance(node, ast.Name)} | {"Any", "NamedTuple"}
+    engine = [template for template_name, template in TEMPLATES.items() if template_name in used]
+    imports = [found for found in definitions.externals if found.name in used]
     head = [_docstring(problem, name, exported), "from __future__ import annotations", _imports(imports)]
-    written = "\n\n".join([*head, "\n\n\n".join(sections)]) + "\n"
-    compile(written, "<export>", "exec", dont_inherit=True)
-    return written
+    sections = [
+        "\n\n".join(head),
+        'Array = Any\n"""A NumPy array."""',
+        equations,
+        *filter(None, [_rule("constants"), parameters, MAKES_OBJECTS, *engine]),
+        f"{statements}\n{called}",
+    ]
+    return "\n\n\n".join(sections) + "\n"
 
 
 def _rule(title: str) -> str:
@@ -369,7 +273,7 @@ def _online_filter(text: DefinitionText, exported: Exported, made: Mapping[str, 
     """Class with the names of what it is given and says."""
     arguments = {**_arguments(exported.initial), **_arguments(exported.measurement)}
     components = tuple((c.name, c.unit) for c in exported.task.components)
-    base = text.name_of(exported.track.__module__, exported.track.__name__)
+    base = text.name_of(exported.parts.track.__module__, exported.parts.track.__name__)
     parts = "".join(f", {expression}" for part, expression in made.items() if part != "filter")
     table = "".join(
         f"    {word(field)}: ({word(each.dtype)}, {each.shape}),\n" for field, each in arguments.items()
