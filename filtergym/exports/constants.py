@@ -185,11 +185,12 @@ def word(value: Any) -> str:
 
 def number_text(value: Any) -> str:
     """Number as text that gives the same bits: the shortest."""
-    if isinstance(value, numpy.generic):
-        text = str(value) if isinstance(value, numpy.floating) else repr(value.item())
-        value = float(value) if isinstance(value, numpy.floating) else value
-    else:
-        text = repr(value)
+    text = repr(value.item() if isinstance(value, numpy.generic) else value)
+    if isinstance(value, numpy.floating):
+        # The shortest of its own precision, unless it rounds to another number by way of Python's double.
+        shortest = str(value)
+        text = shortest if type(value)(float(shortest)) == value else text
+        value = float(value)
     if isinstance(value, float) and not numpy.isfinite(value):
         return "numpy.nan" if value != value else ("numpy.inf" if value > 0.0 else "-numpy.inf")
     return text
@@ -202,8 +203,11 @@ def array_text(array: numpy.ndarray) -> str:
     if array.size == 0:
         return f"numpy.zeros({array.shape}{dtype}{order})"
     if array.size > LONG and array.ndim > 2 and not order:
-        return f"numpy.array(\n{_rows_text(array.reshape(-1))}{dtype}\n).reshape{array.shape}"
-    return f"numpy.array({_rows_text(array)}{dtype}{order})"
+        return f"{array_text(array.reshape(-1))}.reshape{array.shape}"
+    rows = _rows_text(array)
+    if array.ndim == 1 and "\n" in rows:
+        return f"numpy.array(\n{textwrap.indent(rows, '    ')}{dtype}{order}\n)"
+    return f"numpy.array({rows}{dtype}{order})"
 
 
 def _rows_text(array: numpy.ndarray) -> str:
@@ -262,7 +266,9 @@ class ConstantsText:
         if id(value) in self._names:
             return self._names[id(value)]
         if isinstance(value, numpy.ndarray):
-            return self.name(value, wanted) if hoist and value.size > LONG else array_text(value)
+            # Those of a network are named, whatever their size: it holds some of them twice.
+            named = value.size > LONG or value.dtype == numpy.float32
+            return self.name(value, wanted) if hoist and named else array_text(value)
         if isinstance(value, Blocks):
             return self._blocks(value)
         if isinstance(value, NamedReader):
@@ -288,7 +294,7 @@ class ConstantsText:
     def _space(self, space: Any) -> str:
         if hasattr(space, "n"):
             return f"Discrete({int(space.n)})"
-        return f"Box({array_text(space.low)}, {array_text(space.high)})"
+        return call_text("Box(", [array_text(space.low), array_text(space.high)], ")")
 
     def _blocks(self, value: Blocks) -> str:
         bank = self.expression(self.bank, "filter")

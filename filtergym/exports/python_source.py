@@ -310,15 +310,14 @@ def _method(text: DefinitionText, method: str, given: Any, exported: Exported) -
         C = len(exported.task.components)
         described |= {"mean": f"of COMPONENTS, ``({C},)``, or ``({C}, N)`` of N tracks."}
         described |= {"covariance": f"of its errors, ``({C}, {C})`` or ``({C}, {C}, N)``."}
-    signature = ", ".join(f"{field}: Any" for field in described)
     returned, title = (
         ("None", "Start the track at an initial estimate.")
         if method == "start"
         else ("Estimate", "Predict to the time of a measurement, take it in, and estimate.")
     )
-    lines = [f"    def {method}(self, {signature}) -> {returned}:", f'        """{title}', ""]
-    if len(lines[0]) > WIDTH:
-        lines[0] = f"    def {method}(\n        self, {signature}\n    ) -> {returned}:"
+    signature = ["self", *(f"{field}: Any" for field in described)]
+    opening = call_text(f"def {method}(", signature, f") -> {returned}:")
+    lines = [textwrap.indent(opening, " " * 4), f'        """{title}', ""]
     if method == "update":
         lines += ["        Shapes are those of N tracks; of one, they are without the N.", ""]
     lines += ["        Args:"]
