@@ -304,3 +304,54 @@ def test_a_users_environment_is_written(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent.parent / "docs" / "examples")
     env = "inverted_pendulum:mine/InvertedPendulum-v0"
     check_replay(export_python(import_problem(env), "matching"), replay(env, "matching", 1, 20))
+
+
+TWICE = '''
+import numpy
+from dataclasses import dataclass
+
+from filtergym.filters import kalman as math
+from filtergym.filters.kalman import Update
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is set."""
+
+    gain: float
+    unread: str = "no"
+
+
+def update(mean, innovation, settings: "Settings"):
+    """Has the name of Kalman's."""
+    return mean + settings.gain * innovation
+
+
+class Own:
+    """Names that stand for several things."""
+
+    def __init__(self, task):
+        self.settings, self.transition = Settings(0.25), (lambda x: 2.0 * x)
+
+    def start(self, initial, N):
+        return initial.mean, initial.covariance
+
+    def update(self, measurement, memory):
+        mean, P = memory
+        seen = measurement.available > 0.0
+        H, R = numpy.eye(2, 4), numpy.eye(2)[:, :, None] * measurement.variance
+        kalman = math.update(mean, P, numpy.nan_to_num(measurement.position), H, R)
+        mean = numpy.where(seen, Update(*kalman).mean, self.transition(mean) / 2.0)
+        shift = numpy.where(seen, 1.0, 0.0) * numpy.ones((4, 1))
+        return update(mean, shift, self.settings), P, (mean, P)
+'''
+
+
+def test_names_that_two_modules_have_are_told_apart(tmp_path, monkeypatch):
+    (tmp_path / "own_twice.py").write_text(TWICE)
+    monkeypatch.syspath_prepend(tmp_path)
+    text = export_python(import_problem(RADAR), "own_twice:Own")
+    assert "def kalman_update(" in text
+    assert "def own_twice_update(" in text
+    assert 'Settings(gain=0.25, unread="no")' in text
+    check_replay(text, replay(RADAR, "own_twice:Own", 1, 5))

@@ -59,6 +59,8 @@ def _attributes(value: Any, definitions: Definitions) -> dict[str, Any]:
     """Attributes of an object that are read, by name."""
     if isinstance(value, Model):
         return {name: getattr(value, name) for name in OF_A_MODEL if name in definitions.attributes}
+    if dataclasses.is_dataclass(value) and not isinstance(value, TaskParameters):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
     names = definitions.shared_attributes if isinstance(value, Task | World) else definitions.attributes
     if isinstance(value, TaskParameters):
         names = names | definitions.words

@@ -3,13 +3,14 @@
 import ast
 import sys
 from collections import Counter, defaultdict
-from typing import Any
+from typing import Any, NamedTuple
 
 from .definitions import (
     DROPPED_BASES,
     SIMPLER,
     SIMPLER_METHODS,
     Definitions,
+    ExportError,
     External,
     Key,
     Source,
@@ -24,6 +25,19 @@ from .definitions import (
 )
 
 WIDTH = 110
+
+
+class _Edit(NamedTuple):
+    """A name that changes."""
+
+    row: int
+    """Of its module, from 1 on."""
+    start: int
+    """First byte in the row."""
+    end: int
+    old: str
+    """Empty where it does not matter."""
+    new: str
 
 
 def module_order(modules: set[str], definitions: Definitions) -> list[str]:
@@ -161,6 +175,8 @@ class DefinitionText:
             name = self.names[key]
             text = text.replace(f"def {key.name}(", f"def {name}(", 1)
         elif self.names[key] != key.name:
+            if not text.startswith((f"{key.name} =", f"{key.name}:")):
+                raise ExportError(f"{key.name} of {key.module} cannot be given another name")
             text = self.names[key] + text.removeprefix(key.name)
         return text
 
@@ -234,16 +250,23 @@ class DefinitionText:
         return bases
 
     def _edited(self, source: Source, node: ast.AST, first: int, last: int) -> str:
-        """Lines of a module with the names that the file has."""
-        edits = self._edits(source.name, node)
+        """Lines of a module with the names that the file has.
+
+        Raises:
+            ExportError: where a name is not where Python says, as inside of some formatted strings.
+        """
         lines = [line.encode() for line in source.lines[first - 1 : last]]
-        for row, start, end, new in sorted(edits, reverse=True):
-            line = lines[row - first]
-            lines[row - first] = line[:start] + new.encode() + line[end:]
+        for edit in sorted(self._edits(source.name, node), reverse=True):
+            line = lines[edit.row - first]
+            if edit.old and line[edit.start : edit.end] != edit.old.encode():
+                raise ExportError(
+                    f"{edit.old} in line {edit.row} of {source.name} cannot be given another name"
+                )
+            lines[edit.row - first] = line[: edit.start] + edit.new.encode() + line[edit.end :]
         return "\n".join(line.decode() for line in lines)
 
-    def _edits(self, module: str, node: ast.AST) -> list[tuple[int, int, int, str]]:
-        """Places where a name changes: row, first and last column, and what stands there then."""
+    def _edits(self, module: str, node: ast.AST) -> list[_Edit]:
+        """Places where a name changes."""
         if not isinstance(node, ast.stmt | ast.expr):
             return []
         names, edits = global_names(node), []
@@ -259,7 +282,7 @@ class DefinitionText:
             edits += self._annotation_edits(module, annotation)
         return edits
 
-    def _annotation_edits(self, module: str, node: ast.AST) -> list[tuple[int, int, int, str]]:
+    def _annotation_edits(self, module: str, node: ast.AST) -> list[_Edit]:
         """Likewise in an annotation; what is not in the file is Any."""
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             return [_edit(node, "Any")]
@@ -275,7 +298,7 @@ class DefinitionText:
             edit for child in ast.iter_child_nodes(node) for edit in self._annotation_edits(module, child)
         ]
 
-    def _annotated_name(self, module: str, node: ast.Name) -> list[tuple[int, int, int, str]]:
+    def _annotated_name(self, module: str, node: ast.Name) -> list[_Edit]:
         try:
             found: Any = self.definitions.resolve(module, node.id)
         except ValueError:
@@ -289,10 +312,11 @@ class DefinitionText:
         return [] if name == node.id else [_edit(node, name)]
 
 
-def _edit(node: Any, new: str) -> tuple[int, int, int, str]:
+def _edit(node: Any, new: str) -> _Edit:
+    old = "" if isinstance(node, ast.Constant) else ast.unparse(node)
     if node.lineno != node.end_lineno:
-        raise ValueError(f"line {node.lineno}: a name goes over several lines")
-    return node.lineno, node.col_offset, node.end_col_offset, new
+        raise ExportError(f"{old or 'an annotation'} goes over several lines")
+    return _Edit(node.lineno, node.col_offset, node.end_col_offset, old, new)
 
 
 def _heading(source: Source) -> str:

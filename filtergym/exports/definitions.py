@@ -179,7 +179,8 @@ def first_line(statement: ast.stmt) -> int:
     return min([statement.lineno, *(d.lineno for d in getattr(statement, "decorator_list", ()))])
 
 
-def _class_members(cls: type) -> dict[str, tuple[ast.stmt, int]]:
+@functools.cache
+def members_of(cls: type) -> dict[str, tuple[ast.stmt, int]]:
     """Statements in the body of a class by name, with their last lines."""
     body = class_statement(cls).body
     members = {}
@@ -190,9 +191,6 @@ def _class_members(cls: type) -> dict[str, tuple[ast.stmt, int]]:
         for name in names:
             members[name] = statement, _last_line(body, i)
     return members
-
-
-members_of = functools.cache(_class_members)
 
 
 def class_statement(cls: type) -> ast.ClassDef:

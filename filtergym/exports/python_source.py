@@ -179,7 +179,19 @@ def _rule(title: str) -> str:
 
 
 def _imports(externals: list[External]) -> str:
-    """Return the statements that import, NumPy's last."""
+    """Return the statements that import, NumPy's last.
+
+    Raises:
+        ExportError: if a name is imported from two places.
+    """
+    of_types = {"typing", "collections.abc"}
+    origins: dict[str, set[tuple[str, str | None]]] = {}
+    for found in externals:
+        origin = "" if found.module in of_types else found.module
+        origins.setdefault(found.name, set()).add((origin, found.attribute))
+    for name, places in origins.items():
+        if len(places) > 1:
+            raise ExportError(f"{name} is imported from {' and '.join(sorted(place for place, _ in places))}")
     whole = sorted(str(found) for found in externals if found.attribute is None)
     names: dict[str, list[str]] = {}
     for found in sorted(externals, key=str):
@@ -251,7 +263,7 @@ def _docstring(problem: Problem, name: str, exported: Exported) -> str:
         "",
         _wrapped(
             f"Written by filtergym {__version__}. The equations are those of the package, function by function; the "
-            "parameters in force stand behind them, under 'constants'. One track is estimated, or N side by side with "
+            "parameters in force stand behind them, under 'constants'. Python 3.11 and NumPy 2, or later ones. One track is estimated, or N side by side with "
             "N as last axis of every array.",
             "",
         ),
