@@ -262,9 +262,9 @@ def _docstring(problem: Problem, name: str, exported: Exported) -> str:
         f'"""{clean(shown_name(name))}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
         "",
         _wrapped(
-            f"Written by filtergym {__version__}, for Python 3.11 and NumPy 2 or later ones. The equations are those of "
-            "the package, function by function; the parameters in force stand behind them, under 'constants'. One track "
-            "is estimated, or N side by side with N as last axis of every array.",
+            f"Written by filtergym {__version__} for Python 3.11 and NumPy 2, or later. The equations are those of "
+            "the package, function by function; the parameters in force stand behind them, under 'constants'. One "
+            "track is estimated, or N side by side with N as last axis of every array.",
             "",
         ),
         "",
