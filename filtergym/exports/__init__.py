@@ -1,0 +1,1 @@
+"""Filters written out for other programs: what runs without this package."""
