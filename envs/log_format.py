@@ -38,6 +38,9 @@ class TrackLog(NamedTuple):
     """Of the measurements, likewise, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """What was done to the table, a line each."""
+    typical: Mapping[str, float] = {}
+    """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
+    nobody has set them."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,20 @@ def read_log(columns: Columns) -> TrackLog:
         float(columns.time[first]),
         time,
         (*_stale_notes(stale), *_gap_notes(rows)),
+        _typical_sigma(columns, there),
     )
+
+
+def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
+    """Median of the deviations that a table states, in place of the radar's; empty where it is that, or none is stated.
+
+    Agents are shown deviations over this one, and errors cost in its square.
+    """
+    names = ["sigma_x", "sigma_y"] if columns.has("sigma_x", "sigma_y") else ["range_sigma"]
+    if not columns.has(*names):
+        return {}
+    median = float(f"{numpy.nanmedian([columns[name][there] for name in names]):.6g}")
+    return {} if median == ManeuveringTargetParameters.range_sigma else {"range_sigma": median}
 
 
 def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray) -> numpy.ndarray:

@@ -291,7 +291,7 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
 def say_departures(
     problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
 ) -> None:
-    """Say of every agent, in a line, how what it is shown departs from what it was trained on.
+    """Say what agents are shown follows from a log, and how it departs from what each was trained on, in a line.
 
     Args:
         problem: whose agents they are.
@@ -300,6 +300,14 @@ def say_departures(
         keywords: parameters of the task.
         trust: load models that can execute code.
     """
+    typical = data.typical if learned and isinstance(data, Recording) else {}
+    for name in typical.keys() - keywords.keys():
+        console.print(
+            f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
+            f"costs count in its square; --set {name}=VALUE names another",
+            highlight=False,
+            soft_wrap=True,
+        )
     for name in learned:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it was loaded before, and has warned

@@ -143,6 +143,8 @@ def _verdict(advice: Advice) -> str:
         )
         if not math.isnan(one.relative_error.value):
             text += f" {one.name} has {_amount(advice, one.relative_error)} than it, {where}."
+            if one.relative_error.high < 0.0:
+                text += " That is beyond chance: a longer log may turn the choice."
         return text
     name = f"Take {one.name}, with the parameters below"
     if math.isnan(one.relative_error.value):
