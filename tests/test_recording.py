@@ -879,9 +879,10 @@ def test_tables_on_the_command_line(command, tmp_path):
         "evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", "--json", "records.json"
     )
     assert code == 0
-    assert "log-likelihood per measurement" in out
+    assert "log-likelihood: of what was measured" in out
     metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
     assert {"log_likelihood", "anis", "anis_band", "nis_inside"} <= metrics
+    assert {"prediction_error", "innovation_correlation"} <= metrics
     assert not {"rmse", "cost", "anees"} & metrics
 
 

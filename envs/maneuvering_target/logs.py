@@ -12,7 +12,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
-from ..log_format import LogFormat, TrackLog, TrackStart
+from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..plausibility import check_bearings
 from ..recorded_tables import Columns
 from ..recording import Recording
@@ -293,7 +293,7 @@ def scale_noise(measurement: Any, factor: Any) -> Any:
     return measurement._replace(variance=measurement.variance * factor**2)
 
 
-def predict_position(mean: Any, measurement: Any) -> tuple[Any, Any]:
+def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
     """Position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2, N)`` each."""
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
@@ -306,6 +306,7 @@ LOG_FORMAT = LogFormat(
     targets_move=True,
     scale_noise=scale_noise,
     predict=predict_position,
+    predicted=(Predicted("x", "m", "position"), Predicted("y", "m", "position")),
     plane=("x", "y", "truth_position_x", "truth_position_y"),
     longest_interval=60.0,
 )

@@ -34,15 +34,20 @@ from ..evaluation.summary import combine_summaries, summaries
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.benchmark import result_of
 from ..reports.export import latex_table, records_as_csv
+from ..reports.recording_tables import recording_tables
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
-from ..reports.tables import flights_table, recording_table, results_tables
+from ..reports.tables import flights_table, results_tables
 from ..reports.work import work_of
 from .shown import REPORT, make_report
 from .terminal import command_line, console, pair, progress_bar
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
+MOST_PREDICTIONS = 2_000_000
+"""Measurements of all competitors whose estimates are kept, some 200 bytes each."""
+TRACKS = ("truth", "estimate", "covariance")
+"""What is kept of measurements for predictions, and not written unless estimates are asked for."""
 MOST_RECORDINGS = 40
 """Of which a table tells one by one."""
 
@@ -149,6 +154,20 @@ def causal_names(problem: Problem) -> list[str]:
     return [*classical, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
+def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
+    """Whether estimates are kept to say what they predicted: of recordings that are not huge.
+
+    Args:
+        problem: that is evaluated.
+        data: of :func:`find_data`.
+        names: of competitors.
+    """
+    log_format = problem.task.log_format
+    if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
+        return False
+    return data.seconds.size * len(set(names)) <= MOST_PREDICTIONS
+
+
 class Outcome(NamedTuple):
     """What an evaluation has found."""
 
@@ -186,9 +205,11 @@ class Outcome(NamedTuple):
     def tables(self, problem: Problem, flights: list[Any]) -> list[Table]:
         """Return what is printed, widest first."""
         tables = [flights_table(self.dataset, flights, self.records, console.width)] if flights else []
-        if not self.has_truth:
-            return [*tables, recording_table(self.records, self.differences(problem))]
-        return [*tables, *results_tables(self.records, problem.knows, console.width)]
+        if self.has_truth:
+            tables += results_tables(self.records, problem.knows, console.width)
+        if self.dataset.attrs["recorded"]:
+            tables += recording_tables(self.records, self.differences(problem), self.has_truth, console.width)
+        return tables
 
 
 def run(
@@ -225,8 +246,12 @@ def run(
 
         if task.flights or outputs.estimates is not None or whole:
             dataset = run_experiment(experiment, competitors_of(problem, names, trust), tick, workers)
+            records = tidy_records(dataset)
+            if outputs.estimates is None:
+                tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]
+                dataset = dataset.drop_vars(tracks)
             curves = None if outputs.folder is None else curves_of(dataset)
-            return Outcome(dataset, tidy_records(dataset), curves, refusal, store)
+            return Outcome(dataset, records, curves, refusal, store)
         requests = evaluation_requests(problem, experiment, names, trust)
         work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))

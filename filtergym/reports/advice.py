@@ -216,8 +216,8 @@ def _fits(advice: Advice) -> Iterator[str]:
     spread = advice.fits[one.name].spread
     if spread > DROP:
         yield (
-            f"The likelihood of {one.name} has several maxima: the worst of its {STARTS} starts ended {spread:,.1f} nats "
-            "below the best, whose values these are."
+            f"The likelihood of {one.name} has several maxima: the worst of its {STARTS} starts ended {spread:,.1f} "
+            "nats below the best, whose values these are."
         )
     if advice.diverging:
         lose, diverge = ("loses", "it diverges") if len(advice.diverging) == 1 else ("lose", "they diverge")

@@ -154,7 +154,11 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
 
     against = f"cost against {result.paper or 'paper'}, %"
     header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
-    header += [*(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown), "origin", "control"]
+    header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
+    predicted = {r.component: r.unit for r in records if r.metric == "prediction_error"}
+    for group, unit in predicted.items():
+        header += [f"error of predicted {group}, {unit}", f"correlation of successive ones, {group}"]
+    header += ["origin", "control"]
     rows = []
     for name, kind, control in rank_competitors(records):
         median, wins = against_paper(found, name)
@@ -171,6 +175,11 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(consistency_word(value), consistency_word(value)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
                 *(number(name, "rmse", component) for component in shown),
+                *(
+                    number(name, metric, group)
+                    for group in predicted
+                    for metric in ("prediction_error", "innovation_correlation")
+                ),
                 Entry(origin(result, name, kind), origin(result, name, kind)),
                 Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
             ]
