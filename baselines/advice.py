@@ -24,7 +24,15 @@ from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from .fitted_filters import families_of
-from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
+from .fitting import (
+    Fit,
+    Interval,
+    Profile,
+    fit,
+    profile_intervals,
+    profile_parameters,
+    with_noise_scale,
+)
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -130,8 +138,13 @@ class Advice(NamedTuple):
     """The whole recording as the fitted one, its rival and the best in hindsight estimate it, with tracks."""
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
-    intervals: dict[str, Interval]
-    """Of the parameters of ``fitted``."""
+    profiles: dict[str, dict[str, Profile]]
+    """Likelihood of the parameters of ``fitted``; of the other fitted ones where that was asked for."""
+
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """Of the parameters of ``fitted``."""
+        return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     @property
     def advised(self) -> Competitor:
@@ -146,6 +159,7 @@ def advise(
     own: Mapping[str, Tunable] | None = None,
     noise: bool = True,
     seed: int = 0,
+    every_profile: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     **keywords: Any,
 ) -> Advice:
@@ -158,6 +172,7 @@ def advise(
         own: further families, such as an estimator of a user's with limits of its parameters.
         noise: fit the scale of the measurement noise, too, where measurements state one.
         seed: of the starts of the fits.
+        every_profile: of all that are fitted, not only of the likeliest.
         progress: told what is done, and which share of all.
         **keywords: parameters of the task.
 
@@ -207,7 +222,11 @@ def advise(
         before, refitted = chosen, judgement.competitor(name, rival)
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
-    intervals = profile_intervals(likelihoods[name], tunable, fits[name])
+    profiles = {
+        each: profile_parameters(likelihoods[each], tunables[each], fits[each])
+        for each in (fits if every_profile else [name])
+        if each not in diverging
+    }
     progress("done", 1.0)
     advised = chosen if chosen.gain.low > 0.0 else next(c for c in competitors if c.name == rival)
     others = sorted(
@@ -226,7 +245,7 @@ def advise(
         judgement.predictions.dataset.sel(policy=list(dict.fromkeys([name, rival, best]))),
         fits,
         tunables,
-        intervals,
+        profiles,
     )
 
 

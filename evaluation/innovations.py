@@ -45,6 +45,21 @@ def with_innovations(dataset: xarray.Dataset, task: Task) -> xarray.Dataset:
     )
 
 
+def received(run: xarray.Dataset, task: Task) -> numpy.ndarray | None:
+    """What was measured of what estimates predict, ``(m, episodes, time)``; None where nobody predicts.
+
+    Args:
+        run: one competitor's part of an evaluation with tracks.
+        task: of the recording.
+    """
+    log_format = type(task).log_format
+    if log_format is None or log_format.predict is None or "estimate" not in run:
+        return None
+    estimate = run["estimate"].transpose("component", "episode", "time").values
+    found: numpy.ndarray = log_format.predict(estimate, _Measured(run), task.parameters)[1]
+    return found
+
+
 class _Measured:
     """Measurements of one competitor's part of a dataset by attribute, ``(..., episodes, time)``."""
 

@@ -1,12 +1,13 @@
-"""Innovations of recordings: what was measured less what estimates predict, in sensor units, and whether it is white."""
+"""Innovations of recordings: measured less predicted, in sensor units, and whether they are white."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
-from filtergym.reports.recording_tables import recording_tables
 
 from filtergym import evaluate, record, tidy_records
+from filtergym.reports.recording_tables import recording_tables
 
 CASES = {
     "filtergym/ManeuveringTarget-v0": ("imm", "missed-detections", ["position"], ["m"]),
@@ -64,7 +65,7 @@ def test_records_say_how_large_and_how_white_they_are(case):
         assert error.value == pytest.approx(np.sqrt((mine[there] ** 2).sum(axis=1).mean()), rel=1e-12)
         assert error.low < error.value < error.high
         assert error.unit == unit
-        pairs = [(a, b) for a, b in zip(mine[:-1], mine[1:], strict=True) if np.isfinite(a + b).all()]
+        pairs = [(a, b) for a, b in itertools.pairwise(mine) if np.isfinite(a + b).all()]
         products = sum(a @ b for a, b in pairs), sum(0.5 * (a @ a + b @ b) for a, b in pairs)
         assert records["innovation_correlation", group].value == pytest.approx(
             products[0] / products[1], rel=1e-9

@@ -412,7 +412,7 @@ def scaled(tmp_path, factor, sigma=40.0):
 
 @pytest.mark.parametrize("name", ["ppo", "bptt"])
 def test_the_unit_of_length_of_a_log_is_nothing_to_an_agent_of_alpha_beta_filters(tmp_path, name):
-    """To rounding of decimal numbers and sixty updates. What knows accelerations in m/s^2, as kalman-net, is another."""
+    """To rounding of decimals and sixty updates. What knows accelerations in m/s^2, as kalman-net, is another."""
     errors = []
     for factor in (1.0, 1.0 / 32.0):
         recording = read(scaled(tmp_path, factor), tmp_path)
