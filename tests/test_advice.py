@@ -405,12 +405,12 @@ def test_starts_that_disagree_and_parameters_at_a_limit_are_said(advice):
         (
             low,
             (low, low + 0.5),
-            f"at the lower limit of the search: the log says at most {10.0 ** (low + 0.5):.3g} m/s^2",
+            f"at the lower limit of the search, the log says at most {10.0 ** (low + 0.5):.3g} m/s^2",
         ),
         (
             high,
             (high - 0.5, high),
-            f"at the upper limit of the search: the log says at least {10.0 ** (high - 0.5):.3g} m/s^2",
+            f"at the upper limit of the search, the log says at least {10.0 ** (high - 0.5):.3g} m/s^2",
         ),
     ):
         found = two_hills._replace(

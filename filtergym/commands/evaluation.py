@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -316,6 +316,14 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
 def say_departures(
     problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
 ) -> None:
+    """Say what :func:`departure_lines` says."""
+    for line in departure_lines(problem, data, learned, keywords, trust):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def departure_lines(
+    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
+) -> Iterator[str]:
     """Say what agents are shown follows from a log, and how it departs from what each was trained on, in a line.
 
     Args:
@@ -327,11 +335,9 @@ def say_departures(
     """
     typical = data.typical if learned and isinstance(data, Recording) else {}
     for name in typical.keys() - keywords.keys():
-        console.print(
+        yield (
             f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
-            f"costs count in its square; --set {name}=VALUE names another",
-            highlight=False,
-            soft_wrap=True,
+            f"costs count in its square; --set {name}=VALUE names another"
         )
     for name in learned:
         with warnings.catch_warnings():
@@ -339,7 +345,7 @@ def say_departures(
             maker = find_competitor(problem, name, trust)
         found = departure(problem.task, maker, data, keywords)
         if found is not None:
-            console.print(f"{name}: {found}", highlight=False, soft_wrap=True)
+            yield f"{name}: {found}"
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:

@@ -3,6 +3,7 @@
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from rich.table import Table
 
@@ -44,22 +45,8 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     table.add_column("filter", no_wrap=True)
     for title, width in COLUMNS.items():
         table.add_column(title, justify="right", min_width=width)
-    known = advice.rival, advice.best_shipped
-    keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
-    room = MOST_ROWS - len(keep)
-    rest = [c for c in advice.competitors if c not in keep]
-    agents = [c for c in rest if c.name in learned]
-    keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
-    for one in [c for c in advice.competitors if c in keep]:
-        table.add_row(
-            "\n".join(textwrap.wrap(_label(advice, one), NAME_WIDTH)),
-            _number(one.log_likelihood),
-            _interval(one.difference, "+.3f"),
-            _number(one.error if has_truth else one.prediction),
-            _interval(_percent(one.relative_error), "+.1f"),
-            _number(one.nis, ".2f"),
-            _interval(one.correlation, "+.2f"),
-        )
+    for row in advice_rows(advice, learned):
+        table.add_row("\n".join(textwrap.wrap(row.label, NAME_WIDTH)), *row.cells)
     what = "estimates" if has_truth else "predictions"
     table.caption = (
         "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
@@ -69,6 +56,36 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     )
     table.caption_justify = "left"
     return table
+
+
+class Row(NamedTuple):
+    """A row of the table of an advice."""
+
+    competitor: Competitor
+    label: str
+    cells: tuple[str, ...]
+    """In the order of ``COLUMNS``."""
+
+
+def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
+    """Return what stands in the table: the advised filter first; arguments as of :func:`advice_table`."""
+    has_truth = advice.recording.truth is not None
+    known = advice.rival, advice.best_shipped
+    keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
+    room = MOST_ROWS - len(keep)
+    rest = [c for c in advice.competitors if c not in keep]
+    agents = [c for c in rest if c.name in learned]
+    keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
+    for one in [c for c in advice.competitors if c in keep]:
+        cells = (
+            _number(one.log_likelihood),
+            _interval(one.difference, "+.3f"),
+            _number(one.error if has_truth else one.prediction),
+            _interval(_percent(one.relative_error), "+.1f"),
+            _number(one.nis, ".2f"),
+            _interval(one.correlation, "+.2f"),
+        )
+        yield Row(one, _label(advice, one), cells)
 
 
 def _label(advice: Advice, one: Competitor) -> str:
@@ -102,12 +119,17 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
         learned: names of shipped agents.
     """
     one = advice.fitted
-    yield _verdict(advice)
-    yield from _hindsight(advice)
+    yield verdict(advice)
     if one is not advice.advised:
         yield f"Of what was fitted {one.name} comes closest, with"
     for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
         yield f"  {line}"
+    yield from further_sentences(advice, learned)
+
+
+def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
+    """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
+    yield from _hindsight(advice)
     yield from _fits(advice)
     yield from _noise(advice)
     yield from _warnings(advice)
@@ -123,10 +145,12 @@ def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interv
         intervals: of the parameters.
     """
     for name, value in found.values.items():
-        yield _parameter(name, value, intervals.get(name), tunable, name in found.at_limit)
+        text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
+        said = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
+        yield said + (f": {text.remark}" if text.remark else "")
 
 
-def _verdict(advice: Advice) -> str:
+def verdict(advice: Advice) -> str:
     """First sentence."""
     one, rival = advice.fitted, advice.rival
     judged = sum(span.last - span.first for span in advice.share.judged)
@@ -182,32 +206,62 @@ def _hindsight(advice: Advice) -> Iterator[str]:
     )
 
 
-def _size(name: str, value: float) -> float:
-    return 10.0**value if name.startswith("log10_") else value
+def parameter_name(key: str) -> str:
+    """Name of a parameter in words, of the name under which it is searched."""
+    return key.removeprefix("log10_").replace("_", " ")
 
 
-def _parameter(
-    name: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
-) -> str:
-    """A fitted parameter with its interval, and whether it can be known."""
-    plain = name.removeprefix("log10_")
-    unit = f" {tunable.units[plain]}" if plain in tunable.units else ""
-    text = f"{plain.replace('_', ' ')} {_size(name, value):.3g}"
+def parameter_size(key: str, value: float) -> float:
+    """Value of a parameter, of that which is searched."""
+    return float(10.0**value) if key.startswith("log10_") else float(value)
+
+
+class ParameterText(NamedTuple):
+    """A fitted parameter in words."""
+
+    value: str
+    interval: str
+    unit: str
+    remark: str
+    """What its interval means where it is none."""
+
+
+def parameter_text(
+    key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
+) -> ParameterText:
+    """Say a fitted parameter with its interval, and whether it can be known.
+
+    Args:
+        key: as it is searched.
+        value: likewise.
+        interval: of it, if it was computed.
+        tunable: whose it is.
+        is_at_limit: whether it ended at a limit of the search.
+    """
+    unit = tunable.units.get(key.removeprefix("log10_"), "")
+    text = ParameterText(f"{parameter_size(key, value):.3g}", "", unit, "")
     if interval is None:
-        return text + unit
-    low, high = _size(name, interval.low), _size(name, interval.high)
+        return text
+    low, high = parameter_size(key, interval.low), parameter_size(key, interval.high)
+    after = f" {unit}" if unit else ""
     flat = (interval.open_low and interval.open_high) or (
-        name.startswith("log10_") and high > IDENTIFIABLE * low
+        key.startswith("log10_") and high > IDENTIFIABLE * low
     )
     if flat:
-        return f"{text}{unit}: not identifiable, the likelihood is flat over {low:.2g} to {high:.2g}{unit}"
+        return text._replace(
+            remark=f"not identifiable, the likelihood is flat over {low:.2g} to {high:.2g}{after}"
+        )
     if is_at_limit:
-        first, last = tunable.limits[name]
+        first, last = tunable.limits[key]
         if value - first < last - value:
-            return f"{text}{unit}, at the lower limit of the search: the log says at most {high:.3g}{unit}"
-        return f"{text}{unit}, at the upper limit of the search: the log says at least {low:.3g}{unit}"
+            return text._replace(
+                remark=f"at the lower limit of the search, the log says at most {high:.3g}{after}"
+            )
+        return text._replace(
+            remark=f"at the upper limit of the search, the log says at least {low:.3g}{after}"
+        )
     ends = [f"{'<' * interval.open_low}{low:.3g}", f"{'>' * interval.open_high}{high:.3g}"]
-    return f"{text} [{', '.join(ends)}]{unit}"
+    return text._replace(interval=f"[{', '.join(ends)}]")
 
 
 def _fits(advice: Advice) -> Iterator[str]:
@@ -265,7 +319,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
             "not white, or the motion is none of the models'. The likelihood then misleads."
         )
     wide = [
-        name.removeprefix("log10_").replace("_", " ")
+        parameter_name(name)
         for name, interval in advice.intervals.items()
         if interval.open_low and interval.open_high
     ]
