@@ -14,7 +14,7 @@ from ..envs.task import Task
 
 
 def with_innovations(dataset: xarray.Dataset, task: Task) -> xarray.Dataset:
-    """Return an evaluation of a recording with the variable ``innovation`` (policy, episode, time, measured).
+    """Return an evaluation of a recording with the variable ``prediction_error`` (policy, episode, time, measured).
 
     NaN where nothing was received, at the first measurement, and of a smoother, which predicts nothing. Where no log
     format says what an estimate predicts, or no estimates were kept, the evaluation stays as it is.
@@ -38,7 +38,7 @@ def with_innovations(dataset: xarray.Dataset, task: Task) -> xarray.Dataset:
         innovations.append(numpy.moveaxis(measured - predicted, 0, -1))
     values = numpy.stack(innovations)
     quantities = log_format.predicted[: values.shape[-1]]
-    return dataset.assign(innovation=(("policy", "episode", "time", "measured"), values)).assign_coords(
+    return dataset.assign(prediction_error=(("policy", "episode", "time", "measured"), values)).assign_coords(
         measured=[quantity.name for quantity in quantities],
         measured_unit=("measured", [quantity.unit for quantity in quantities]),
         measured_group=("measured", [quantity.group for quantity in quantities]),

@@ -318,12 +318,12 @@ def prediction_measures(run: xarray.Dataset) -> Iterator[Measure]:
     Args:
         run: one competitor's part of an evaluation.
     """
-    if "innovation" not in run:
+    if "prediction_error" not in run:
         return
     groups = run["measured_group"].values
     for group in dict.fromkeys(groups.tolist()):
         chosen = numpy.flatnonzero(groups == group)
-        innovation = numpy.moveaxis(run["innovation"].values[..., chosen], -1, 0)
+        innovation = numpy.moveaxis(run["prediction_error"].values[..., chosen], -1, 0)
         squares = (innovation**2).sum(axis=0)
         there = numpy.isfinite(squares)
         if not there.any():

@@ -49,10 +49,10 @@ class Predictions:
 
     def prediction_error(self, name: str) -> numpy.ndarray | None:
         """Measured less predicted, ``(m, episodes, time)``, of the first group of what is measured; None without."""
-        if "innovation" not in self.dataset:
+        if "prediction_error" not in self.dataset:
             return None
         groups = self.dataset["measured_group"].values
-        values = self.dataset["innovation"].sel(policy=name).values[..., groups == groups[0]]
+        values = self.dataset["prediction_error"].sel(policy=name).values[..., groups == groups[0]]
         found: numpy.ndarray = numpy.moveaxis(values, -1, 0)
         return found
 

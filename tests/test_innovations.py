@@ -43,7 +43,7 @@ def case(request):
 def test_they_are_those_of_a_loop(case):
     """To rounding: sums in another order, of numbers up to 1e5 m."""
     recording, name, _, _, dataset = case
-    found = dataset["innovation"].sel(policy=name).values[0]
+    found = dataset["prediction_error"].sel(policy=name).values[0]
     estimate = dataset["estimate"].sel(policy=name).values[0]
     assert np.isnan(found[0]).all()
     for k in range(1, 60):
@@ -57,7 +57,7 @@ def test_they_are_those_of_a_loop(case):
 def test_records_say_how_large_and_how_white_they_are(case):
     _, name, groups, units, dataset = case
     records = {(r.metric, r.component): r for r in tidy_records(dataset) if r.policy == name}
-    every = dataset["innovation"].sel(policy=name).values[0]
+    every = dataset["prediction_error"].sel(policy=name).values[0]
     for group, unit in zip(groups, units, strict=True):
         mine = every[:, (dataset["measured_group"] == group).values]
         there = np.isfinite(mine).all(axis=1)
@@ -84,8 +84,8 @@ def test_the_terminal_shows_them_in_eighty_columns(case):
 
 def test_without_tracks_or_for_a_smoother_nothing_is_said():
     recording = record("filtergym/ManeuveringTarget-v0", "paper", 1, horizon=20)
-    assert "innovation" not in evaluate(recording.environment, ["imm"], recording)
+    assert "prediction_error" not in evaluate(recording.environment, ["imm"], recording)
     dataset = evaluate(recording.environment, ["imm", "kalman-smoother"], recording, tracks=True)
     said = {r.policy for r in tidy_records(dataset) if r.metric == "prediction_error"}
     assert said == {"imm"}
-    assert "innovation" not in evaluate(recording.environment, ["imm"], "paper", episodes=2, tracks=True)
+    assert "prediction_error" not in evaluate(recording.environment, ["imm"], "paper", episodes=2, tracks=True)

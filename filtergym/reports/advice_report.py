@@ -86,7 +86,7 @@ def advice_html(
             }
         ),
         has_track=received(advice.replay.isel(policy=0), task) is not None,
-        has_innovations="innovation" in advice.replay,
+        has_innovations="prediction_error" in advice.replay,
         has_nis="nis" in advice.replay,
     )
 
@@ -221,11 +221,11 @@ def _track(run: xarray.Dataset, task: Task, names: Sequence[str], step: int) -> 
 
 def _innovations(run: xarray.Dataset, name: str, step: int) -> dict[str, Any]:
     """Innovations of a competitor, scaled so that their squares sum to the NIS: of deviation one each."""
-    if "innovation" not in run or "nis" not in run:
+    if "prediction_error" not in run or "nis" not in run:
         return {}
     groups = run["measured_group"].values
     one = run.sel(policy=name).isel(episode=0, measured=groups == groups[0])
-    values, nis = one["innovation"].values, one["nis"].values
+    values, nis = one["prediction_error"].values, one["nis"].values
     length = numpy.sqrt((values**2).sum(axis=-1))
     with numpy.errstate(divide="ignore", invalid="ignore"):
         scaled = values * (numpy.sqrt(nis) / length)[:, None]
