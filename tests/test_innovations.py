@@ -88,4 +88,6 @@ def test_without_tracks_or_for_a_smoother_nothing_is_said():
     dataset = evaluate(recording.environment, ["imm", "kalman-smoother"], recording, tracks=True)
     said = {r.policy for r in tidy_records(dataset) if r.metric == "prediction_error"}
     assert said == {"imm"}
-    assert "prediction_error" not in evaluate(recording.environment, ["imm"], "paper", episodes=2, tracks=True)
+    assert "prediction_error" not in evaluate(
+        recording.environment, ["imm"], "paper", episodes=2, tracks=True
+    )
