@@ -17,6 +17,7 @@ from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import make_task, read_recording, task_class
 from filtergym.evaluation import likelihood as likelihood_module
+from filtergym.evaluation.bootstrap import Estimate
 from filtergym.evaluation.likelihood import Span, WindowLikelihood, cut_windows
 
 from filtergym import evaluate
@@ -354,6 +355,14 @@ def test_the_best_in_hindsight_is_named_beside(advice):
         line.startswith(f"In hindsight {advice.best_shipped} is the best of the 3 shipped ones")
         for line in advice_lines(other, [])
     )
+
+
+def test_a_likelihood_that_misleads_is_said(advice):
+    """As where errors last longer than a measurement: what predicts best errs more."""
+    worse = advice.fitted._replace(relative_error=Estimate(0.07, 0.02, 0.12))
+    line = next(advice_lines(advice._replace(fitted=worse, competitors=[worse, *advice.competitors[1:]]), []))
+    assert "7.0 % more error [2.0, 12.0]" in line
+    assert f"the likelihood misleads here, keep {advice.rival}." in line
 
 
 def test_what_loses_the_track_is_left_out_and_said(one_family, tmp_path):

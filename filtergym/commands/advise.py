@@ -109,8 +109,8 @@ def advise_on_log(
     found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
-    learned = list(pretrained_agents(problem.id))
-    shipped = {name: find_competitor(problem, name) for name in causal_names(problem)}
+    shipped = {name: find_competitor(problem, name) for name in causal_names(problem, found)}
+    learned = [name for name in pretrained_agents(problem.id) if name in shipped]
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)

@@ -13,6 +13,7 @@ from rich.table import Table
 from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
+from ..envs.backend import make_model
 from ..envs.catalogue import make_task, read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
@@ -143,15 +144,31 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
     known = problem.baselines
     if policies or not isinstance(data, Recording):
         return list(policies or known.benchmark or known.names)
-    return [*causal_names(problem), *known.smoothers]
+    return [*causal_names(problem, data), *known.smoothers]
 
 
-def causal_names(problem: Problem) -> list[str]:
+def causal_names(problem: Problem, recording: Recording) -> list[str]:
     """Return the names of all that can run on a recording as it comes: classical, tuned and learned."""
     # What is drawn by lot says nothing of anybody's sensors.
     known = problem.baselines
     classical = [name for name in known.policies if problem.competitor(name) is not RandomPolicy]
-    return [*classical, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
+    return [
+        *classical,
+        *known.estimators,
+        *problem.tuned_policies,
+        *(name for name in pretrained_agents(problem.id) if _knows_fields(problem, name, recording)),
+    ]
+
+
+def _knows_fields(problem: Problem, name: str, recording: Recording) -> bool:
+    """Whether an agent was trained on fields that are shown of a recording: one of other axes shows others."""
+    maker = find_competitor(problem, name)
+    stored = getattr(maker, "policy", maker)
+    header, control = getattr(stored, "header", None), getattr(stored, "control", None)
+    if header is None or control is None:
+        return True
+    model = make_model(problem.task, control, recording, backend="numpy")
+    return {*header["fields"]} <= {field.name for field in model.fields}
 
 
 def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:

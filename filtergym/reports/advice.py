@@ -177,7 +177,9 @@ def verdict(advice: Advice) -> str:
         f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
         f"same measurements, {where}."
     )
-    if one.relative_error.low <= 0.0 <= one.relative_error.high:
+    if one.relative_error.low > 0.0:
+        text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
+    elif one.relative_error.low <= 0.0 <= one.relative_error.high:
         text += f" The difference may be chance: {rival} is good enough."
     return text
 

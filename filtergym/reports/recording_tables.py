@@ -41,25 +41,20 @@ def recording_tables(
     entries = dict.fromkeys((r.policy, r.kind, r.control) for r in records if r.kind != "smoother")
     names = sorted(entries, key=lambda entry: likelihood(entry[0]))
     bands = {_band(record) for (_, metric, _), record in found.items() if metric == "anis_band"} - {"-"}
-    expected = {
-        **_likelihood_columns(found, differences),
-        **_consistency_columns(found, len(bands) == 1),
-    }
-    predicted = _prediction_columns(records, found)
-    beside = [competitors_table(names, {**expected, **predicted}, control) for control in (True, False)]
-    whole = first_fitting(beside, width)
-    tables = [] if whole is None else [whole]
-    if whole is None:
-        for columns in (expected, predicted) if predicted else (expected,):
-            narrow = [competitors_table(names, columns, False, compact) for compact in (False, True)]
-            tables.append(first_fitting(narrow, width) or narrow[-1])
+    parts = [
+        _likelihood_columns(found, differences),
+        _consistency_columns(found, len(bands) == 1),
+        _prediction_columns(records, found),
+    ]
+    parts = [part for part in parts if part]
+    tables = _beside(names, parts, width)
     first = records[0]
     episodes = f"{first.episodes} episode{'s' if first.episodes > 1 else ''}"
     tables[0].title = f"{first.environment}, recording {first.scenario} ({episodes}; 95 % intervals)"
     notes = (
         [LIKELIHOOD] if has_truth else ["There is no truth, so there are no errors and no costs.", LIKELIHOOD]
     )
-    notes += [f"{PREDICTIONS} Intervals are over stretches of measurements."] if predicted else []
+    notes += [f"{PREDICTIONS} Intervals are over stretches of measurements."] if len(parts) > 2 else []
     notes += [f"95 % band of the mean NIS: {bands.pop()}."] if len(bands) == 1 else []
     if any(record.kind == "smoother" for record in records) and not has_truth:
         notes.append("A smoother predicts nothing: --estimates writes what it has found, with its deviation.")
@@ -68,6 +63,20 @@ def recording_tables(
 
 
 Column = Callable[[str], str]
+
+
+def _beside(names: Sequence[Any], parts: Sequence[Mapping[str, Column]], width: int) -> list[Table]:
+    """Return tables of groups of columns, as many groups beside each other as fit, the rest below."""
+    for count in range(len(parts), 0, -1):
+        columns = {title: column for part in parts[:count] for title, column in part.items()}
+        looks = [competitors_table(names, columns, control) for control in (True, False)]
+        looks.append(competitors_table(names, columns, False, compact=True))
+        table = first_fitting(looks, width)
+        if table is not None or count == 1:
+            return [table or looks[-1], *_beside(names, parts[count:], width)]
+    return []
+
+
 Found = Mapping[tuple[str, str, str], Any]
 """Records by competitor, metric and component."""
 
