@@ -264,5 +264,6 @@ def _profiles(advice: Advice) -> Iterator[dict[str, Any]]:
             "is_log": key.startswith("log10_"),
             "values": _numbers(values),
             "drops": _numbers(profile.drops),
+            "ends": [parameter_size(key, profile.interval.low), parameter_size(key, profile.interval.high)],
             "best": parameter_size(key, advice.fits[name].values[key]),
         }

@@ -59,13 +59,13 @@
 
   function drawProfiles(box, { profiles, drop }) {
     const panels = profiles.map(() => box.appendChild(document.createElement("div")));
-    const draw = () => profiles.forEach(({ title, is_log, values, drops, best }, i) => {
+    const draw = () => profiles.forEach(({ title, is_log, values, drops, ends, best }, i) => {
       const shapes = [
         { type: "line", xref: "paper", x0: 0, x1: 1, y0: -drop, y1: -drop, line: { color: css("--soft"), width: 1, dash: "dot" } },
         { type: "line", yref: "paper", y0: 0, y1: 1, x0: best, x1: best, line: { color: css("--soft"), width: 1 } },
       ];
       const curve = { x: values, y: drops.map((y) => (y === null ? null : -y)), mode: "lines+markers", line: { color: FIRST, width: 2 }, marker: { size: 5 }, showlegend: false, hovertemplate: "%{x:.3g}: %{y:.2f} nats<extra></extra>" };
-      const near = values.filter((_, k) => drops[k] !== null && drops[k] < 12).map((x) => (is_log ? Math.log10(x) : x));
+      const near = [...ends, ...values.filter((_, k) => drops[k] !== null && drops[k] < 12)].map((x) => (is_log ? Math.log10(x) : x));
       const [low, high] = [Math.min(...near), Math.max(...near)], margin = 0.06 * (high - low || 1);
       Plotly.react(panels[i], [curve], layout({ shapes, height: 250, margin: { l: 50, r: 10, t: 10, b: 45 }, xaxis: { title: { text: plain(title) }, type: is_log ? "log" : "linear", range: [low - margin, high + margin], nticks: 6 }, yaxis: { title: { text: "nats" }, range: [-8, 0.5] } }), { ...config, displayModeBar: false });
     });
