@@ -6,6 +6,7 @@ import gzip
 import itertools
 import json
 import re
+import sys
 
 import browser
 import numpy as np
@@ -17,6 +18,7 @@ from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import make_task, read_recording
 from filtergym.evaluation.metrics import chi_square_band
 
+from filtergym.__main__ import main
 from filtergym.reports.advice import further_sentences, verdict
 
 pytest.importorskip("plotly")
@@ -150,3 +152,12 @@ def test_every_picture_is_drawn_and_nothing_complains(page, tmp_path, width):
         assert all(drawn)
         assert not [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
         assert driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def test_a_report_without_its_extra_is_refused_before_anything_is_read(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "filtergym.reports.html_report", None)
+    monkeypatch.setattr(sys, "argv", ["filtergym", "advise", "missing.csv", "--report", "advice.html"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "reports need more packages" in capsys.readouterr().err
