@@ -33,15 +33,7 @@
   }
   const config = { displayModeBar: window.innerWidth < 640 ? false : "hover", responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
 
-  // --- choices and themes; what is drawn is drawn again
-
-  function addChoices(figure, names, chosen) {
-    const box = figure.querySelector(".choices"), select = document.createElement("select");
-    select.setAttribute("aria-label", "what is shown");
-    names.forEach((name, i) => select.append(new Option(name.replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&"), i)));
-    select.addEventListener("change", () => chosen(Number(select.value)));
-    box.append(select);
-  }
+  // --- themes; what is drawn is drawn again
 
   const redraw = [];
   const dark = matchMedia("(prefers-color-scheme: dark)");

@@ -290,6 +290,14 @@
 
   // --- pages: choices, drawing, themes, sorting
 
+  function addChoices(figure, names, chosen) {
+    const box = figure.querySelector(".choices"), select = document.createElement("select");
+    select.setAttribute("aria-label", "what is shown");
+    names.forEach((name, i) => select.append(new Option(name.replace(/&lt;/g, "<").replace(/&gt;/g, ">").replace(/&amp;/g, "&"), i)));
+    select.addEventListener("change", () => chosen(Number(select.value)));
+    box.append(select);
+  }
+
   function drawFigure(figure, cell) {
     const kind = figure.dataset.kind, box = figure.querySelector(".plot");
     if (kind === "track") return redraw.push(drawTrack(figure, cell));
