@@ -306,8 +306,7 @@ class ConstantsText:
 
     def _container(self, value: Any, wanted: str) -> str:
         if isinstance(value, slice):
-            parts = ", ".join(repr(part) for part in (value.start, value.stop, value.step))
-            return f"slice({parts})"
+            return f"slice({value.start!r}, {value.stop!r}, {value.step!r})"
         if isinstance(value, range):
             return repr(value)
         if isinstance(value, Mapping):

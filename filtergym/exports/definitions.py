@@ -12,12 +12,12 @@ import ast
 import dataclasses
 import dis
 import functools
-import importlib
+import importlib.util
 import inspect
 import sys
 import types
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 ARRAYS = "filtergym.filters.array_namespace"
 SIMPLER = {
@@ -251,8 +251,20 @@ class Definitions:
     @property
     def size(self) -> int:
         """Of what was found; it no longer grows when all is."""
-        names = self.keys, self.attributes, self.shared_attributes, self.task_names, self.words, self.members
-        return sum(map(len, names)) + len(self.concrete) + len(self.externals) + len(self.instantiated)
+        names: Any = (
+            self.keys,
+            self.attributes,
+            self.shared_attributes,
+            self.task_names,
+            self.words,
+            self.members,
+        )
+        return (
+            sum(len(found) for found in names)
+            + len(self.concrete)
+            + len(self.externals)
+            + len(self.instantiated)
+        )
 
     def is_own(self, module: str) -> bool:
         """Whether definitions of a module are written out."""
@@ -329,7 +341,7 @@ class Definitions:
         if node.attr.startswith("__"):
             return  # what is overridden is found with what overrides it
         self.attributes.add(node.attr)
-        self.reads.add((getattr(owner, "id", None) or getattr(owner, "attr", ""), node.attr))
+        self.reads.add((str(getattr(owner, "id", getattr(owner, "attr", ""))), node.attr))
         is_task = own_class is not None and any(issubclass(task, own_class) for task in self.tasks)
         if getattr(owner, "id", None) == "self" and is_task:
             self.shared_attributes.add(node.attr)

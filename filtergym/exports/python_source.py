@@ -105,7 +105,8 @@ def _check_text(text: str, exported: Exported, name: str) -> None:
     Raises:
         ExportError: if it fails, or says something else.
     """
-    model, starts = exported.model, []
+    model = exported.model
+    starts: list[Episode] = []
     start_lanes(model, [0], starts.append)
     answers = rollout(model, exported.maker, [0], _answer, name=name)
     namespace: dict[str, Any] = {"__name__": __name__}
