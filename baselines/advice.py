@@ -9,7 +9,7 @@ Intervals are of whole stretches of measurements, since neighbours are not indep
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -33,6 +33,11 @@ FEWEST = 40
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
+APART = 10.0
+"""s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own filter
+makes of them, and one-step predictions say much of that and little of errors that last."""
+MEMORY = 8
+"""Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
 
 class Share(NamedTuple):
@@ -101,6 +106,16 @@ class Competitor(NamedTuple):
     """Of successive judged prediction errors; zero where they are white."""
 
 
+class Anchor(NamedTuple):
+    """How a filter with a second sensor predicts measurements some time apart, and the best without one."""
+
+    name: str
+    other: str
+    gain: float
+    """Mean log-likelihood less the other's on the measurements of the choice that are ``APART``, nats; both are fitted
+    to such measurements."""
+
+
 class Advice(NamedTuple):
     """What :func:`advise` has found."""
 
@@ -116,6 +131,8 @@ class Advice(NamedTuple):
     tunables: dict[str, Tunable]
     intervals: dict[str, Interval]
     """Of the parameters of ``fitted``."""
+    anchor: Anchor | None = None
+    """None where the recording has no second sensor."""
 
     @property
     def advised(self) -> Competitor:
@@ -150,14 +167,15 @@ def advise(
     """
     task, share = _task(problem, recording, keywords), share_out(recording)
     families = {**families_of(problem, recording), **(own or {})}
-    windows = cut_windows(recording, task, share.fitted, share.warm_up)
+    if int(recording.rows.sum()) * _interval(recording) < FEWEST * APART:  # too few that are apart
+        families = {name: family for name, family in families.items() if not family.anchored}
     fits: dict[str, Fit] = {}
     tunables: dict[str, Tunable] = {}
     likelihoods: dict[str, WindowLikelihood] = {}
     for i, (name, family) in enumerate(families.items()):
         progress(f"fitting {name}", 0.6 * i / len(families))
         tunable = _with_noise(problem, family, noise)
-        likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+        likelihood = _likelihood(recording, task, share.fitted, share.warm_up, tunable)
         fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
     makers = {
         **shipped,
@@ -171,30 +189,38 @@ def advise(
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
         counts = {name: len(fits[name].values) for name in makers if name in fits}
-        return _Judgement(Predictions(dataset, task), share).competitors(counts)
+        anchored = {name for name, tunable in tunables.items() if tunable.anchored}
+        return _Judgement(Predictions(dataset, task), share, anchored).competitors(counts)
 
     progress("replaying the recording", 0.6)
     competitors, best = judge(makers)
     progress("computing intervals", 0.9)
-    chosen = _likeliest([c for c in competitors if c.fitted])
+    alone = [c for c in competitors if c.name not in tunables or not tunables[c.name].anchored]
+    chosen = _likeliest([c for c in alone if c.fitted])
+    anchor = None
+    for name in [c.name for c in competitors if c not in alone]:
+        anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
+        if anchor.gain > 0.0:
+            chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
     if share.apart:  # to all that does not judge
-        windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
         begin = dataclasses.replace(tunable, start=fits[name].values)
-        likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
+        spans = [*share.fitted, *share.chosen]
+        likelihoods[name] = _likelihood(recording, task, spans, share.warm_up, begin)
         fits[name] = fit(likelihoods[name], begin, seed, starts=1)
         makers = {name: make_tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
         refitted = next(c for c in judge(makers)[0] if c.name == name)
         before, chosen = chosen, refitted._replace(log_likelihood=chosen.log_likelihood)
         competitors = [chosen if c is before else c for c in competitors]
+        alone = [chosen if c is before else c for c in alone]
     intervals = profile_intervals(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
-    advised = _likeliest(competitors)
+    advised = chosen if tunable.anchored else _likeliest(alone)
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
     )
-    return Advice(recording, share, [advised, *others], chosen, best, fits, tunables, intervals)
+    return Advice(recording, share, [advised, *others], chosen, best, fits, tunables, intervals, anchor)
 
 
 def fit_all(
@@ -224,8 +250,7 @@ def fit_all(
     if share.apart:  # side by side it takes a fraction of the time
         spans = [*share.fitted, *share.chosen, *share.judged]
     tunable = _with_noise(problem, family, noise)
-    windows = cut_windows(recording, task, spans, share.warm_up)
-    likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+    likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
     found = fit(likelihood, tunable, seed)
     return tunable, found, profile_intervals(likelihood, tunable, found)
 
@@ -237,11 +262,63 @@ def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -
 
 
 def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be."""
+    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of white errors."""
     log_format = problem.task.log_format
-    if not noise or log_format is None or log_format.scale_noise is None:
+    if not noise or family.anchored or log_format is None or log_format.scale_noise is None:
         return family
     return with_noise_scale(family, log_format.scale_noise)
+
+
+def _likelihood(
+    recording: Recording,
+    task: Task,
+    spans: Sequence[Span],
+    warm_up: int,
+    tunable: Tunable,
+    thinned: bool = False,
+) -> WindowLikelihood:
+    """Likelihood of a tunable's parameters on spans of a recording; of an anchored one, or where that is asked for, of
+    measurements that are ``APART``.
+    """
+    every = 1
+    if tunable.anchored or thinned:
+        warm_up = max(warm_up, int(recording.rows.sum()) // MEMORY)
+        every = max(1, round(APART / _interval(recording)))
+    windows = cut_windows(recording, task, spans, warm_up, every)
+    return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+
+
+def _compare_anchored(
+    recording: Recording,
+    task: Task,
+    share: Share,
+    name: str,
+    other: str,
+    tunables: Mapping[str, Tunable],
+    fitted: Fit,
+    seed: int,
+) -> Anchor:
+    """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such.
+
+    That is the likelihood that both have in common: of the same measurements, given the same earlier ones. From one
+    measurement to the next the other follows errors that last, and so predicts them well.
+    """
+
+    def apart(spans: Sequence[Span], tunable: Tunable) -> WindowLikelihood:
+        return _likelihood(recording, task, spans, share.warm_up, tunable, thinned=True)
+
+    rival = fit(apart(share.fitted, tunables[other]), tunables[other], seed)
+    means = []
+    for tunable, found in ((tunables[name], fitted), (tunables[other], rival)):
+        chosen = apart(share.chosen, dataclasses.replace(tunable, start=found.values))
+        values = numpy.array([[value] for value in found.values.values()])
+        means.append(float(chosen(values)[0]) / chosen.count)
+    return Anchor(name, other, means[0] - means[1])
+
+
+def _interval(recording: Recording) -> float:
+    """Median time between measurements, s."""
+    return float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
 
 
 class _Judgement:
@@ -250,10 +327,11 @@ class _Judgement:
     Args:
         predictions: of all.
         share: which measurements they are.
+        anchored: names of filters with a second sensor, of which an estimate alone does not say what they predict.
     """
 
-    def __init__(self, predictions: Predictions, share: Share) -> None:
-        self.predictions = predictions
+    def __init__(self, predictions: Predictions, share: Share, anchored: Container[str] = ()) -> None:
+        self.predictions, self.anchored = predictions, anchored
         choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
         self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
 
@@ -271,7 +349,9 @@ class _Judgement:
             fitted: how many parameters of whom.
         """
         found, judged = self.predictions, self.judged
-        errors = {name: found.prediction_error(name) for name in found.names}
+        errors = {
+            name: None if name in self.anchored else found.prediction_error(name) for name in found.names
+        }
         predicted = {name: (each**2).sum(axis=0) for name, each in errors.items() if each is not None}
         squares = {name: found.squared_error(name) for name in found.names} if found.has_truth else {}
         judged_by = squares or predicted
@@ -291,9 +371,9 @@ class _Judgement:
                     fitted.get(name, 0),
                     mean_of(found.log_likelihood(name), self.chosen) - penalty,
                     found.difference(name, best, judged),
-                    math.sqrt(mean_of(predicted[name], judged)) if predicted else math.nan,
+                    math.sqrt(mean_of(predicted[name], judged)) if name in predicted else math.nan,
                     math.sqrt(mean_of(squares[name], judged)) if squares else math.nan,
-                    relative_error(judged_by[name], judged_by[best], judged) if judged_by else UNKNOWN,
+                    relative_error(judged_by[name], judged_by[best], judged) if name in judged_by else UNKNOWN,
                     found.nis(name, judged),
                     UNKNOWN if each is None else correlation(each, judged),
                 )

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from rich.table import Table
 
-from ..baselines.advice import Advice, Competitor
+from ..baselines.advice import APART, Advice, Competitor
 from ..baselines.fitting import IDENTIFIABLE, NOISE_SCALE, Fit, Interval
 from ..baselines.table import Tunable
 from ..evaluation.bootstrap import Estimate
@@ -104,7 +104,7 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
         yield f"Of what was fitted {one.name} comes closest, {lag:.3f} nats per measurement behind, with"
     for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
         yield f"  {line}"
-    yield from _noise(advice)
+    yield from _anchor(advice) if advice.tunables[one.name].anchored else _noise(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
 
@@ -134,6 +134,8 @@ def _verdict(advice: Advice) -> str:
     if one.name == best:
         return f"Take {name}: nothing that was fitted predicts better, and no shipped filter does better {where}."
     relative = _percent(one.relative_error)
+    if advice.anchor is not None and one.name == advice.anchor.name and math.isnan(relative.value):
+        return f"Take {name}, by the second sensor: there is no truth to say how much it gains."
     if math.isnan(relative.value):
         return f"Take {name}: {one.difference.value:+.3f} nats per measurement against {best}, {where}."
     kind = "error" if advice.recording.truth is not None else "error of prediction"
@@ -197,6 +199,20 @@ def _noise(advice: Advice) -> Iterator[str]:
             "NIS and likelihood say nothing of errors that last longer than the motion: those are invisible without a "
             "second sensor."
         )
+
+
+def _anchor(advice: Advice) -> Iterator[str]:
+    """Why a filter with a second sensor is advised, and what its likelihood says."""
+    anchor = advice.anchor
+    if anchor is None:
+        return
+    yield (
+        f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
+        f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next filters "
+        "without it may predict better, because they follow these errors: there likelihoods of both kinds do not compare, "
+        "nor does NIS, and deviations are taken as they are stated."
+    )
+    yield "An error that never changes, or lasts longer than this recording, remains invisible."
 
 
 def _warnings(advice: Advice) -> Iterator[str]:
