@@ -21,7 +21,7 @@ from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from .fitted_filters import families_of
-from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
+from .fitting import Fit, Interval, fit, profile_intervals, searched_intervals, with_noise_scale
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -34,8 +34,8 @@ BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
 APART = 10.0
-"""s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own filter
-makes of them, and one-step predictions say much of that and little of errors that last."""
+"""s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own
+filter makes of them, and one-step predictions say much of that and little of errors that last."""
 MEMORY = 8
 """Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
@@ -213,7 +213,7 @@ def advise(
         before, chosen = chosen, refitted._replace(log_likelihood=chosen.log_likelihood)
         competitors = [chosen if c is before else c for c in competitors]
         alone = [chosen if c is before else c for c in alone]
-    intervals = profile_intervals(likelihoods[name], tunable, fits[name])
+    intervals = _intervals(likelihoods[name], tunable, fits[name])
     progress("done", 1.0)
     advised = chosen if tunable.anchored else _likeliest(alone)
     others = sorted(
@@ -252,7 +252,7 @@ def fit_all(
     tunable = _with_noise(problem, family, noise)
     likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
     found = fit(likelihood, tunable, seed)
-    return tunable, found, profile_intervals(likelihood, tunable, found)
+    return tunable, found, _intervals(likelihood, tunable, found)
 
 
 def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
@@ -262,7 +262,7 @@ def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -
 
 
 def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of white errors."""
+    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it."""
     log_format = problem.task.log_format
     if not noise or family.anchored or log_format is None or log_format.scale_noise is None:
         return family
@@ -286,6 +286,12 @@ def _likelihood(
         every = max(1, round(APART / _interval(recording)))
     windows = cut_windows(recording, task, spans, warm_up, every)
     return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+
+
+def _intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
+    """Intervals of the parameters, of an anchored filter by searches, since size and duration of its error are tied."""
+    find = searched_intervals if tunable.anchored else profile_intervals
+    return find(likelihood, tunable, found)
 
 
 def _compare_anchored(
@@ -373,7 +379,9 @@ class _Judgement:
                     found.difference(name, best, judged),
                     math.sqrt(mean_of(predicted[name], judged)) if name in predicted else math.nan,
                     math.sqrt(mean_of(squares[name], judged)) if squares else math.nan,
-                    relative_error(judged_by[name], judged_by[best], judged) if name in judged_by else UNKNOWN,
+                    relative_error(judged_by[name], judged_by[best], judged)
+                    if name in judged_by
+                    else UNKNOWN,
                     found.nis(name, judged),
                     UNKNOWN if each is None else correlation(each, judged),
                 )

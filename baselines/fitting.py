@@ -200,6 +200,80 @@ def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit
     return intervals
 
 
+def searched_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
+    """Profile-likelihood intervals of all parameters, whose others are searched anew at every step.
+
+    As :func:`profile_intervals`, and right where parameters are tied so closely that one curvature does not lead along
+    their ridge, as are size and duration of an error; one run after another, so that it takes longer.
+
+    Args:
+        likelihood: of the tunable's parameters.
+        tunable: the estimator, with limits.
+        found: of :func:`fit`.
+    """
+    limits = numpy.array(list(tunable.limits.values())).T
+    best = numpy.array([found.values[name] for name in tunable.limits])
+    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
+    return {
+        name: Interval(
+            *(
+                float(best[i] + sign * distance)
+                for sign, (distance, _) in zip((-1.0, 1.0), ends, strict=True)
+            ),
+            *(is_open for _, is_open in ends),
+        )
+        for i, name in enumerate(tunable.limits)
+        for ends in [
+            [_walk_profile(likelihood, limits, found, best, i, sign, deviation[i]) for sign in (-1.0, 1.0)]
+        ]
+    }
+
+
+def _walk_profile(
+    likelihood: WindowLikelihood,
+    limits: numpy.ndarray,
+    found: Fit,
+    best: numpy.ndarray,
+    parameter: int,
+    sign: float,
+    deviation: float,
+) -> tuple[float, bool]:
+    """Distance at which the likelihood has fallen far enough, and whether it has not done so at the limit."""
+    from scipy.optimize import minimize
+
+    room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
+    others = numpy.delete(numpy.arange(len(best)), parameter)
+    places: list[_Place] = []
+    drops: list[float] = []
+    point = best.copy()
+    for distance in [*(d for d in numpy.array(STEPS) * deviation if d < room), room]:
+        point[parameter] = best[parameter] + sign * distance
+
+        def objective(values: numpy.ndarray) -> tuple[float, numpy.ndarray]:
+            whole = point.copy()
+            whole[others] = values
+            value, gradient = likelihood.gradient(whole)
+            if not (math.isfinite(value) and numpy.isfinite(gradient).all()):
+                return 1e6, numpy.zeros(len(others))
+            return -value, -gradient[others]
+
+        bounds = list(limits[:, others].T)
+        end = minimize(
+            objective,
+            point[others],
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": 12, "ftol": 1e-6},
+        )
+        point[others] = end.x
+        places.append(_Place(parameter, sign, float(distance)))
+        drops.append(found.log_likelihood + float(end.fun))
+        if drops[-1] > DROP:
+            break
+    return _profile_end(places, numpy.array(drops), parameter, sign)
+
+
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:
     """Curvature of the likelihood at its maximum; a direction without one is taken for a flat one."""
     low, high = limits

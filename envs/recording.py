@@ -408,8 +408,7 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
     return dataclasses.replace(
         first,
         measurements={
-            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings])
-            for key in names
+            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings]) for key in names
         },
         initial={key: numpy.concatenate([one.initial[key] for one in recordings]) for key in first.initial},
         seconds=numpy.concatenate([padded(one.seconds) for one in recordings]),

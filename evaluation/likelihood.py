@@ -89,7 +89,7 @@ def cut_windows(
 
 
 def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
-    """Keep of what is available, ``(T, W)``, the first, and each that comes so many measurements after the last kept."""
+    """Keep of what is available, ``(T, W)``, the first, and each so many measurements after the last kept."""
     kept = numpy.zeros_like(available)
     since = numpy.full(available.shape[1], every)
     for row, values in zip(kept, available, strict=True):

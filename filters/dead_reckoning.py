@@ -11,14 +11,14 @@ receiver's do not. With its displacement d over an interval T, scaled by k and t
 
 The error e is a Gauss-Markov process of deviation s and correlation time tau (Brown and Hwang, Introduction to Random
 Signals and Applied Kalman Filtering, 1997, section 5.5), estimated with the position, so that what remains to be
-filtered is white (the same, section 8.7). The error of dead reckoning is a random walk of intensity q over the way l, the
-length of the displacement, and a little more: what stands still is known to creep no faster than ``CREEP``. Where the
-second sensor says nothing, the velocity goes on with a white acceleration a that is constant in the interval:
+filtered is white (the same, section 8.7). The error of dead reckoning is a random walk of intensity q over the way l,
+the length of the displacement, and a little more: what stands still is known to creep no faster than ``CREEP``.
+Where the second sensor says nothing, the velocity goes on with a white acceleration a that is constant in the interval:
 
     p' = p + T v + T^2 / 2 a,              v' = v + T a
 
-The states are position x, y, velocity x, y, error x, y; k, h, s, tau and q are constants of the filter. Nothing observes a
-constant error, one that lasts longer than the recording.
+The states are position x, y, velocity x, y, error x, y; k, h, s, tau and q are constants of the filter. Nothing
+observes a constant error, one that lasts longer than the recording.
 
 Shapes: batch last.
 """

@@ -24,7 +24,16 @@ PROBLEM = problem_of(ID)
 
 
 def write_log(
-    folder, count=240, acceleration=0.8, sigma=1.0, T=0.5, seed=0, missed=0.0, truth=True, stated=None
+    folder,
+    count=240,
+    acceleration=0.8,
+    sigma=1.0,
+    T=0.5,
+    seed=0,
+    missed=0.0,
+    truth=True,
+    stated=None,
+    odometry=False,
 ):
     """Write a log of a target of white acceleration, constant in every interval; return its path."""
     rng = np.random.default_rng(seed)
@@ -41,6 +50,9 @@ def write_log(
     names = "time,x,y,sigma_x,sigma_y" + truth * (
         ",truth_position_x,truth_position_y,truth_velocity_x,truth_velocity_y"
     )
+    if odometry:
+        columns.append(T * velocity)
+        names += ",odometry_x,odometry_y"
     path = folder / f"log{seed}.csv"
     np.savetxt(path, np.column_stack(columns), "%.6f", ",", header=names, comments="")
     return path
@@ -106,7 +118,7 @@ def test_half_the_stated_deviation_is_twice_the_scale(tmp_path):
 @pytest.mark.parametrize("name", list(log_families()))
 def test_candidates_side_by_side_are_those_alone(tmp_path, name, monkeypatch):
     """In lanes, compiled, one by one, and with NumPy; 60 updates of an iterated filter round by 1e-9 at most."""
-    recording = read(write_log(tmp_path, count=70, missed=0.1))
+    recording = read(write_log(tmp_path, count=70, missed=0.1, odometry=True))
     found, tunable = likelihood_of(recording, name)
     low, high = np.array(list(tunable.limits.values())).T
     candidates = low[:, None] + (high - low)[:, None] * np.random.default_rng(1).uniform(

@@ -86,8 +86,8 @@ class DeadReckoning(KalmanModel):
 def regress_odometry(recording: Recording) -> tuple[float, float]:
     """Scale and heading offset (degrees) of the odometry, from displacements of the measured positions over ``STEP``.
 
-    Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the fixes
-    hardly do. Where the target does not move, 1 and 0.
+    Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the
+    fixes hardly do. Where the target does not move, 1 and 0.
 
     Args:
         recording: with a second sensor.

@@ -183,9 +183,10 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
 def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
     """Dead reckoning by a second sensor, with slow errors of the positions.
 
-    Limits are narrow where a log says little. An error that lasts for more than five minutes cannot be told from a place
-    elsewhere in a log of an hour. Dead reckoning that errs by less than a metre after a hundred would be believed
-    blindly, and one that errs by more than ten anchors nothing; of wheels and compasses that is the usual range.
+    Limits are narrow where a log says little. An error that lasts for more than five minutes cannot be told from a
+    place elsewhere in a log of an hour. Dead reckoning errs by 3 to 10 m after a hundred: to believe it more is
+    dangerous, as likelihood may where errors are no Gauss-Markov process, to believe it less than it deserves costs
+    little.
 
     Args:
         recording: with a second sensor; None: any.
@@ -198,7 +199,7 @@ def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable
         DeadReckoning,
         log10_error_deviation=(math.log10(r) - 1.5, math.log10(2.0 * r), math.log10(r) + 2.0),
         log10_correlation_time=(math.log10(shortest), math.log10(60.0), math.log10(300.0)),
-        log10_drift=(-1.0, -0.5, 0.0),
+        log10_drift=(-0.5, -0.25, 0.0),
         scale=(0.8 * scale, scale, 1.25 * scale),
         heading_offset=(heading - 30.0, heading, heading + 30.0),
     )

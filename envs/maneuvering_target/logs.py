@@ -292,7 +292,8 @@ def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]
 
     Args:
         columns: of one track.
-        rows: of the scans, ``(T,)``, -1 for a scan that has no row: what was moved until the next row is divided evenly.
+        rows: of the scans, ``(T,)``, -1 for a scan that has no row: what was moved until the next row is divided
+            evenly.
     """
     moved = _displacements(columns)
     if moved is None:

@@ -10,29 +10,34 @@ from ..baselines.advice import advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import check_names, nearest, read_recording, short_name
+from ..envs.recording import Recording
 from ..evaluation.files import writable_file
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table, parameter_lines
 from .evaluation import causal_names, say_departures
-from .terminal import command_line, console, pair, parse_settings, progress_bar
+from .terminal import (
+    TruthOffset,
+    TruthOption,
+    command_line,
+    console,
+    pair,
+    parse_settings,
+    progress_bar,
+)
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
 
 
-def fit_to_recording(
-    problem: Problem, name: str, recording: str, speeds: tuple[float, float], folder: Path, seed: int
-) -> None:
+def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
     """Fit one filter to all of a recording, say its parameters, and write them.
 
     Args:
         problem: of the recording.
         name: of what can be fitted, or ``module:Class``.
-        recording: files of it.
-        speeds: that are possible, m/s.
+        found: the recording.
         folder: for the file.
         seed: of the starts of the fit.
     """
-    found = read_recording(recording, problem.id, speeds=speeds)
     families = families_of(problem, found)
     if ":" not in name and name not in families:
         raise nearest("filter that can be fitted to a recording", name, families)
@@ -71,6 +76,8 @@ def advise_on_log(
             help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
         ),
     ] = None,
+    truth: TruthOption = None,
+    truth_offset: TruthOffset = 0.0,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -95,7 +102,14 @@ def advise_on_log(
         if not out.name.endswith(SUFFIX):
             raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
         writable_file(out)
-    found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
+    found = read_recording(
+        recording,
+        environment,
+        speeds=pair("--speeds", speeds),
+        truth=truth,
+        truth_offset=truth_offset,
+        **keywords,
+    )
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
     learned = list(pretrained_agents(problem.id))

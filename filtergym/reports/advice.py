@@ -208,9 +208,9 @@ def _anchor(advice: Advice) -> Iterator[str]:
         return
     yield (
         f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
-        f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next filters "
-        "without it may predict better, because they follow these errors: there likelihoods of both kinds do not compare, "
-        "nor does NIS, and deviations are taken as they are stated."
+        f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next "
+        "filters without it may predict better, because they follow these errors: there likelihoods of both kinds do "
+        "not compare, nor does NIS, and deviations are taken as they are stated."
     )
     yield "An error that never changes, or lasts longer than this recording, remains invisible."
 
