@@ -214,19 +214,14 @@ def searched_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fi
     limits = numpy.array(list(tunable.limits.values())).T
     best = numpy.array([found.values[name] for name in tunable.limits])
     deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
-    return {
-        name: Interval(
-            *(
-                float(best[i] + sign * distance)
-                for sign, (distance, _) in zip((-1.0, 1.0), ends, strict=True)
-            ),
-            *(is_open for _, is_open in ends),
+    intervals = {}
+    for i, name in enumerate(tunable.limits):
+        (low, open_low), (high, open_high) = (
+            _walk_profile(likelihood, limits, found, best, i, sign, float(deviation[i]))
+            for sign in (-1.0, 1.0)
         )
-        for i, name in enumerate(tunable.limits)
-        for ends in [
-            [_walk_profile(likelihood, limits, found, best, i, sign, deviation[i]) for sign in (-1.0, 1.0)]
-        ]
-    }
+        intervals[name] = Interval(float(best[i] - low), float(best[i] + high), open_low, open_high)
+    return intervals
 
 
 def _walk_profile(

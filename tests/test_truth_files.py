@@ -85,7 +85,7 @@ def test_dates_are_matched_with_seconds_since_1970_and_with_rtklib(tmp_path):
     header = "%  GPST  latitude(deg) longitude(deg) height(m) Q ns sdn(m) sde(m)"
     degrees = path_of(TIME) / 111e3
     rows = [
-        f"2026/05/01 {start + pandas.Timedelta(seconds=t):%H:%M:%S.000} {y + 48.0:.9f} {x + 2.0:.9f} 100.0 1 9 0.01 0.01"
+        f"2026/05/01 {start + pandas.Timedelta(seconds=t):%H:%M:%S.000} {y + 48.0:.9f} {x + 2.0:.9f} 100 1 9 0.01 0.01"
         for t, (x, y) in zip(TIME, degrees, strict=True)
     ]
     table = log(time=dates).drop(columns=["x", "y"])
