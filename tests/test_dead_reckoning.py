@@ -278,6 +278,19 @@ def test_it_is_said_what_its_likelihood_is_of(advice):
     assert "times as large as stated" not in text
 
 
+def test_a_second_sensor_that_does_not_help_is_said_so(advice):
+    """As where its displacements are of something else."""
+    fitted = next(c for c in advice.competitors if c.name == "constant-velocity")
+    worse = advice._replace(fitted=fitted, anchor=advice.anchor._replace(gain=-0.5))
+    text = "\n".join(advice_lines(worse, []))
+    assert (
+        "The second sensor does not help here: by dead-reckoning measurements 10 s apart are less likely by"
+        in text
+    )
+    assert "0.50 nats each than by constant-velocity" in text
+    assert "times as large as stated, if they are white" in text
+
+
 @pytest.mark.filterwarnings("ignore:.*is not compiled")  # the code that refuses is not
 def test_its_file_runs_on_such_logs_alone(advice, tmp_path):
     path = tmp_path / "mine.filter.json"

@@ -104,7 +104,9 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
         yield f"Of what was fitted {one.name} comes closest, {lag:.3f} nats per measurement behind, with"
     for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
         yield f"  {line}"
-    yield from _anchor(advice) if advice.tunables[one.name].anchored else _noise(advice)
+    if not advice.tunables[one.name].anchored:
+        yield from _noise(advice)
+    yield from _anchor(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
 
@@ -202,9 +204,15 @@ def _noise(advice: Advice) -> Iterator[str]:
 
 
 def _anchor(advice: Advice) -> Iterator[str]:
-    """Why a filter with a second sensor is advised, and what its likelihood says."""
+    """Why a filter with a second sensor is advised or not, and what its likelihood says."""
     anchor = advice.anchor
     if anchor is None:
+        return
+    if anchor.name != advice.fitted.name:
+        yield (
+            f"The second sensor does not help here: by {anchor.name} measurements {APART:g} s apart are less likely by "
+            f"{-anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such."
+        )
         return
     yield (
         f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
