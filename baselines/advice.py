@@ -11,7 +11,7 @@ is. Intervals are of whole stretches of measurements, since neighbours are not i
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
@@ -29,8 +29,8 @@ from .fitting import (
     Interval,
     Profile,
     fit,
-    profile_intervals,
     profile_parameters,
+    search_profiles,
     with_noise_scale,
 )
 from .problem import Problem
@@ -47,6 +47,11 @@ what loses more has lost the track."""
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
+APART = 10.0
+"""s between the measurements to which anchored filters are fitted: within less, fixes are what the receiver's own
+filter makes of them, and one-step predictions say much of that and little of errors that last."""
+MEMORY = 8
+"""Part of a recording by which the windows of anchored filters begin earlier: an eighth."""
 
 
 class Share(NamedTuple):
@@ -117,6 +122,16 @@ class Competitor(NamedTuple):
     """Of successive judged prediction errors; zero where they are white."""
 
 
+class Anchor(NamedTuple):
+    """How a filter with a second sensor predicts measurements some time apart, and the best without one."""
+
+    name: str
+    other: str
+    gain: float
+    """Mean log-likelihood less the other's on the measurements of the choice that are ``APART``, nats; both are fitted
+    to such measurements."""
+
+
 class Advice(NamedTuple):
     """What :func:`advise` has found."""
 
@@ -140,6 +155,9 @@ class Advice(NamedTuple):
     tunables: dict[str, Tunable]
     profiles: dict[str, dict[str, Profile]]
     """Likelihood of the parameters of ``fitted``; of the other fitted ones where that was asked for."""
+
+    anchor: Anchor | None
+    """None where the recording has no second sensor."""
 
     @property
     def intervals(self) -> dict[str, Interval]:
@@ -181,14 +199,15 @@ def advise(
     """
     task, share = _task(problem, recording, keywords), share_out(recording)
     families = {**families_of(problem, recording), **(own or {})}
-    windows = cut_windows(recording, task, share.fitted, share.warm_up)
+    if int(recording.rows.sum()) * _interval(recording) < FEWEST * APART:  # too few that are apart
+        families = {name: family for name, family in families.items() if not family.anchored}
     fits: dict[str, Fit] = {}
     tunables: dict[str, Tunable] = {}
     likelihoods: dict[str, WindowLikelihood] = {}
     for i, (name, family) in enumerate(families.items()):
         progress(f"fitting {name}", 0.6 * i / len(families))
         tunable = _with_noise(problem, family, noise)
-        likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+        likelihood = _likelihood(recording, task, share.fitted, share.warm_up, tunable)
         fits[name], tunables[name], likelihoods[name] = fit(likelihood, tunable, seed), tunable, likelihood
     makers = {
         **shipped,
@@ -198,24 +217,32 @@ def advise(
         },
     }
     counts = {name: len(found.values) for name, found in fits.items()}
+    anchored = [name for name, tunable in tunables.items() if tunable.anchored]
 
     def judge(makers: Mapping[str, Any]) -> _Judgement:
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper)
+        return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper, anchored)
 
     progress("replaying the recording", 0.6)
     judgement = judge(makers)
-    diverging = judgement.find_diverging(fits)
+    diverging = judgement.find_diverging(
+        {name: found for name, found in fits.items() if name not in anchored}
+    )
     rival, best = judgement.rival(), judgement.best_shipped()
     competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
-    chosen = _likeliest([c for c in competitors if c.fitted])
+    chosen = _likeliest([c for c in competitors if c.fitted and c.name not in anchored])
+    anchor = None
+    for name in anchored:
+        anchor = _compare_anchored(recording, task, share, name, chosen.name, tunables, fits[name], seed)
+        if anchor.gain > 0.0:
+            chosen = next(c for c in competitors if c.name == name)
     name, tunable = chosen.name, tunables[chosen.name]
     if share.apart:  # to all that does not judge
-        windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
         begin = dataclasses.replace(tunable, start=fits[name].values)
-        likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
+        spans = [*share.fitted, *share.chosen]
+        likelihoods[name] = _likelihood(recording, task, spans, share.warm_up, begin)
         fits[name] = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
         fitted = make_tuned_policy(f"fitted {name}", tunable, fits[name].values)
         judgement = judge({name: fitted, rival: shipped[rival], best: shipped[best]})
@@ -223,12 +250,13 @@ def advise(
         chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
     profiles = {
-        each: profile_parameters(likelihoods[each], tunables[each], fits[each])
+        each: _profiles(likelihoods[each], tunables[each], fits[each])
         for each in (fits if every_profile else [name])
         if each not in diverging
     }
     progress("done", 1.0)
-    advised = chosen if chosen.gain.low > 0.0 else next(c for c in competitors if c.name == rival)
+    sure = tunable.anchored or chosen.gain.low > 0.0
+    advised = chosen if sure else next(c for c in competitors if c.name == rival)
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
@@ -246,6 +274,7 @@ def advise(
         fits,
         tunables,
         profiles,
+        anchor,
     )
 
 
@@ -276,10 +305,10 @@ def fit_all(
     if share.apart:  # side by side it takes a fraction of the time
         spans = [*share.fitted, *share.chosen, *share.judged]
     tunable = _with_noise(problem, family, noise)
-    windows = cut_windows(recording, task, spans, share.warm_up)
-    likelihood = WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+    likelihood = _likelihood(recording, task, spans, share.warm_up, tunable)
     found = fit(likelihood, tunable, seed)
-    return tunable, found, profile_intervals(likelihood, tunable, found)
+    profiles = _profiles(likelihood, tunable, found)
+    return tunable, found, {name: each.interval for name, each in profiles.items()}
 
 
 def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -> Task:
@@ -289,11 +318,69 @@ def _task(problem: Problem, recording: Recording, keywords: Mapping[str, Any]) -
 
 
 def _with_noise(problem: Problem, family: Tunable, noise: bool) -> Tunable:
-    """Fit the scale of the noise too, where that is wanted and can be."""
+    """Fit the scale of the noise too, where that is wanted and can be: measurements apart say little of it."""
     log_format = problem.task.log_format
-    if not noise or log_format is None or log_format.scale_noise is None:
+    if not noise or family.anchored or log_format is None or log_format.scale_noise is None:
         return family
     return with_noise_scale(family, log_format.scale_noise)
+
+
+def _likelihood(
+    recording: Recording,
+    task: Task,
+    spans: Sequence[Span],
+    warm_up: int,
+    tunable: Tunable,
+    thinned: bool = False,
+) -> WindowLikelihood:
+    """Likelihood of a tunable's parameters on spans of a recording; of an anchored one, or where that is asked for, of
+    measurements that are ``APART``.
+    """
+    every = 1
+    if tunable.anchored or thinned:
+        warm_up = max(warm_up, int(recording.rows.sum()) // MEMORY)
+        every = max(1, round(APART / _interval(recording)))
+    windows = cut_windows(recording, task, spans, warm_up, every)
+    return WindowLikelihood(task, windows, tunable.start, tunable.apply, tunable.in_lanes)
+
+
+def _profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
+    """Profiles of the parameters, of an anchored filter by searches, since size and duration of its error are tied."""
+    find = search_profiles if tunable.anchored else profile_parameters
+    return find(likelihood, tunable, found)
+
+
+def _compare_anchored(
+    recording: Recording,
+    task: Task,
+    share: Share,
+    name: str,
+    other: str,
+    tunables: Mapping[str, Tunable],
+    fitted: Fit,
+    seed: int,
+) -> Anchor:
+    """Compare an anchored filter with the best other one on measurements that are ``APART``, both fitted to such.
+
+    That is the likelihood that both have in common: of the same measurements, given the same earlier ones. From one
+    measurement to the next the other follows errors that last, and so predicts them well.
+    """
+
+    def apart(spans: Sequence[Span], tunable: Tunable) -> WindowLikelihood:
+        return _likelihood(recording, task, spans, share.warm_up, tunable, thinned=True)
+
+    rival = fit(apart(share.fitted, tunables[other]), tunables[other], seed)
+    means = []
+    for tunable, found in ((tunables[name], fitted), (tunables[other], rival)):
+        chosen = apart(share.chosen, dataclasses.replace(tunable, start=found.values))
+        values = numpy.array([[value] for value in found.values.values()])
+        means.append(float(chosen(values)[0]) / chosen.count)
+    return Anchor(name, other, means[0] - means[1])
+
+
+def _interval(recording: Recording) -> float:
+    """Median time between measurements, s."""
+    return float(numpy.nanmedian(numpy.diff(recording.seconds, axis=1)))
 
 
 class _Judgement:
@@ -304,16 +391,23 @@ class _Judgement:
         share: which measurements they are.
         parameters: how many were fitted, by the name of who was fitted; all others are shipped.
         default: shipped filter that stands unless another is likelier beyond chance; empty: none.
+        anchored: names of filters with a second sensor, of which an estimate alone does not say what they predict.
     """
 
     def __init__(
-        self, predictions: Predictions, share: Share, parameters: Mapping[str, int], default: str
+        self,
+        predictions: Predictions,
+        share: Share,
+        parameters: Mapping[str, int],
+        default: str,
+        anchored: Container[str] = (),
     ) -> None:
         self.predictions, self.parameters, self.default = predictions, parameters, default
         choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
         self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
         self.shipped = [name for name in predictions.names if name not in parameters]
-        errors = {name: predictions.prediction_error(name) for name in predictions.names}
+        alone = [name for name in predictions.names if name not in anchored]
+        errors = {name: predictions.prediction_error(name) for name in alone}
         self._errors = {name: each for name, each in errors.items() if each is not None}
         self._predicted = {name: (each**2).sum(axis=0) for name, each in self._errors.items()}
         names = predictions.names if predictions.has_truth else []
@@ -354,7 +448,8 @@ class _Judgement:
     def relative_error(self, name: str, other: str) -> Estimate:
         """Judged error over that of another, less one; without truth of the prediction errors."""
         squares = self._squares or self._predicted
-        return relative_error(squares[name], squares[other], self.judged) if squares else UNKNOWN
+        known = name in squares and other in squares
+        return relative_error(squares[name], squares[other], self.judged) if known else UNKNOWN
 
     def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
         """Return who loses the track in the whole recording; nobody where all do.
@@ -385,11 +480,11 @@ class _Judgement:
             mean_of(found.log_likelihood(name), self.chosen) - penalty,
             Estimate(*(value - penalty for value in gain)),
             found.difference(name, rival, judged),
-            math.sqrt(mean_of(self._predicted[name], judged)) if self._predicted else math.nan,
+            math.sqrt(mean_of(self._predicted[name], judged)) if name in self._predicted else math.nan,
             math.sqrt(mean_of(self._squares[name], judged)) if self._squares else math.nan,
             self.relative_error(name, rival),
             found.nis(name, judged),
-            correlation(self._errors[name], judged) if self._errors else UNKNOWN,
+            correlation(self._errors[name], judged) if name in self._errors else UNKNOWN,
         )
 
 

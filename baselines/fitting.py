@@ -179,11 +179,6 @@ class _Place(NamedTuple):
     """From the best value of that parameter."""
 
 
-def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
-    """Profile-likelihood intervals of all parameters; arguments as of :func:`profile_parameters`."""
-    return {name: each.interval for name, each in profile_parameters(likelihood, tunable, found).items()}
-
-
 def profile_parameters(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
     """Profile likelihood of all parameters, side by side.
 
@@ -208,16 +203,91 @@ def profile_parameters(likelihood: WindowLikelihood, tunable: Tunable, found: Fi
     # The maximum may turn out to be none: then the drop is counted from the highest point.
     drops = max(found.log_likelihood, float(value.max())) - value
     at_best = max(found.log_likelihood, float(value.max())) - found.log_likelihood
+    return {name: _profile(best[i], i, places, drops, at_best) for i, name in enumerate(names)}
+
+
+def search_profiles(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
+    """Profile likelihood of all parameters, whose others are searched anew at every step.
+
+    As :func:`profile_parameters`, and right where parameters are tied so closely that one curvature does not lead along
+    their ridge, as are size and duration of an error; one run after another, so that it takes longer.
+
+    Args:
+        likelihood: of the tunable's parameters.
+        tunable: the estimator, with limits.
+        found: of :func:`fit`.
+    """
+    limits = numpy.array(list(tunable.limits.values())).T
+    best = numpy.array([found.values[name] for name in tunable.limits])
+    deviation = numpy.sqrt(numpy.diag(numpy.linalg.inv(_information(likelihood, best, limits))))
     profiles = {}
-    for i, name in enumerate(names):
-        ends = [_profile_end(places, drops, i, sign) for sign in (-1.0, 1.0)]
-        (low, open_low), (high, open_high) = ends
-        interval = Interval(float(best[i] - low), float(best[i] + high), open_low, open_high)
-        mine = [k for k, place in enumerate(places) if place.parameter == i]
-        values = numpy.append(points[i, mine], best[i])
-        order = numpy.argsort(values)
-        profiles[name] = Profile(values[order], numpy.append(drops[mine], at_best)[order], interval)
+    for i, name in enumerate(tunable.limits):
+        places: list[_Place] = []
+        drops: list[float] = []
+        for sign in (-1.0, 1.0):
+            walked, lower = _walk_profile(likelihood, limits, found, best, i, sign, float(deviation[i]))
+            places, drops = [*places, *walked], [*drops, *lower]
+        profiles[name] = _profile(best[i], i, places, numpy.array(drops))
     return profiles
+
+
+def _profile(
+    best: float, parameter: int, places: Sequence[_Place], drops: numpy.ndarray, at_best: float = 0.0
+) -> Profile:
+    """Put the places at which a parameter was held in order, with the best one, and find its interval."""
+    (low, open_low), (high, open_high) = (
+        _profile_end(places, drops, parameter, sign) for sign in (-1.0, 1.0)
+    )
+    mine = [k for k, place in enumerate(places) if place.parameter == parameter]
+    values = numpy.array([*(best + places[k].sign * places[k].distance for k in mine), best])
+    order = numpy.argsort(values)
+    interval = Interval(float(best - low), float(best + high), open_low, open_high)
+    return Profile(values[order], numpy.append(drops[mine], at_best)[order], interval)
+
+
+def _walk_profile(
+    likelihood: WindowLikelihood,
+    limits: numpy.ndarray,
+    found: Fit,
+    best: numpy.ndarray,
+    parameter: int,
+    sign: float,
+    deviation: float,
+) -> tuple[list[_Place], list[float]]:
+    """Places on the way to a limit, up to where the likelihood has fallen far enough, and how far it has at each."""
+    from scipy.optimize import minimize
+
+    room = float(sign * (limits[int(sign > 0.0), parameter] - best[parameter]))
+    others = numpy.delete(numpy.arange(len(best)), parameter)
+    places: list[_Place] = []
+    drops: list[float] = []
+    point = best.copy()
+    for distance in [*(d for d in numpy.array(STEPS) * deviation if d < room), room]:
+        point[parameter] = best[parameter] + sign * distance
+
+        def objective(values: numpy.ndarray) -> tuple[float, numpy.ndarray]:
+            whole = point.copy()
+            whole[others] = values
+            value, gradient = likelihood.gradient(whole)
+            if not (math.isfinite(value) and numpy.isfinite(gradient).all()):
+                return 1e6, numpy.zeros(len(others))
+            return -value, -gradient[others]
+
+        bounds = list(limits[:, others].T)
+        end = minimize(
+            objective,
+            point[others],
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": 12, "ftol": 1e-6},
+        )
+        point[others] = end.x
+        places.append(_Place(parameter, sign, float(distance)))
+        drops.append(found.log_likelihood + float(end.fun))
+        if drops[-1] > DROP:
+            break
+    return places, drops
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:

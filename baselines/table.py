@@ -34,6 +34,9 @@ class Tunable:
     """Whether values may be arrays ``(N,)``, one for each episode: candidates are then tried side by side."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Of the values, without their logarithm; what is not named is a pure number."""
+    anchored: bool = False
+    """Whether a second sensor tells it the motion, so that it can tell errors that last from motion. It is fitted to
+    measurements some time apart, and compared with others on these (:mod:`.advice`)."""
 
 
 def tunable(

@@ -25,7 +25,7 @@ from .failures import own_line
 from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from .plausibility import check_recording
-from .recorded_tables import read_columns
+from .recorded_tables import TruthFile, read_columns
 from .recording import Recording, joined, recording_from
 from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
@@ -307,6 +307,8 @@ def read_recording(
     environment: str | None = None,
     *,
     speeds: tuple[float, float] = (1.0, 1000.0),
+    truth: Any = None,
+    truth_offset: float = 0.0,
     **keywords: Any,
 ) -> Recording:
     """Read recorded measurements, and check whether they can be true (:mod:`.plausibility`).
@@ -319,6 +321,9 @@ def read_recording(
             broken one is left out and named in the notes.
         environment: id of the environment that it is for; default: what the file says.
         speeds: m/s; a recording whose median speed is outside is refused. The lowest holds in ManeuveringTarget only.
+        truth: path of the truth in a file of its own, a table or a log of a receiver, matched by time; a note says how
+            much of the recording has one. For tables.
+        truth_offset: s, added to the times of that file.
         **keywords: parameters of the environment that win over those of the file.
 
     Returns:
@@ -334,11 +339,12 @@ def read_recording(
     if cls is not None:
         check_names(cls, keywords)
     files = [file for one in several for file in files_of(one)]
+    true = None if truth is None else TruthFile(Path(truth), truth_offset)
     found: list[Recording] = []
     left_out: list[str] = []
     for file in files:
         try:
-            found.append(_read_recording(file, cls, speeds, keywords))
+            found.append(_read_recording(file, cls, speeds, keywords, true))
             cls = cls or task_class(found[0].environment)
         except Exception as error:  # readers raise whatever a broken file makes them stumble over
             reason = " ".join(str(error).split()) or type(error).__name__
@@ -355,7 +361,11 @@ def read_recording(
 
 
 def _read_recording(
-    file: Path, cls: type[Task] | None, speeds: tuple[float, float], keywords: Mapping[str, Any]
+    file: Path,
+    cls: type[Task] | None,
+    speeds: tuple[float, float],
+    keywords: Mapping[str, Any],
+    truth: TruthFile | None,
 ) -> Recording:
     """Read one file."""
     if not file.is_file():
@@ -363,13 +373,17 @@ def _read_recording(
     if file.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES / 1e9:g} GB: split it")
     if names_environment(file):
+        if truth is not None:
+            raise ValueError(
+                "a recording in NetCDF holds its own truth: --truth is for tables and logs of receivers"
+            )
         recording = read_netcdf(file, task_class, None if cls is None else cls.id, keywords)
     elif cls is None:
         raise ValueError(
             "it does not say of which environment it is: give its id, as the argument environment or before --recording"
         )
     else:
-        recording = read_columns(file, cls, keywords)
+        recording = read_columns(file, cls, keywords, truth)
     task = make_task(cls or task_class(recording.environment), recording)
     notes = check_recording(recording, task, speeds)
     return dataclasses.replace(recording, notes=(*recording.notes, *notes))

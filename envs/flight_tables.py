@@ -13,6 +13,8 @@ from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy
+
 from .receiver_logs import RECEIVER_READERS, receiver_columns
 
 if TYPE_CHECKING:  # imported where they are used: `import filtergym` takes neither
@@ -313,6 +315,33 @@ def _parse_times_of_day(values: "pandas.Series") -> "pandas.Series":
     return time + DAY * (time.diff() < -0.5 * DAY).cumsum()
 
 
+def clock_seconds(values: "pandas.Series") -> tuple[str, numpy.ndarray]:
+    """Times in seconds by a clock that other files have, too, and which: ``dates``, since 1970, ``times of day``, since
+    midnight, or ``seconds`` as they are; of dates to a microsecond.
+
+    Args:
+        values: times as of :func:`seconds`, numbers from 1e8 on are since 1970.
+
+    Raises:
+        ValueError: for what is no time.
+    """
+    import pandas
+
+    found, unit = _parse_times(values)
+    if pandas.api.types.is_datetime64_any_dtype(found):
+        since = pandas.Timestamp(0, tz="UTC" if found.dt.tz is not None else None)
+        return "dates", ((found - since) / pandas.Timedelta(seconds=1)).to_numpy()
+    if pandas.api.types.is_timedelta64_dtype(found):
+        return "seconds", (found / pandas.Timedelta(seconds=1)).to_numpy()
+    first = next(iter(values.dropna()), None)
+    if isinstance(first, str) and CLOCK.fullmatch(first.strip()):
+        return "times of day", found.to_numpy()
+    if not numpy.isfinite(found).all():
+        raise ValueError(f"time has no value in row {found.isna().idxmax()}")
+    dates = unit > 1.0 or (len(found) > 0 and found.iloc[0] >= 1e8)
+    return "dates" if dates else "seconds", (found / unit).to_numpy()
+
+
 def seconds(values: "pandas.Series") -> "pandas.Series":
     """Times in seconds: numbers as they are, dates since the first of them, times of day since midnight.
 
@@ -325,12 +354,27 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     """
     import pandas
 
+    found, unit = _parse_times(values)
+    if not pandas.api.types.is_numeric_dtype(found):
+        # Not total_seconds of pandas, which can be wrong in the last bit.
+        return (found - found.iloc[:1].squeeze()) / pandas.Timedelta(seconds=1)
+    return found if unit == 1.0 else (found - found.iloc[0]) / unit
+
+
+def _parse_times(values: "pandas.Series") -> tuple["pandas.Series", float]:
+    """Return dates, lengths of time, or numbers, and how many of these are a second.
+
+    Raises:
+        ValueError: for what is none.
+    """
+    import pandas
+
     types = pandas.api.types
     first = next(iter(values.dropna()), None)
     if isinstance(first, str) and first and pandas.isna(pandas.to_numeric(first, errors="coerce")):
         values = values.astype(object).where(values.notna(), "").map(_rewrite_date)
         if CLOCK.fullmatch(values.iloc[0]):
-            return _parse_times_of_day(values)
+            return _parse_times_of_day(values), 1.0
         offset = values.str.contains(OFFSET)
         if offset.any() and not offset.all():
             raise ValueError(
@@ -348,10 +392,9 @@ def seconds(values: "pandas.Series") -> "pandas.Series":
     if types.is_datetime64_any_dtype(values) or types.is_timedelta64_dtype(values):
         if values.isna().any():
             raise ValueError(f"time has no value in row {values.isna().idxmax()}")
-        # Not total_seconds of pandas, which can be wrong in the last bit.
-        return (values - values.iloc[:1].squeeze()) / pandas.Timedelta(seconds=1)
+        return values, 1.0
     found = numbers("time", values)
     first = found.iloc[0] if len(found) else 0.0
     # 1e11 seconds after 1970 is the year 5138, 1e11 milliseconds 1973; and so on in steps of a thousand.
     unit = next((unit for unit in (1e9, 1e6, 1e3) if first > 1e8 * unit), 1.0)
-    return found if unit == 1.0 else (found - first) / unit
+    return found, unit

@@ -3,7 +3,8 @@
 * RTKLIB's ``.pos``: geodetic or Earth-fixed positions or baselines in metres, with standard deviations.
 * NMEA 0183, ``.nmea``: positions of GGA and RMC, standard deviations of GST.
 * ULog of PX4, ``.ulg``: positions of the topic ``vehicle_gps_position``, or ``sensor_gps``.
-* Bags of ROS 1, ``.bag``: messages ``sensor_msgs/NavSatFix``.
+* Bags of ROS 1, ``.bag``, and of ROS 2, ``.db3`` or ``.mcap``: ``NavSatFix``, with ``Odometry`` for a second sensor, or
+  positions of ``Odometry`` or of poses.
 
 What each becomes is a table with ``time``, ``latitude``, ``longitude``, ``altitude``, ``sigma_x``, ``sigma_y``, as far
 as the log knows them, or ``x`` and ``y`` of a baseline. Libraries that read the last three are imported when such a
@@ -14,6 +15,7 @@ refused before it fills the memory.
 import bz2
 import contextlib
 import datetime
+import functools
 import math
 import os
 import re
@@ -376,11 +378,80 @@ def read_ulog(file: Path, most_rows: int) -> ReceiverLog:
 # --- ROS
 
 NAVSAT = "sensor_msgs/msg/NavSatFix"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSES = (ODOMETRY, "geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
+"""Messages with positions, the first that a bag without :data:`NAVSAT` has."""
 UNKNOWN_COVARIANCE, NO_FIX = 0, -1
 
 
+class _Bag(NamedTuple):
+    """An open bag, of ROS 1 or 2."""
+
+    reader: Any
+    parse: Callable[[bytes, str], Any]
+    digests: Callable[[str], str] | None
+    """Of a type's definition as the library knows it; None where a bag holds none."""
+
+    def busiest(self, kind: str) -> tuple[str, int]:
+        """Topic that has most messages of a type, and how many; no topic where there are none."""
+        counts: Counter[str] = Counter()
+        for connection in self.reader.connections:
+            if connection.msgtype == kind:
+                counts[connection.topic] += connection.msgcount
+        return next(iter(counts.most_common(1)), ("", 0))
+
+    def rows(
+        self, topic: str, kind: str, values: Callable[[Any], tuple[float, ...]], most: int
+    ) -> numpy.ndarray:
+        """Numbers of the messages of a topic, a column each: messages take a hundred times as much.
+
+        Raises:
+            ValueError: if there are none or too many, or they are of another definition.
+        """
+        chosen = [c for c in self.reader.connections if c.topic == topic and c.msgtype == kind]
+        _check_rows(sum(connection.msgcount for connection in chosen), most)
+        if self.digests is not None and any(c.digest != self.digests(kind) for c in chosen):
+            raise ValueError(f"its {kind} is another than that of ROS 1")
+        found = []
+        for _, _, raw in self.reader.messages(chosen):
+            found.append(values(self.parse(raw, kind)))
+            _check_rows(len(found), most)
+        if not found:
+            raise ValueError(f"its topic {topic} has no messages")
+        return numpy.array(found).T
+
+
+@contextlib.contextmanager
+def _open_bag(file: Path) -> Iterator[_Bag]:
+    """Open a bag with types as the library knows them: definitions in a bag become code.
+
+    Raises:
+        ValueError: if the library is missing.
+    """
+    try:
+        from rosbags.rosbag1 import Reader as FirstReader
+        from rosbags.rosbag2 import Reader as SecondReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ValueError(f"a bag needs one more package: {EXTRA}") from error
+    if file.suffix == ".bag":
+        types = get_typestore(Stores.ROS1_NOETIC)
+        with FirstReader(file) as bag:
+            for place, chunk in bag.chunks.items():
+                bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
+            yield _Bag(bag, types.deserialize_ros1, lambda kind: types.generate_msgdef(kind)[1])
+        return
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    # The file alone: metadata.yaml of its folder could name files elsewhere.
+    with _bound_chunks(), SecondReader(file) as bag:
+        yield _Bag(bag, types.deserialize_cdr, None)
+
+
 def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
-    """Read positions ``NavSatFix`` from a bag of ROS 1, those of the topic that has the most.
+    """Read positions from a bag of ROS 1 or a storage file of ROS 2, those of the topic that has the most.
+
+    Messages ``NavSatFix``, and beside them displacements of ``Odometry`` for a second sensor; else positions of
+    ``Odometry`` or of poses, metres in their own frame.
 
     Args:
         file: its path.
@@ -389,59 +460,87 @@ def read_rosbag(file: Path, most_rows: int) -> ReceiverLog:
     Raises:
         ValueError: if it holds none, or more.
     """
-    try:
-        from rosbags.rosbag1 import Reader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise ValueError(f"a bag needs one more package: {EXTRA}") from error
-    # Types as the library knows them: definitions in a bag become code.
-    types = get_typestore(Stores.ROS1_NOETIC)
-    with Reader(file) as bag:
-        counts: Counter[str] = Counter()
-        for connection in bag.connections:
-            if connection.msgtype == NAVSAT:
-                counts[connection.topic] += connection.msgcount
-        if not counts:
-            topics = sorted({connection.msgtype for connection in bag.connections})
-            raise ValueError(f"it holds no {NAVSAT}; it holds {', '.join(topics) or 'nothing'}")
-        topic, count = counts.most_common(1)[0]
-        _check_rows(count, most_rows)
-        for place, chunk in bag.chunks.items():
-            bag.chunks[place] = chunk._replace(decompressor=_bound_unpacking(chunk.decompressor))
-        chosen = [c for c in bag.connections if c.topic == topic and c.msgtype == NAVSAT]
-        known = types.generate_msgdef(NAVSAT)[1]
-        if any(connection.digest != known for connection in chosen):
-            raise ValueError(f"its {NAVSAT} is another than that of ROS 1")
-        # Numbers of each at once: messages take a hundred times as much.
-        fixes = [_fix_values(types.deserialize_ros1(raw, NAVSAT)) for _, _, raw in bag.messages(chosen)]
-    if not fixes:
-        raise ValueError(f"its topic {topic} has no messages")
-    return _navsat_columns(numpy.array(fixes).T, topic)
+    with _open_bag(file) as bag:
+        topic, _ = bag.busiest(NAVSAT)
+        source, _ = bag.busiest(ODOMETRY)
+        if topic:
+            found = _navsat_columns(bag.rows(topic, NAVSAT, _fix_values, most_rows), topic)
+            if source:
+                found = _add_odometry(found, bag.rows(source, ODOMETRY, _pose_values, most_rows), source)
+            return found
+        for kind in POSES:
+            topic, _ = bag.busiest(kind)
+            if topic:
+                return _pose_columns(bag.rows(topic, kind, _pose_values, most_rows), topic)
+        held = sorted({connection.msgtype for connection in bag.reader.connections})
+        raise ValueError(f"it holds no {NAVSAT} and no positions; it holds {', '.join(held) or 'nothing'}")
+
+
+def _seconds(header: Any) -> float:
+    return float(header.stamp.sec + 1e-9 * header.stamp.nanosec)
 
 
 def _fix_values(fix: Any) -> tuple[float, ...]:
     """Time, status, latitude, longitude, altitude, variances east and north, and what is known of them."""
-    stamp, variances = fix.header.stamp, fix.position_covariance.reshape(3, 3).diagonal()
+    variances = fix.position_covariance.reshape(3, 3).diagonal()
     place = fix.latitude, fix.longitude, fix.altitude
-    time = stamp.sec + 1e-9 * stamp.nanosec
-    return time, fix.status.status, *place, *variances[:2].tolist(), fix.position_covariance_type
+    known = fix.position_covariance_type
+    return _seconds(fix.header), fix.status.status, *place, *variances[:2].tolist(), known
+
+
+def _pose_values(message: Any) -> tuple[float, ...]:
+    """Time, x, y, and their variances, zero where they are not told."""
+    pose, variances = message.pose, (0.0, 0.0)
+    if hasattr(pose, "covariance"):
+        diagonal = pose.covariance.reshape(6, 6).diagonal()
+        pose, variances = pose.pose, (float(diagonal[0]), float(diagonal[1]))
+    return _seconds(message.header), pose.position.x, pose.position.y, *variances
 
 
 def _bound_unpacking(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """Return a function that unpacks no more than a chunk may have."""
-    import lz4.frame
+    """Return a function that unpacks no more than a chunk of a bag of ROS 1 may have."""
+    packed_by = next((word for word in ("bz2", "lz4") if word in str(decompress.__module__)), "")
+    return lambda packed: _unpack(packed, packed_by)
 
-    def unpack(packed: bytes) -> bytes:
-        makers = {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
-        maker = next((m for word, m in makers.items() if word in decompress.__module__), None)
-        if maker is None:  # not packed at all
-            return packed
-        found: bytes = maker().decompress(packed, max_length=MOST_CHUNK)
-        if len(found) >= MOST_CHUNK:
-            raise ValueError(f"a part of it is larger than {MOST_CHUNK / 1e6:g} MB")
-        return found
 
-    return unpack
+@contextlib.contextmanager
+def _bound_chunks() -> Iterator[None]:
+    """Let the library unpack no more of a chunk of MCAP than that may have."""
+    from rosbags.rosbag2 import storage_mcap
+
+    table: dict[str, Any] = storage_mcap.DECOMPRESSORS
+    before = dict(table)
+    for name in ("lz4", "zstd"):
+        table[name] = functools.partial(lambda name, packed, _: _unpack(packed, name), name)
+    try:
+        yield
+    finally:
+        table.update(before)
+
+
+def _unpack(packed: bytes, packed_by: str) -> bytes:
+    """Unpack a chunk.
+
+    Raises:
+        ValueError: if it is larger than a chunk may be.
+    """
+    if not packed_by:
+        return packed
+    unpacker: Any
+    if packed_by == "lz4":
+        import lz4.frame
+
+        unpacker = lz4.frame.LZ4FrameDecompressor()
+    elif packed_by == "zstd":
+        from rosbags.rosbag2 import storage_mcap
+
+        unpacker = storage_mcap.zstd.ZstdDecompressor()
+    else:
+        unpacker = bz2.BZ2Decompressor()
+    found: bytes = unpacker.decompress(packed, max_length=MOST_CHUNK)
+    if len(found) >= MOST_CHUNK:
+        raise ValueError(f"a part of it is larger than {MOST_CHUNK / 1e6:g} MB")
+    return found
 
 
 def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
@@ -462,11 +561,39 @@ def _navsat_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
     return ReceiverLog(columns, tuple(notes))
 
 
+def _pose_columns(values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Columns of messages, of which there are ``values`` as :func:`_pose_values` returns them, ``(5, n)``."""
+    time, x, y, *variances = values
+    columns = {"time": time, "x": x, "y": y}
+    notes = (f"positions are of the topic {topic}, metres in its own frame",)
+    if not (numpy.array(variances) > 0.0).all():
+        return ReceiverLog(columns, (*notes, "messages do not say how large errors are"))
+    sigma_x, sigma_y = numpy.sqrt(variances)
+    return ReceiverLog({**columns, "sigma_x": sigma_x, "sigma_y": sigma_y}, notes)
+
+
+def _add_odometry(log: ReceiverLog, values: numpy.ndarray, topic: str) -> ReceiverLog:
+    """Add displacements since the row before, of poses ``(5, n)`` as :func:`_pose_values` returns them."""
+    order = numpy.argsort(values[0], kind="stable")
+    time, x, y, *_ = values[:, order]
+    now = log.columns["time"]
+    moved = {}
+    for name, axis in (("odometry_x", x), ("odometry_y", y)):
+        at = numpy.interp(now, time, axis, left=math.nan, right=math.nan)
+        moved[name] = numpy.append(math.nan, numpy.diff(at))
+    if not numpy.isfinite(moved["odometry_x"]).any():
+        return log
+    note = f"the second sensor is the topic {topic}: it must not be made of the positions themselves"
+    return ReceiverLog({**log.columns, **moved}, (*log.notes, note))
+
+
 RECEIVER_READERS: Mapping[str, Callable[[Path, int], ReceiverLog]] = {
     ".pos": read_rtklib,
     ".nmea": read_nmea,
     ".ulg": read_ulog,
     ".bag": read_rosbag,
+    ".db3": read_rosbag,
+    ".mcap": read_rosbag,
 }
 """By the end of a file's name."""
 

@@ -7,7 +7,7 @@ and true values, ``truth_NAME`` for the components of the environment.
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
 
@@ -17,6 +17,7 @@ from .log_format import TrackLog
 from .plausibility import check_degrees, check_interval, limit_notes, unknown_column_notes
 from .recording import Recording, measure_once, side_by_side
 from .task import Task
+from .truth_files import match_truth, offset_note, read_truth
 
 if TYPE_CHECKING:
     import pandas
@@ -149,6 +150,17 @@ class Columns:
             )
             self.table = self.table.assign(**dict(zip(names, found, strict=True)))
 
+    def note_offset(self, plane: tuple[str, ...]) -> None:
+        """Say which offset of its clock would bring the truth nearer to what was measured.
+
+        Args:
+            plane: names of the columns, see :attr:`.LogFormat.plane`.
+        """
+        if self.has(*plane):
+            x, y, true_x, true_y = (self[name] for name in plane)
+            found = offset_note(self.time, numpy.stack([x, y], axis=1), numpy.stack([true_x, true_y], axis=1))
+            self.notes += [found] * bool(found)
+
     def _height(self, name: str) -> numpy.ndarray:
         """A column of heights, the median where it says nothing, ``(rows,)``, m; zero where there is none."""
         height = self[name] if self.has(name) else numpy.zeros(len(self.time))
@@ -214,13 +226,24 @@ class Columns:
         return interval
 
 
-def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Recording:
+class TruthFile(NamedTuple):
+    """A file of the truth, see :mod:`.truth_files`."""
+
+    path: Path
+    offset: float = 0.0
+    """Added to its times, s."""
+
+
+def read_columns(
+    path: Path, cls: type[Task], keywords: Mapping[str, Any], truth: TruthFile | None = None
+) -> Recording:
     """Read a table of what sensors said.
 
     Args:
         path: of a file.
         cls: the environment.
         keywords: parameters of it.
+        truth: in a file of its own.
 
     Raises:
         ValueError: if it cannot be read, or lacks what the environment needs.
@@ -250,6 +273,9 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
         if numpy.isinf(table[name]).any():
             raise ValueError(f"{name} is not finite in row {numpy.isinf(table[name]).idxmax()}")
     table.insert(0, "time", seconds(read[time_name]))
+    if truth is not None:
+        table, told = _add_truth(table, read[time_name], cls, keywords, truth)
+        notes = (*notes, *told)
     parts = []
     log_time = _times_as_written(read[time_name])
     for name, rows in _by_recording(table, read.get(RECORDING)).items():
@@ -261,6 +287,8 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
             own.drop_duplicates()
             if log_format.plane:
                 own.project_to_plane(log_format.plane)
+                if truth is not None:
+                    own.note_offset(log_format.plane)
             if "sampling_interval" not in keywords:
                 check_interval(own.interval(), log_format.longest_interval)
             parts.append((own, log_format.read(own)))
@@ -269,6 +297,31 @@ def read_columns(path: Path, cls: type[Task], keywords: Mapping[str, Any]) -> Re
                 raise
             raise ValueError(f"recording {name!r}: {error}") from error
     return _side_by_side(path, cls, keywords, parts, names, notes)
+
+
+def _add_truth(
+    table: "pandas.DataFrame",
+    times: "pandas.Series",
+    cls: type[Task],
+    keywords: Mapping[str, Any],
+    truth: TruthFile,
+) -> tuple["pandas.DataFrame", tuple[str, ...]]:
+    """Add the truth of a file of its own to the rows of a log, and say how many have one.
+
+    Raises:
+        ValueError: if it cannot be read or matched, or the log has a truth already.
+    """
+    log_format: Any = cls.log_format
+    here = [name for name in table if name.startswith(TRUTH)]
+    if here:
+        raise ValueError(f"it has {', '.join(here)}: leave these columns or the file of the truth out")
+    components = [component.name for component in cls(cls.Parameters(**keywords)).components]
+    try:
+        found = read_truth(truth.path, log_format, components, TRUTH, TIME)
+        columns, note = match_truth(found, times, truth.offset)
+    except ValueError as error:
+        raise ValueError(f"truth {truth.path}: {error}") from error
+    return table.assign(**columns), (note, *(f"truth: {each}" for each in found.notes))
 
 
 def _rename_aliases(read: "pandas.DataFrame", names: list[str]) -> tuple["pandas.DataFrame", list[str]]:

@@ -14,7 +14,7 @@ Where there is no truth there is no error and no cost, and rewards are zero.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -234,7 +234,7 @@ class Recording:
 
     def check_fits(self, task: Task) -> None:
         """Raise ValueError if a task of NumPy measures other arrays than there are, or a closed loop."""
-        initial, measurement = measure_once(task)
+        initial, measurement = measure_once(task, self.measurements)
         for kind, prefix, example, found, leading in (
             ("measures", "", measurement, self.measurements, 2),
             ("is told at the start", "initial_", initial, self.initial, 1),
@@ -385,6 +385,10 @@ def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()
     untrue = [one.name for one in kept if one.truth is None]
     if untrue and len(untrue) < len(kept):
         told.append(f"{untrue[0]}: has no truth, so nobody is judged")
+    for key in sorted({key for one in kept for key in one.measurements}):
+        lacking = [one.name for one in kept if key not in one.measurements]
+        if lacking:
+            told.append(f"{lacking[0]}: has no {key}, which is left out of all")
     names = []
     for one in kept:
         alone = len(one.names) == 1
@@ -406,13 +410,14 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         widths = [(0, 0), (0, longest - values.shape[1]), *[(0, 0)] * (values.ndim - 2)]
         return numpy.pad(values, widths, constant_values=fill)
 
+    # What only some hold, such as a second sensor, is of none.
+    names = [key for key in first.measurements if all(key in one.measurements for one in recordings)]
     truths = [padded(one.truth) for one in recordings if one.truth is not None]
     times = [padded(one.log_time) for one in recordings if one.log_time is not None]
     return dataclasses.replace(
         first,
         measurements={
-            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings])
-            for key in first.measurements
+            key: numpy.concatenate([padded(one.measurements[key]) for one in recordings]) for key in names
         },
         initial={key: numpy.concatenate([one.initial[key] for one in recordings]) for key in first.initial},
         seconds=numpy.concatenate([padded(one.seconds) for one in recordings]),
@@ -445,9 +450,14 @@ def _first(values: numpy.ndarray) -> int:
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
-def measure_examples(task: Task) -> tuple[Any, Any, Any]:
+def measure_examples(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any, Any]:
     """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
     episodes side by side.
+
+    Args:
+        task: on NumPy arrays.
+        names: of the arrays of a recording; where one is of a field that only recordings hold, the measurement has
+            these fields, too.
     """
     world = task.World(task)
     draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
@@ -456,16 +466,19 @@ def measure_examples(task: Task) -> tuple[Any, Any, Any]:
     feedback = bank.feedback(bank.start(initial), initial)
     row = numpy.zeros((world.normals + world.row_uniforms, 8))
     row[world.normals :] = 0.5
-    return initial, world.advance(truth, row, feedback)[1], feedback
+    measurement = world.advance(truth, row, feedback)[1]
+    whole = world.add_recorded_fields(measurement)
+    further = {name for name, _ in named_arrays(whole)} - {name for name, _ in named_arrays(measurement)}
+    return initial, whole if further & {*names} else measurement, feedback
 
 
-def measure_once(task: Task) -> tuple[Any, Any]:
-    """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
+def measure_once(task: Task, names: Iterable[str] = ()) -> tuple[Any, Any]:
+    """What a task of NumPy says of a start of the track, and one measurement; arguments as of :func:`measure_examples`.
 
     Raises:
         ValueError: if what is measured depends on what is estimated.
     """
-    initial, measurement, feedback = measure_examples(task)
+    initial, measurement, feedback = measure_examples(task, names)
     if feedback is not None:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
@@ -505,7 +518,8 @@ class RecordedWorld(World[Task, Replayed, Any]):
         self.recording = recording
         self.simulated = task.World(task)
         """The task's own world, which knows what an error costs."""
-        self._initial, self._measurement = measure_once(type(task)(task.parameters))
+        plain = type(task)(task.parameters)
+        self._initial, self._measurement = measure_once(plain, recording.measurements)
         tables = recording.tables
         # Tables of NumPy are read by compiled code as they are.
         kept = task.constant if "torch" in task.xp.__name__ else numpy.asarray

@@ -85,6 +85,15 @@ class World(ABC, Generic[TaskT, Truth, Measurement]):
         replaced: Measurement = there._replace(**{self.received_field: values})
         return replaced
 
+    def add_recorded_fields(self, measurement: Measurement) -> Measurement:
+        """Return a measurement with zeros in the fields, None else, that only recordings may hold; by default there are
+        none.
+
+        Args:
+            measurement: of :meth:`advance`.
+        """
+        return measurement
+
     def component_readings(self, measurement: Measurement) -> Array | None:
         """Readings of the task's components, ``(C, N)`` in their units, for pictures.
 

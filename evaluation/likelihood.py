@@ -47,7 +47,9 @@ class Windows(NamedTuple):
     """Whether a measurement's likelihood counts, ``(T, W)``."""
 
 
-def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up: int) -> Windows:
+def cut_windows(
+    recording: Recording, task: Task, spans: Sequence[Span], warm_up: int, every: int = 1
+) -> Windows:
     """Cut a recording into windows, each with an initial estimate from its own first measurements.
 
     Args:
@@ -56,8 +58,9 @@ def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up
             recording, the recording's own initial estimate stands.
         spans: what counts.
         warm_up: measurements that a window begins earlier, where there are as many.
+        every: of those with a field ``available`` one in so many is received, the others are missing.
     """
-    template, like = measure_once(type(task)(task.parameters))
+    template, like = measure_once(type(task)(task.parameters), recording.measurements)
     starts, pieces, counted = [], [], []
     for span in spans:
         initial, first = _start(recording, task, span, warm_up)
@@ -75,12 +78,25 @@ def cut_windows(recording: Recording, task: Task, spans: Sequence[Span], warm_up
         name: numpy.stack([_extend(piece[name], longest) for piece in pieces], axis=-1)
         for name in recording.measurements
     }
+    if every > 1:
+        arrays["available"] = _thin(arrays["available"], every)
     initial_arrays = {
         name: numpy.stack([numpy.asarray(start[name]) for start in starts], axis=-1) for name in starts[0]
     }
     rows = [{name: values[k] for name, values in arrays.items()} for k in range(longest)]
     measurements = [fill_arrays(like, row.__getitem__, numpy) for row in rows]
     return Windows(fill_arrays(template, initial_arrays.__getitem__, numpy), measurements, counts)
+
+
+def _thin(available: numpy.ndarray, every: int) -> numpy.ndarray:
+    """Keep of what is available, ``(T, W)``, the first, and each so many measurements after the last kept."""
+    kept = numpy.zeros_like(available)
+    since = numpy.full(available.shape[1], every)
+    for row, values in zip(kept, available, strict=True):
+        now = (values > 0.0) & (since >= every)
+        row[now], since[now] = values[now], 0
+        since += 1
+    return kept
 
 
 def _start(recording: Recording, task: Task, span: Span, warm_up: int) -> tuple[Mapping[str, Any], int]:

@@ -11,7 +11,7 @@ from filtergym.baselines import advice as advice_module
 from filtergym.baselines import fitting
 from filtergym.baselines.advice import advise, share_out
 from filtergym.baselines.fitted_filters import own_family, read_fitted
-from filtergym.baselines.fitting import fit, profile_intervals, with_noise_scale
+from filtergym.baselines.fitting import fit, profile_parameters, with_noise_scale
 from filtergym.baselines.maneuvering_target.estimators import ConstantVelocity
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
@@ -28,7 +28,16 @@ PROBLEM = problem_of(ID)
 
 
 def write_log(
-    folder, count=240, acceleration=0.8, sigma=1.0, T=0.5, seed=0, missed=0.0, truth=True, stated=None
+    folder,
+    count=240,
+    acceleration=0.8,
+    sigma=1.0,
+    T=0.5,
+    seed=0,
+    missed=0.0,
+    truth=True,
+    stated=None,
+    odometry=False,
 ):
     """Write a log of a target of white acceleration, constant in every interval; return its path."""
     rng = np.random.default_rng(seed)
@@ -45,6 +54,9 @@ def write_log(
     names = "time,x,y,sigma_x,sigma_y" + truth * (
         ",truth_position_x,truth_position_y,truth_velocity_x,truth_velocity_y"
     )
+    if odometry:
+        columns.append(T * velocity)
+        names += ",odometry_x,odometry_y"
     path = folder / f"log{seed}.csv"
     np.savetxt(path, np.column_stack(columns), "%.6f", ",", header=names, comments="")
     return path
@@ -110,7 +122,7 @@ def test_half_the_stated_deviation_is_twice_the_scale(tmp_path):
 @pytest.mark.parametrize("name", list(log_families()))
 def test_candidates_side_by_side_are_those_alone(tmp_path, name, monkeypatch):
     """In lanes, compiled, one by one, and with NumPy; 60 updates of an iterated filter round by 1e-9 at most."""
-    recording = read(write_log(tmp_path, count=70, missed=0.1))
+    recording = read(write_log(tmp_path, count=70, missed=0.1, odometry=True))
     found, tunable = likelihood_of(recording, name)
     low, high = np.array(list(tunable.limits.values())).T
     candidates = low[:, None] + (high - low)[:, None] * np.random.default_rng(1).uniform(
@@ -164,7 +176,8 @@ def test_fit_finds_what_made_the_log_and_its_intervals_are_those_of_the_profile(
     best = fit(found, tunable)
     assert best.spread < 1e-3
     assert best.at_limit == ()
-    intervals = profile_intervals(found, tunable, best)
+    profiles = profile_parameters(found, tunable, best)
+    intervals = {name: each.interval for name, each in profiles.items()}
     for name, true in {"log10_acceleration": math.log10(0.8), "log10_noise_scale": math.log10(2.0)}.items():
         assert intervals[name].low < true < intervals[name].high  # of this seed; coverage is a command
     for i, name in enumerate(tunable.limits):
@@ -189,13 +202,15 @@ def test_what_the_log_says_nothing_of_is_open(tmp_path):
     recording = read(write_log(tmp_path, acceleration=0.0, count=160))
     found, tunable = likelihood_of(recording, "constant-velocity", noise=True)
     best = fit(found, tunable)
-    intervals = profile_intervals(found, tunable, best)
+    profiles = profile_parameters(found, tunable, best)
+    intervals = {name: each.interval for name, each in profiles.items()}
     assert intervals["log10_acceleration"].open_low
     assert not intervals["log10_acceleration"].open_high
     assert not intervals["log10_noise_scale"].open_low
     assert not intervals["log10_noise_scale"].open_high
     found, tunable = likelihood_of(read(write_log(tmp_path, count=160, seed=1)), "imm-turn")
-    intervals = profile_intervals(found, tunable, fit(found, tunable))
+    profiles = profile_parameters(found, tunable, fit(found, tunable))
+    intervals = {name: each.interval for name, each in profiles.items()}
     assert any(interval.open_low and interval.open_high for interval in intervals.values())
 
 

@@ -387,6 +387,99 @@ def bag(path, covariance_type=2, compression=None, kind="sensor_msgs/msg/NavSatF
     return path
 
 
+def bag2(folder, storage="SQLITE3", compression=False, kinds=("sensor_msgs/msg/NavSatFix",), covariance=4.0):
+    """Write a bag of ROS 2 and return its storage file; poses go 3 m east and 1 m south of the places."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="not installed: pip install 'filtergym[logs]'")
+    from rosbags.typesys import Stores, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+
+    def make(kind, *fields):
+        return types.types[kind](*fields)
+
+    storages = rosbag2.StoragePlugin
+    writer = rosbag2.Writer(folder, version=9, storage_plugin=storages[storage])
+    if compression:
+        writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
+    with writer:
+        topics = {
+            kind: writer.add_connection("/" + kind.split("/")[-1], kind, typestore=types) for kind in kinds
+        }
+        for i, place in enumerate(places().T):
+            time = 1756402239 * 10**9 + round(1e9 * TIME[i])
+            stamp = make("builtin_interfaces/msg/Time", time // 10**9, time % 10**9)
+            header = make("std_msgs/msg/Header", stamp, "gps")
+            status = make("sensor_msgs/msg/NavSatStatus", -1 if i == 9 else 0, 1)
+            point = make("geometry_msgs/msg/Point", east[i] + 3.0, north[i] - 1.0, 0.0)
+            pose = make(
+                "geometry_msgs/msg/Pose", point, make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+            )
+            vector = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+            twist = make("geometry_msgs/msg/Twist", vector, vector)
+            C = np.diag([covariance, 9.0, 1.0, 1.0, 1.0, 1.0]).ravel()
+            messages = {
+                "sensor_msgs/msg/NavSatFix": (header, status, *place, np.diag([4.0, 9.0, 16.0]).ravel(), 2),
+                "nav_msgs/msg/Odometry": (
+                    header,
+                    "base",
+                    make("geometry_msgs/msg/PoseWithCovariance", pose, C),
+                    make("geometry_msgs/msg/TwistWithCovariance", twist, C),
+                ),
+                "geometry_msgs/msg/PoseStamped": (header, pose),
+                "std_msgs/msg/String": ("hello",),
+            }
+            for kind in kinds:
+                writer.write(topics[kind], time, types.serialize_cdr(make(kind, *messages[kind]), kind))
+    return next(file for file in folder.iterdir() if file.suffix in (".db3", ".mcap"))
+
+
+@pytest.mark.parametrize(("storage", "compression"), [("SQLITE3", False), ("MCAP", False), ("MCAP", True)])
+def test_messages_of_a_bag_of_ros_2(storage, compression, tmp_path):
+    """By its file and by its folder, whose metadata are not needed."""
+    path = bag2(tmp_path / "drive", storage, compression)
+    (tmp_path / "drive" / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information: {relative_file_paths: [/etc/passwd]}"
+    )
+    recording = read_recording(path, TARGET)
+    there = recording.measurements["available"][0] > 0.0
+    assert there.tolist() == [i != 9 for i in range(2, COUNT)]
+    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
+    found = recording.measurements["position"][0][there]
+    np.testing.assert_allclose(found, np.stack([east, north], axis=1)[2:][there], atol=1e-7)
+    assert (recording.measurements["variance"][0][there] == [4.0, 9.0]).all()
+    assert recording.notes[:2] == ("positions are of the topic /NavSatFix", "1 message without a fix")
+    folder = read_recording(tmp_path / "drive", TARGET)
+    np.testing.assert_array_equal(folder.measurements["position"], recording.measurements["position"])
+
+
+def test_odometry_of_a_bag_is_the_second_sensor(tmp_path):
+    """Displacements of poses between the times of fixes, in the frame of the odometry."""
+    kinds = ("sensor_msgs/msg/NavSatFix", "nav_msgs/msg/Odometry")
+    recording = read_recording(bag2(tmp_path / "drive", kinds=kinds), TARGET)
+    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
+    moved = np.diff(np.stack([east, north], axis=1), axis=0)[1:]
+    np.testing.assert_allclose(recording.measurements["odometry_displacement"][0], moved, atol=1e-8)
+    assert (recording.measurements["odometry_available"] == 1.0).all()
+    assert any("the second sensor is the topic /Odometry" in note for note in recording.notes)
+
+
+def test_poses_of_a_bag_are_positions(tmp_path):
+    east, north, _ = pymap3d.geodetic2enu(*places(), *places()[:2, 0], 0.0)
+    expected = np.stack([east + 3.0, north - 1.0], axis=1)[2:]
+    recording = read_recording(bag2(tmp_path / "odometry", kinds=("nav_msgs/msg/Odometry",)), TARGET)
+    np.testing.assert_allclose(recording.measurements["position"][0], expected, atol=1e-9)
+    assert (recording.measurements["variance"][0] == [4.0, 9.0]).all()
+    path = bag2(tmp_path / "poses", "MCAP", kinds=("geometry_msgs/msg/PoseStamped",))
+    recording = read_recording(path, TARGET, range_sigma=2.0)
+    np.testing.assert_allclose(recording.measurements["position"][0], expected, atol=1e-9)
+    assert "messages do not say how large errors are" in recording.notes
+    with pytest.raises(
+        ValueError, match=r"it holds no .*NavSatFix and no positions; it holds std_msgs/msg/String"
+    ):
+        read_recording(bag2(tmp_path / "talk", kinds=("std_msgs/msg/String",)), TARGET)
+
+
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
 def test_messages_of_a_bag(compression, tmp_path):
     recording = read_recording(bag(tmp_path / "drive.bag", compression=compression), TARGET)
@@ -403,7 +496,8 @@ def test_a_bag_without_deviations_or_positions(tmp_path):
     with pytest.raises(ValueError, match="nothing says how large the errors"):
         read_recording(bag(tmp_path / "drive.bag", covariance_type=0), TARGET)
     with pytest.raises(
-        ValueError, match=r"it holds no sensor_msgs/msg/NavSatFix; it holds .*std_msgs/msg/String"
+        ValueError,
+        match=r"it holds no sensor_msgs/msg/NavSatFix and no positions; it holds .*std_msgs/msg/String",
     ):
         read_recording(bag(tmp_path / "imu.bag", kind="sensor_msgs/msg/Imu"), TARGET)
 
@@ -423,6 +517,8 @@ def test_a_bag_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
         path = bag(tmp_path / f"{compression}.bag", compression=compression)
         with pytest.raises(ValueError, match=r"a part of it is larger than 0\.001 MB"):
             read_recording(path, TARGET)
+    with pytest.raises(ValueError, match=r"a part of it is larger than 0\.001 MB"):
+        read_recording(bag2(tmp_path / "packed", "MCAP", compression=True), TARGET)
     assert len(receiver_logs._bound_unpacking(bz2.decompress)(bz2.compress(b"a" * 999))) == 999
 
 
@@ -432,7 +528,7 @@ def test_only_known_columns_of_a_log_are_given(tmp_path):
     assert list(table.columns) == table.names == KNOWN[:6]
 
 
-@pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bag"])
+@pytest.mark.parametrize("suffix", [".pos", ".nmea", ".ulg", ".bag", ".db3", ".mcap"])
 def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
     """Bytes that changed and files that end early are read or refused, and nothing else happens."""
     library = {".ulg": "pyulog", ".nmea": "pynmea2"}.get(suffix, "numpy")
@@ -443,6 +539,8 @@ def test_whatever_is_broken_is_one_sentence(suffix, tmp_path):
         ".nmea": nmea,
         ".ulg": lambda path: ulog(path, NEW, rows),
         ".bag": bag,
+        ".db3": lambda path: bag2(path),
+        ".mcap": lambda path: bag2(path, "MCAP", compression=True),
     }[suffix]
     whole = make(tmp_path / f"whole{suffix}").read_bytes()
     path, rng, sentences = tmp_path / f"log{suffix}", np.random.default_rng(0), []

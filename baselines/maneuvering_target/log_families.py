@@ -20,6 +20,7 @@ from ...evaluation.competitors import Likelihood
 from ...filters import kalman
 from ..table import Tunable, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes
+from .anchored import DeadReckoning, regress_odometry
 from .estimators import (
     ConstantVelocity,
     KalmanInteractingMultipleModel,
@@ -109,6 +110,10 @@ UNITS = {
     **dict.fromkeys(("acceleration", "acceleration_quiet", "least"), "m/s^2"),
     "jerk": "m/s^3",
     **dict.fromkeys(("turn_rate", "turn_rate_start", "turn_rate_change"), "degrees/s"),
+    "error_deviation": "m",
+    "correlation_time": "s",
+    "drift": "m/m^0.5",
+    "heading_offset": "degrees",
 }
 """Of the parameters of all families."""
 
@@ -170,4 +175,32 @@ def log_families(recording: Recording | None = None) -> dict[str, Tunable]:
             log10_shape=(-0.3, 0.7, 3.0),
         ),
     }
+    if recording is None or "odometry_displacement" in recording.measurements:
+        families["dead-reckoning"] = _anchored_family(recording, T, r)
     return {name: dataclasses.replace(family, units=UNITS) for name, family in families.items()}
+
+
+def _anchored_family(recording: Recording | None, T: float, r: float) -> Tunable:
+    """Dead reckoning by a second sensor, with slow errors of the positions.
+
+    Limits are narrow where a log says little. An error that lasts for more than five minutes cannot be told from a
+    place elsewhere in a log of an hour. Dead reckoning errs by 3 to 10 m after a hundred: to believe it more is
+    dangerous, as likelihood may where errors are no Gauss-Markov process, to believe it less than it deserves costs
+    little.
+
+    Args:
+        recording: with a second sensor; None: any.
+        T: interval between measurements, s.
+        r: their deviation, m.
+    """
+    scale, heading = (1.0, 0.0) if recording is None else regress_odometry(recording)
+    shortest = min(2.0 * T, 10.0)
+    family = tunable(
+        DeadReckoning,
+        log10_error_deviation=(math.log10(r) - 1.5, math.log10(2.0 * r), math.log10(r) + 2.0),
+        log10_correlation_time=(math.log10(shortest), math.log10(60.0), math.log10(300.0)),
+        log10_drift=(-0.5, -0.25, 0.0),
+        scale=(0.8 * scale, scale, 1.25 * scale),
+        heading_offset=(heading - 30.0, heading, heading + 30.0),
+    )
+    return dataclasses.replace(family, anchored=True)

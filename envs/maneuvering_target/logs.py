@@ -31,10 +31,21 @@ COLUMNS = {
     "sigma_y": "m, likewise",
     "range_sigma": "m, standard deviation of the range; optional, default: the parameter",
     "azimuth_sigma": "degrees, of the azimuth; default: the parameter bearing_sigma",
+    "odometry_x": "m, moved east since the row before, by a second sensor such as wheels and a compass; optional",
+    "odometry_y": "m, moved north, likewise",
+    "odometry_speed": "m/s, in place of both: the speed by that sensor",
+    "odometry_heading": "degrees clockwise from north, likewise",
 }
 FINER = 10.0
 """Times that a stated deviation exceeds the resolution of positions where noise does not repeat one by chance."""
-PAIRS = (("x", "y"), ("range", "azimuth"), ("sigma_x", "sigma_y"), ("range_sigma", "azimuth_sigma"))
+PAIRS = (
+    ("x", "y"),
+    ("range", "azimuth"),
+    ("sigma_x", "sigma_y"),
+    ("range_sigma", "azimuth_sigma"),
+    ("odometry_x", "odometry_y"),
+    ("odometry_speed", "odometry_heading"),
+)
 FARTHEST_RANGE = 500e3
 """m; what lies beyond this is taken for a mistake of units."""
 LARGEST_GAP = 1000
@@ -85,6 +96,7 @@ def read_log(columns: Columns) -> TrackLog:
         "variance": numpy.where(seen[:, None], variance[rows], nominal),
         "available": seen.astype(float),
         **_clocks(numpy.append(columns.time[first], time), seen),
+        **_odometry(columns, rows),
     }
     return TrackLog(
         said,
@@ -289,6 +301,44 @@ def _clocks(time: numpy.ndarray, seen: numpy.ndarray) -> dict[str, numpy.ndarray
 
     last = pandas.Series(numpy.where([True, *seen], time, numpy.nan)).ffill().to_numpy()[:-1]
     return {"interval": numpy.diff(time), "elapsed": time[1:] - last}
+
+
+def _odometry(columns: Columns, rows: numpy.ndarray) -> dict[str, numpy.ndarray]:
+    """What a second sensor says of the motion between scans; nothing where there is none.
+
+    Args:
+        columns: of one track.
+        rows: of the scans, ``(T,)``, -1 for a scan that has no row: what was moved until the next row is divided
+            evenly.
+    """
+    moved = _displacements(columns)
+    if moved is None:
+        return {}
+    import pandas
+
+    ends = pandas.Series(numpy.where(rows >= 0, rows, numpy.nan)).bfill().to_numpy().astype(int)
+    there = numpy.isfinite(moved).all(axis=1)
+    if not there[ends].any():
+        raise ValueError("the columns of the odometry are empty: fill them, or leave them out")
+    shares = numpy.where(there[:, None], moved, 0.0)[ends] / numpy.bincount(ends)[ends][:, None]
+    return {"odometry_displacement": shares, "odometry_available": there[ends].astype(float)}
+
+
+def _displacements(columns: Columns) -> numpy.ndarray | None:
+    """Displacement since the row before by the second sensor, ``(rows, 2)``, m; NaN where it says nothing."""
+    if columns.has("odometry_x", "odometry_speed"):
+        raise ValueError("it has odometry_x and odometry_speed: leave one of them out")
+    if columns.has("odometry_x"):
+        return numpy.stack([columns["odometry_x"], columns["odometry_y"]], axis=1)
+    if not columns.has("odometry_speed"):
+        return None
+    heading = numpy.radians(columns["odometry_heading"])
+    velocity = columns["odometry_speed"][:, None] * numpy.stack(
+        [numpy.sin(heading), numpy.cos(heading)], axis=1
+    )
+    moved = numpy.full_like(velocity, numpy.nan)
+    moved[1:] = 0.5 * numpy.diff(columns.time)[:, None] * (velocity[:-1] + velocity[1:])
+    return moved
 
 
 def scale_noise(measurement: Any, factor: Any) -> Any:

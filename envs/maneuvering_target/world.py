@@ -30,6 +30,15 @@ class Truth(NamedTuple):
     """None where every scan comes on time and sees the target."""
 
 
+class Odometry(NamedTuple):
+    """What a second sensor says of the motion since the scan before: wheels and a compass, a camera, an INS."""
+
+    displacement: Array
+    """x and y, m, ``(2, N)``; zero where it says nothing."""
+    available: Array
+    """1 if it says something, 0 if not, ``(N,)``."""
+
+
 class Measurement(NamedTuple):
     """What the radar says in a scan."""
 
@@ -47,6 +56,9 @@ class Measurement(NamedTuple):
     elapsed: Array
     """s since the last scan that saw the target, or the start of the track, ``(N,)``: the interval, unless that before
     missed it."""
+    odometry: Odometry | None = None
+    """What a second sensor says of the motion; None except in recordings that have one. No bank reads it, and no agent
+    is shown it."""
 
 
 class RadarWorld(World[Task, Truth, Measurement]):
@@ -123,6 +135,11 @@ class RadarWorld(World[Task, Truth, Measurement]):
     def state(self, truth: Truth) -> Array:
         """Position and velocity, ``(4, N)``."""
         return self.xp.concat([truth.position, truth.velocity])
+
+    def add_recorded_fields(self, measurement: Measurement) -> Measurement:
+        """Add the odometry, which is not simulated."""
+        nothing = 0.0 * measurement.position
+        return measurement._replace(odometry=Odometry(nothing, nothing[0]))
 
     def component_readings(self, measurement: Measurement) -> Array:
         """The measured position; nothing of the velocity."""

@@ -10,31 +10,36 @@ from ..baselines.advice import advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import check_names, make_task, nearest, read_recording, short_name
+from ..envs.recording import Recording
 from ..evaluation.files import writable_file, write_text
 from ..names import find_competitor
 from ..reports.advice import advice_lines, advice_table, further_sentences, parameter_lines
 from ..reports.results import settings_of
 from .evaluation import causal_names, departure_lines
 from .shown import advice_maker
-from .terminal import command_line, console, pair, parse_settings, progress_bar
+from .terminal import (
+    TruthOffset,
+    TruthOption,
+    command_line,
+    console,
+    pair,
+    parse_settings,
+    progress_bar,
+)
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
 
 
-def fit_to_recording(
-    problem: Problem, name: str, recording: str, speeds: tuple[float, float], folder: Path, seed: int
-) -> None:
+def fit_to_recording(problem: Problem, name: str, found: Recording, folder: Path, seed: int) -> None:
     """Fit one filter to all of a recording, say its parameters, and write them.
 
     Args:
         problem: of the recording.
         name: of what can be fitted, or ``module:Class``.
-        recording: files of it.
-        speeds: that are possible, m/s.
+        found: the recording.
         folder: for the file.
         seed: of the starts of the fit.
     """
-    found = read_recording(recording, problem.id, speeds=speeds)
     families = families_of(problem, found)
     if ":" not in name and name not in families:
         raise nearest("filter that can be fitted to a recording", name, families)
@@ -79,6 +84,8 @@ def advise_on_log(
             help="HTML file for a page of it: sentences, tables, the track, innovations and NIS over time."
         ),
     ] = None,
+    truth: TruthOption = None,
+    truth_offset: TruthOffset = 0.0,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -106,7 +113,14 @@ def advise_on_log(
     make_page = None if report is None else advice_maker()  # what it lacks is said before anything else
     if report is not None:
         writable_file(report)
-    found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
+    found = read_recording(
+        recording,
+        environment,
+        speeds=pair("--speeds", speeds),
+        truth=truth,
+        truth_offset=truth_offset,
+        **keywords,
+    )
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
     shipped = {name: find_competitor(problem, name) for name in causal_names(problem, found)}

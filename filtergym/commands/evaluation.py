@@ -53,14 +53,17 @@ MOST_RECORDINGS = 40
 """Of which a table tells one by one."""
 
 
-class FlightOptions(NamedTuple):
-    """How flights are read from files, as options of a command."""
+class FileOptions(NamedTuple):
+    """How flights and recordings are read from files, as options of a command."""
 
     site: str | None
     longest_gap: float
     speeds: str
     smoothing: float
     fewest_scans: int
+    truth: Path | None = None
+    """Of a recording, in a file of its own."""
+    truth_offset: float = 0.0
 
 
 class Outputs(NamedTuple):
@@ -94,7 +97,7 @@ def find_data(
     environment: str | None,
     scenario: str | None,
     recording: str | None,
-    options: FlightOptions,
+    options: FileOptions,
     keywords: Mapping[str, Any],
 ) -> tuple[Problem, Any]:
     """Return the problem, and the scenario: its name, flights, or a recording.
@@ -108,10 +111,19 @@ def find_data(
     named = problem.task.scenarios if problem else {}
     if recording is not None or (scenario is not None and scenario not in named and is_recording(scenario)):
         speeds = pair("--speeds", options.speeds)
-        found = read_recording(recording or str(scenario), environment, speeds=speeds, **keywords)
+        found = read_recording(
+            recording or str(scenario),
+            environment,
+            speeds=speeds,
+            truth=options.truth,
+            truth_offset=options.truth_offset,
+            **keywords,
+        )
         if options.site is not None:
             raise _no_flights(recording or scenario)
         return problem_of(found.environment), found
+    if options.truth is not None:
+        raise ValueError("--truth is for a recording: --recording FILE --truth FILE")
     if problem is None:
         raise ValueError("name an environment, or a recording, which names its own: --recording FILE")
     if scenario in named or not names_flights(scenario):

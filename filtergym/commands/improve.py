@@ -12,7 +12,7 @@ from ..agents.training_run import RunOptions, Session
 from ..baselines.problem import problem_of
 from ..baselines.tuned_values import FOLDER, read_table, save_tuned, table_path
 from ..baselines.tuning import Search, tune
-from ..envs.catalogue import nearest
+from ..envs.catalogue import nearest, read_recording
 from ..evaluation.files import writable_file
 from ..evaluation.parallel import Workers
 from ..evaluation.store import UNFINISHED, Store
@@ -26,6 +26,8 @@ from .terminal import (
     TrainedControl,
     TrainingScenario,
     Trust,
+    TruthOffset,
+    TruthOption,
     complete_policy,
     console,
     pair,
@@ -49,6 +51,8 @@ def tune_policy(
         str | None,
         typer.Option(help="What sensors really said, NetCDF or tables (CSV): fit an estimator to it."),
     ] = None,
+    truth: TruthOption = None,
+    truth_offset: TruthOffset = 0.0,
     speeds: Annotated[
         str,
         typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
@@ -63,7 +67,10 @@ def tune_policy(
     """
     problem = problem_of(environment)
     if recording is not None:
-        fit_to_recording(problem, policy, recording, pair("--speeds", speeds), out, seed)
+        found = read_recording(
+            recording, problem.id, speeds=pair("--speeds", speeds), truth=truth, truth_offset=truth_offset
+        )
+        fit_to_recording(problem, policy, found, out, seed)
         return
     tunable = problem.baselines.tunable
     if policy not in tunable:

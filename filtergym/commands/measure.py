@@ -25,7 +25,7 @@ from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
 from .evaluation import (
-    FlightOptions,
+    FileOptions,
     Outputs,
     find_data,
     find_names,
@@ -50,6 +50,8 @@ from .terminal import (
     Split,
     Threads,
     Trust,
+    TruthOffset,
+    TruthOption,
     command_line,
     complete_environment,
     complete_policy,
@@ -126,6 +128,8 @@ def evaluate_policies(
             ".nmea): a file, a folder, or a pattern in quotes."
         ),
     ] = None,
+    truth: TruthOption = None,
+    truth_offset: TruthOffset = 0.0,
     estimates: Annotated[
         Path | None,
         typer.Option(help="File (CSV or NetCDF) for every estimate with its sigma, NIS and log-likelihood."),
@@ -171,7 +175,7 @@ def evaluate_policies(
     """
     keywords = parse_settings(settings or [])
     outputs = Outputs(out, netcdf, format or ["png"], columns, json, estimates)
-    options = FlightOptions(site, longest_gap, speeds, smoothing, fewest_scans)
+    options = FileOptions(site, longest_gap, speeds, smoothing, fewest_scans, truth, truth_offset)
     outputs.check()
     problem, data = find_data(environment, scenario, recording, options, keywords)
     names = find_names(problem, data, policy)

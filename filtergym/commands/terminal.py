@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -121,6 +122,15 @@ TrainedControl = Annotated[
 Parameters = Annotated[
     list[str] | None, typer.Option("--set", help="Parameter of the task, name=value; repeat for several.")
 ]
+TruthOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--truth",
+        help="Of a recording in tables: the truth in a file of its own (CSV, .pos), matched by time; a note says how "
+        "much of it has one.",
+    ),
+]
+TruthOffset = Annotated[float, typer.Option(help="Added to the times of --truth, s.")]
 Backend = Annotated[
     str,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from rich.table import Table
 
-from ..baselines.advice import Advice, Competitor
+from ..baselines.advice import APART, Advice, Competitor
 from ..baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, STARTS, Fit, Interval
 from ..baselines.table import Tunable
 from ..evaluation.bootstrap import Estimate
@@ -131,7 +131,9 @@ def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
     yield from _hindsight(advice)
     yield from _fits(advice)
-    yield from _noise(advice)
+    if not advice.tunables[advice.fitted.name].anchored:
+        yield from _noise(advice)
+    yield from _anchor(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
 
@@ -171,6 +173,8 @@ def verdict(advice: Advice) -> str:
                 text += " That is beyond chance: a longer log may turn the choice."
         return text
     name = f"Take {one.name}, with the parameters below"
+    if math.isnan(one.relative_error.value) and advice.anchor is not None and one.name == advice.anchor.name:
+        return f"{name}, by the second sensor: there is no truth to say how much it gains."
     if math.isnan(one.relative_error.value):
         return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
     text = (
@@ -306,6 +310,26 @@ def _noise(advice: Advice) -> Iterator[str]:
             "NIS and likelihood say nothing of errors that last longer than the motion: those are invisible without a "
             "second sensor."
         )
+
+
+def _anchor(advice: Advice) -> Iterator[str]:
+    """Why a filter with a second sensor is advised or not, and what its likelihood says."""
+    anchor = advice.anchor
+    if anchor is None:
+        return
+    if anchor.name != advice.fitted.name:
+        yield (
+            f"The second sensor does not help here: by {anchor.name} measurements {APART:g} s apart are less likely by "
+            f"{-anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such."
+        )
+        return
+    yield (
+        f"The second sensor tells errors that last from motion: measurements {APART:g} s apart are likelier by "
+        f"{anchor.gain:.2f} nats each than by {anchor.other}, both fitted to such. From one measurement to the next "
+        "filters without it may predict better, because they follow these errors: there likelihoods of both kinds do "
+        "not compare, nor does NIS, and deviations are taken as they are stated."
+    )
+    yield "An error that never changes, or lasts longer than this recording, remains invisible."
 
 
 def _warnings(advice: Advice) -> Iterator[str]:

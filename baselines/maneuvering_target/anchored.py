@@ -1,0 +1,115 @@
+"""A filter of positions with slow errors that a second sensor anchors, and where its fit begins."""
+
+import math
+from typing import Any
+
+import numpy
+
+from ...envs.filter import Initial
+from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.maneuvering_target.world import Measurement
+from ...envs.observation import Array
+from ...envs.recording import Recording
+from ...evaluation.competitors import Likelihood
+from ...filters import dead_reckoning
+from .estimators import DEGREE, KalmanModel
+
+STEP = 10.0
+"""s, over which displacements by both sensors are compared: less says more of noise."""
+FIXED_POINTS = 30
+"""Iterations of the regression, far more than it takes."""
+
+
+class DeadReckoning(KalmanModel):
+    """Kalman filter of position, velocity and a Gauss-Markov error of the measured positions, moved by odometry.
+
+    Equations: ``filters/dead_reckoning.py``. It runs on recordings with a second sensor alone.
+
+    Args:
+        task: the problem.
+        error_deviation: of the slow error of the measured positions, m.
+        correlation_time: of that error, s.
+        drift: of dead reckoning, m over the root of a metre of way.
+        scale: of its displacements.
+        heading_offset: by which these are turned clockwise, degrees.
+    """
+
+    kind = "estimator"
+    acceleration = 1.0
+    """m/s^2, where the odometry says nothing; ours, of what has wheels or legs."""
+
+    def __init__(
+        self,
+        task: ManeuveringTarget,
+        error_deviation: float = 5.0,
+        correlation_time: float = 60.0,
+        drift: float = 0.3,
+        scale: float = 1.0,
+        heading_offset: float = 0.0,
+    ) -> None:
+        super().__init__(task)
+        self.deviation, self.correlation_time, self.drift = error_deviation, correlation_time, drift
+        self.scale, self.heading_offset = scale, DEGREE * heading_offset
+        self.H = task.constant([[float(j in (i, i + 4)) for j in range(6)] for i in range(2)])
+
+    def start(self, initial: Initial, N: int) -> Initial:
+        """Start where everyone starts, off by an unknown error."""
+        return Initial(*dead_reckoning.start(initial.mean, initial.covariance, self.deviation))
+
+    def update(self, measurement: Measurement, memory: Initial) -> tuple[Array, Array, Initial, Likelihood]:
+        """Move by the odometry and update with the measured position."""
+        odometry = measurement.odometry
+        if odometry is None:
+            raise ValueError(
+                "dead reckoning needs a second sensor: a recording with the columns odometry_x and odometry_y, or "
+                "odometry_speed and odometry_heading"
+            )
+        predicted = dead_reckoning.predict_position(
+            *memory,
+            dead_reckoning.calibrate(odometry.displacement, self.scale, self.heading_offset),
+            odometry.available,
+            measurement.interval,
+            drift=self.drift,
+            acceleration=self.acceleration,
+            correlation_time=self.correlation_time,
+            deviation=self.deviation,
+        )
+        result = self.update_estimate(predicted, measurement)
+        return (
+            result.mean[:4],
+            result.covariance[:4, :4],
+            Initial(result.mean, result.covariance),
+            self.likelihood(measurement, *result[2:]),
+        )
+
+
+def regress_odometry(recording: Recording) -> tuple[float, float]:
+    """Scale and heading offset (degrees) of the odometry, from displacements of the measured positions over ``STEP``.
+
+    Iteratively reweighted least squares: a displacement off by e counts as ``|e|^-1.5``, so that excursions of the
+    fixes hardly do. Where the target does not move, 1 and 0.
+
+    Args:
+        recording: with a second sensor.
+    """
+    said, found, moved = recording.measurements, [], []
+    for episode, rows in enumerate(recording.rows.tolist()):
+        time, seen = recording.seconds[episode, :rows], said["available"][episode, :rows] > 0.0
+        position = said["position"][episode, :rows] @ numpy.array([1.0, 1.0j])
+        reckoned = numpy.cumsum(said["odometry_displacement"][episode, :rows] @ numpy.array([1.0, 1.0j]))
+        ends = numpy.searchsorted(time, time + STEP)
+        both = numpy.flatnonzero(ends < rows)
+        both = both[seen[both] & seen[ends[both]]]
+        found.append(position[ends[both]] - position[both])
+        moved.append(reckoned[ends[both]] - reckoned[both])
+    fixes, ways = numpy.concatenate(found), numpy.concatenate(moved)
+    there = numpy.abs(ways) > 0.1 * numpy.abs(ways).max(initial=0.0)
+    fixes, ways = fixes[there], ways[there]
+    if not len(ways):
+        return 1.0, 0.0
+    ratio: Any = 1.0
+    floor = 1e-3 * float(numpy.median(numpy.abs(ways)))
+    for _ in range(FIXED_POINTS):
+        weight = numpy.maximum(numpy.abs(fixes - ratio * ways), floor) ** -1.5
+        ratio = (weight * numpy.conj(ways) * fixes).sum() / (weight * numpy.abs(ways) ** 2).sum()
+    return float(abs(ratio)), -math.degrees(float(numpy.angle(ratio)))
