@@ -281,7 +281,11 @@ def test_it_is_said_what_its_likelihood_is_of(advice):
 def test_a_second_sensor_that_does_not_help_is_said_so(advice):
     """As where its displacements are of something else."""
     fitted = next(c for c in advice.competitors if c.name == "constant-velocity")
-    worse = advice._replace(fitted=fitted, anchor=advice.anchor._replace(gain=-0.5))
+    worse = advice._replace(
+        fitted=fitted,
+        anchor=advice.anchor._replace(gain=-0.5),
+        profiles={fitted.name: {}},
+    )
     text = "\n".join(advice_lines(worse, []))
     assert (
         "The second sensor does not help here: by dead-reckoning measurements 10 s apart are less likely by"

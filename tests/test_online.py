@@ -84,7 +84,9 @@ def test_the_same_measurements_give_the_same_bits(id, name, options, monkeypatch
 
 
 def map_leaves(function, part):
-    return type(part)(*(map_leaves(function, p) if isinstance(p, tuple) else function(p) for p in part))
+    if part is None:  # what only recordings hold
+        return None
+    return type(part)(*(map_leaves(function, p) for p in part)) if isinstance(part, tuple) else function(part)
 
 
 def first_tracks(part):
