@@ -1,0 +1,1 @@
+"""Filters that leave the package: as C, as Python, their networks in other forms."""
