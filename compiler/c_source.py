@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy
 
+from .interpretation import first_steps
 from .parts import FREE, cut_parts, scratch_slots
 from .program import Program
 
@@ -256,6 +257,8 @@ def write_program(
     write: Callable[[int, int], str],
     scalar: Scalar = DOUBLE,
     qualifier: str = "static ",
+    between: Sequence[str] = (),
+    results: int = 0,
 ) -> Source:
     """Write a program as statements.
 
@@ -269,6 +272,8 @@ def write_program(
         write: from argument and row to where a result goes; ``""``: nowhere.
         scalar: kind of numbers.
         qualifier: of static functions.
+        between: statements that stand where the first results are known, before any other input is read.
+        results: how many these are.
     """
     starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
@@ -277,28 +282,35 @@ def write_program(
     for argument, row, step in program.results:
         if place := write(argument, row):
             stores.setdefault(step, []).append(place)
-    parts = cut_parts(program, PART)
-    slots = scratch_slots(program, parts) if len(parts) > 1 else {}
-    blocks = [_statements(text, steps, set(steps), stores, slots) for steps in parts]
+    pause = first_steps(program, results) if between else 0
+    parts, before = cut_parts(program, PART, pause)
+    count_operations = sum(step.operation not in FREE for step in program.steps)
+    together = count_operations <= PART
+    slots = {} if together else scratch_slots(program, parts)
+    own = [set(range(len(program.steps))) if together else set(steps) for steps in parts]
+    blocks = [_statements(text, steps, *given, stores, slots) for steps, *given in zip(parts, own, strict=True)]
     defined = [
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
     ]
-    body, count = blocks[0], max(slots.values(), default=-1) + 1
-    if len(blocks) > 1:
+    count = max(slots.values(), default=-1) + 1
+    lines = blocks
+    if not together:
         listed = [*parameters, Parameter(f"{scalar.name} *", "w")]
         defined += [_function(f"{name}_part_{i}", listed, block, qualifier) for i, block in enumerate(blocks)]
         names = ", ".join(parameter.name for parameter in listed)
-        body = [f"{scalar.name} w[{max(count, 1)}];"]
-        body += [f"{name}_part_{i}({names});" for i in range(len(blocks))]
+        lines = [[f"{name}_part_{i}({names});"] for i in range(len(blocks))]
+    body = [line for block in lines[:before] for line in block]
+    body += [*between, *(line for block in lines[before:] for line in block)]
+    if not together:
+        body.insert(0, f"{scalar.name} w[{max(count, 1)}];")
     constants = [
         float(program.constants[step.arguments[0]])
         for step in program.steps
         if step.operation == "constant" and not step.logical
     ]
     replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
-    operations = sum(step.operation not in FREE for step in program.steps)
-    return Source("\n".join(defined), body, operations, count, replaced)
+    return Source("\n".join(defined), body, count_operations, count, replaced)
 
 
 def _statements(

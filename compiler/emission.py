@@ -222,7 +222,7 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
     Raises:
         KeyError: for a function that the library lacks.
     """
-    parts = cut_parts(program, PART)
+    parts, _ = cut_parts(program, PART)
     slots = scratch_slots(program, parts)
     results: dict[int, list[tuple[int, int]]] = {}
     for argument, row, step in program.results:

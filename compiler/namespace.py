@@ -60,7 +60,6 @@ class Traced:
     """
 
     __slots__ = ("dtype", "nodes")
-    __array_priority__ = 1  # NumPy leaves mixed arithmetic to the methods below
     device = None
     __bool__ = __float__ = __int__ = __index__ = __complex__ = _refuse
 
@@ -71,15 +70,15 @@ class Traced:
     def __array__(self, *_: Any, **__: Any) -> Any:
         raise NotTraceable("an array is handed to a function of NumPy: call that of its namespace")
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *arrays: Any, **options: Any) -> Any:
-        """Compute what a function of NumPy computes of every entry."""
-        if method != "__call__" or options:
-            raise NotTraceable(f"numpy.{ufunc.__name__} with method or options cannot be traced")
-        return _of_numpy(ufunc)(*arrays)
+    def __array_ufunc__(self, function: Any, method: str, *arguments: Any, **keywords: Any) -> "Traced":
+        from .numpy_functions import call_ufunc
 
-    def __array_function__(self, function: Any, types: Any, arguments: Any, keywords: Any) -> Any:
-        """Compute what any other function of NumPy does."""
-        return _of_numpy(function)(*arguments, **keywords)
+        return call_ufunc(function, method, arguments, keywords)
+
+    def __array_function__(self, function: Any, types: Any, arguments: Any, keywords: Any) -> "Traced":
+        from .numpy_functions import call_function
+
+        return call_function(function, arguments, keywords)
 
     def __array_namespace__(self, api_version: str | None = None) -> ModuleType:
         return importlib.import_module(__name__)
@@ -148,24 +147,26 @@ class Traced:
         return max(self, axis=axis)
 
     def any(self, axis: int | None = None) -> "Traced":
-        """Whether an entry along an axis, or any, is true."""
+        """Whether an entry along an axis is true."""
         return any(self, axis=axis)
 
     def all(self, axis: int | None = None) -> "Traced":
-        """Whether all entries along an axis, or all of them, are true."""
+        """Whether all entries along an axis are true."""
         return all(self, axis=axis)
 
-    def argmax(self, axis: int | None = None) -> "Traced":
-        """Place of the largest entry along an axis, or of all."""
-        return argmax(self, axis=axis)
+    def mean(self, axis: int | None = None) -> "Traced":
+        """Mean along an axis, or of all."""
+        from .numpy_functions import mean
 
-    def astype(self, dtype: Any, copy: Any = True) -> "Traced":
-        """Return the same entries as another type."""
-        return astype(self, dtype)
+        return mean(self, axis)
 
     def reshape(self, *shape: Any) -> "Traced":
         """Return the same entries in another shape."""
         return Traced(self.nodes.reshape(*shape), self.dtype)
+
+    def astype(self, dtype: Any) -> "Traced":
+        """Return the entries as another type."""
+        return astype(self, dtype)
 
     def copy(self) -> "Traced":
         """Return the array itself, as nothing changes it."""
@@ -448,17 +449,6 @@ sum, prod, max, min = (_reduction(o, of_numbers=True) for o in (add, multiply, m
 any, all = _reduction(logical_or), _reduction(logical_and)
 
 
-def argmax(x: Any, /, *, axis: int | None = None, keepdims: Any = False) -> Traced:
-    """Place of the largest entry along an axis, of equal ones the first."""
-    x = _numbers(asarray(x))
-    first, *rest = moveaxis(x, axis, 0) if axis is not None else reshape(x, -1)
-    place = zeros_like(first, dtype=int64)
-    for i, entry in enumerate(rest, 1):
-        larger = greater(entry, first)
-        first, place = where(larger, entry, first), where(larger, i, place)
-    return place if not keepdims else expand_dims(place, axis=axis)
-
-
 def sort(x: Any, /, *, axis: int = -1) -> Traced:
     """Sort by comparing neighbours."""
     rows = list(moveaxis(x, axis, 0))
@@ -479,49 +469,3 @@ def matmul(a: Any, b: Any, /) -> Traced:
     )
     product = product[..., 0, :] if a.ndim == 1 else product
     return product[..., 0] if b.ndim == 1 else product
-
-
-def _transpose(x: Any, axes: Any = None) -> Traced:
-    return Traced(numpy.transpose(asarray(x).nodes, axes), x.dtype)
-
-
-def _split(x: Any, parts: Any, axis: int = 0) -> list[Traced]:
-    return [Traced(nodes, x.dtype) for nodes in numpy.split(asarray(x).nodes, parts, axis=axis)]
-
-
-_OTHER_NAMES = {"true_divide": "divide", "mod": "remainder", "absolute": "abs", "rint": "round", "amin": "min"}
-_OTHER_NAMES |= {"amax": "max", "around": "round", "concatenate": "concat", "fabs": "abs", "power": "pow"}
-_OTHER_NAMES |= {"bitwise_and": "logical_and", "bitwise_or": "logical_or", "invert": "logical_not"}
-_OTHER_NAMES |= {f"arc{name}": f"a{name}" for name in ("sin", "cos", "tan", "tan2", "sinh", "cosh", "tanh")}
-_OTHER_NAMES |= {"nan_to_num": "_nan_to_num"}
-
-
-def _nan_to_num(x: Any) -> Traced:
-    x = asarray(x)
-    if x.dtype.kind != "f":
-        return x
-    largest = float(numpy.finfo(float64).max)
-    return clip(where(isnan(x), 0.0, x), -largest, largest)
-
-
-def _copy(x: Any, order: str = "K", subok: Any = False) -> Traced:
-    return asarray(x)
-
-
-_FUNCTIONS: dict[Any, Callable[..., Any]] = {numpy.transpose: _transpose, numpy.split: _split, numpy.copy: _copy}
-
-
-def _of_numpy(function: Any) -> Callable[..., Any]:
-    """Return what computes on traced arrays what a function of NumPy computes on its own.
-
-    Raises:
-        NotTraceable: if nothing does.
-    """
-    if function in _FUNCTIONS:
-        return _FUNCTIONS[function]
-    name = _OTHER_NAMES.get(function.__name__, function.__name__)
-    found = globals().get(name)
-    known = callable(found) and not isinstance(found, type) and getattr(numpy, function.__name__, None) is function
-    if not known:
-        raise NotTraceable(f"numpy.{function.__name__} cannot be traced: call a function of the array's namespace")
-    return found  # type: ignore[no-any-return]

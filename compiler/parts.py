@@ -11,16 +11,24 @@ FREE = ("input", "constant")
 """Steps that every part makes again instead of fetching them from the scratch array."""
 
 
-def cut_parts(program: Program, size: int) -> list[list[int]]:
+def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[int]], int]:
     """Steps of each part; those that are free stand only where they are results themselves.
 
     Args:
         program: to cut.
         size: steps of a part.
+        pause: a step with which a part begins.
+
+    Returns:
+        Parts, at least one, and how many of them are before the pause.
     """
     results = {result.node for result in program.results}
     listed = [i for i, step in enumerate(program.steps) if step.operation not in FREE or i in results]
-    return [listed[i : i + size] for i in range(0, len(listed), size)] or [[]]
+    first, second = (
+        [half[i : i + size] for i in range(0, len(half), size)]
+        for half in ([i for i in listed if i < pause], [i for i in listed if i >= pause])
+    )
+    return [*first, *second] or [[]], len(first)
 
 
 def scratch_slots(program: Program, parts: list[list[int]]) -> dict[int, int]:

@@ -134,10 +134,10 @@ class Policy:
         """
         single = observation.ndim == 1
         batch = observation[None] if single else observation
-        start = numpy.zeros(len(batch), dtype=bool) if episode_start is None else numpy.asarray(episode_start)
+        start = numpy.full(len(batch), state is None) if episode_start is None else episode_start
         if state is None:
             start = numpy.ones(len(batch), dtype=bool)
-        action, state = self.act(batch, state, start.reshape(-1))
+        action, state = self.act(batch, state, numpy.reshape(start, -1))
         return (action[0] if single else action), state
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:

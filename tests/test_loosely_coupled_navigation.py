@@ -5,6 +5,7 @@ from collections import deque
 
 import numpy as np
 import pytest
+from filtergym.baselines.loosely_coupled_navigation.policies import FixedGain
 from filtergym.envs.draws import Draws
 from filtergym.envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
 from filtergym.envs.loosely_coupled_navigation.task import TASK
@@ -334,7 +335,7 @@ def test_actions_and_gains_are_inverse():
     # The least action above -1 sets about the smallest gain.
     assert bank.gain(np.array(-1 + 1e-12)) == pytest.approx(1e-5)
     with pytest.raises(ValueError, match=r"gain must lie in \[0, 1\]"):
-        bank.action_for_gain(1.5)
+        FixedGain(model, 1.5)
     settled = loosely_coupled.steady_state_gain(0.0036, 2.0)
     assert bank.gain(np.array(TASK.paper_policy.action[0])) == pytest.approx(settled, rel=1e-12)
     # Where the paper's gain lies at the edge of the range, zero keeps room on both sides.

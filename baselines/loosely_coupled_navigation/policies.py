@@ -36,12 +36,18 @@ def gain_bank(model: Model) -> GainBank:
 
 
 class FixedGain(ConstantPolicy):
-    """The plain scheme (3) with one gain for every sample."""
+    """The plain scheme (3) with one gain for every sample.
+
+    Raises:
+        ValueError: for a gain outside [0, 1].
+    """
 
     control = "gain"
 
     def __init__(self, model: Model, gain: float) -> None:
         super().__init__(model)
+        if not 0.0 <= gain <= 1.0:
+            raise ValueError(f"gain must lie in [0, 1], got {gain!r}")
         self.action = (float(gain_bank(model).action_for_gain(gain)),) * self.task.parameters.axes
 
 

@@ -143,9 +143,12 @@ class StuckCheck(NisAdaptive):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Look whether any reading of the last decision has repeated the one before it."""
         action, _ = super().act(observation, None, start)
-        stuck = self.repeat(observation)[:, 0] > 0.0
-        action[:, self.switch] = numpy.where(stuck, 1.0, action[:, self.switch])
-        return action, None
+        stuck = self.repeat(observation) > 0.0
+        return numpy.where(stuck & self._switched(action), 1.0, action), None
+
+    def _switched(self, action: numpy.ndarray) -> numpy.ndarray:
+        """Which component of the action is that of the accelerometers, ``(A,)``."""
+        return numpy.arange(action.shape[1]) == self.switch
 
 
 class StuckCheckFallback(StuckCheck):
@@ -158,8 +161,7 @@ class StuckCheckFallback(StuckCheck):
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Keep what is said of the accelerometers."""
         action, _ = super().act(observation, state, start)
-        only = numpy.arange(action.shape[1]) == self.switch
-        return action * only, None
+        return action * self._switched(action), None
 
 
 # --- what can be tuned

@@ -79,7 +79,7 @@ class InnovationAdaptive(Policy):
         mean = numpy.where(start[:, None], 1.0, 1.0 if state is None else state)
         mean = mean + self.forget * self.available(observation) * (squared - mean)
         # One column after the other in memory: the last bit of the product depends on it.
-        decades = numpy.asfortranarray(numpy.log10(numpy.maximum(mean, 1e-12))) @ self.weights
+        decades = numpy.copy(numpy.log10(numpy.maximum(mean, 1e-12)), order="F") @ self.weights
         wanted = self.unit * (self.offset + decades)
         action = self.memory * self.last_action(observation)[:, 0] + (1.0 - self.memory) * wanted
         return numpy.clip(action, -1.0, 1.0)[:, None], mean

@@ -384,14 +384,9 @@ class GainBank(_KalmanBucyBank):
         return self.xp.where(action <= -1.0, 0.0, self.xp.exp(middle + beyond))
 
     def action_for_gain(self, gain: Any) -> Any:
-        """Action that sets gains, NumPy: the inverse of :meth:`gain`; the smallest one and less count as zero.
-
-        Raises:
-            ValueError: a gain outside [0, 1].
+        """Action that sets gains from 0 to 1, NumPy: the inverse of :meth:`gain`; the smallest one and less count as
+        zero.
         """
-        gain = numpy.asarray(gain)
-        if not ((gain >= 0.0) & (gain <= 1.0)).all():
-            raise ValueError(f"gain must lie in [0, 1], got {gain!r}")
         smallest, middle = self.parameters.smallest_gain, self.middle
         beyond = numpy.log(numpy.maximum(gain, smallest)) - middle
         action = beyond / numpy.where(beyond > 0.0, -middle, middle - math.log(smallest))

@@ -25,7 +25,8 @@ from ..compiler.program import Graph, Program, Result, program
 from ..envs.filter import Input
 from ..envs.model import Model
 from ..envs.task import Task
-from ..evaluation.competitors import RANKED, Likelihood, Policy, kind_of, make_competitor
+from ..evaluation.competitors import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
+from ..evaluation.steered_filter import Steered, SteeredFilter, steer
 
 STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
 """Arguments of the programs."""
@@ -101,89 +102,27 @@ class EstimatorSteps:
         return memory, {"mean": mean, "covariance": covariance, **known}
 
 
-class SteeredState(NamedTuple):
-    """State of a bank that a policy steers."""
-
-    bank: Any
-    memory: Any
-    """Of the policy."""
-    started: Any
-    """One after the first measurement, ``(1,)``."""
-    taken: Any
-    """Measurements since the last decision, ``(1,)``."""
-    sums: Any
-    """Of the fields that are shown as means, since the last decision, ``(fields, 1)``."""
-    action: Any
-    """That holds, ``(..., 1)``."""
-
-
 class SteeredSteps:
-    """A bank that a policy steers, decision by decision.
+    """A bank closed by a policy.
 
     Args:
-        model: with the bank, on traced arrays.
-        policy: made for the same model on NumPy's.
-        every: whether it decides at every measurement, whatever the task's decision interval.
+        steered: on traced arrays.
     """
 
-    def __init__(self, model: Model, policy: Policy, every: bool = False) -> None:
-        self.model, self.policy = model, policy
-        self.interval = 1 if every else model.task.decision_interval
-        averaged = [i for i, field in enumerate(model.fields) if field.over_interval == "mean"]
-        self.averaged = averaged if self.interval > 1 else []
+    def __init__(self, steered: SteeredFilter) -> None:
+        self.steered = steered
 
-    def start(self, initial: Any) -> SteeredState:
-        """Bank at the start of the track; the policy's memory is that of a first answer, and begins anew."""
-        bank = self.model.filter.start(initial)
-        zero = namespace.zeros((1,))
-        return SteeredState(bank, None, zero, zero, namespace.zeros((len(self.averaged), 1)), None)
+    def start(self, initial: Any) -> Steered:
+        """The bank at the start of the track."""
+        return self.steered.start(initial)
 
-    def update(self, state: SteeredState, measurement: Any) -> tuple[SteeredState, dict[str, Any]]:
+    def update(self, state: Steered, measurement: Any) -> tuple[Steered, dict[str, Any]]:
         """Predict, show, ask, update."""
-        bank, received = self.model.filter, clear_missing(self.model.task, measurement)
-        predicted = bank.predict(state.bank, received)
-        shown = self.model._blocks.observe(predicted, received)
-        deciding, shown, sums, taken = self._decision(state, shown)
-        # A policy is asked about a batch of one observation.
-        start = namespace.equal(state.started, 0.0)
-        action, memory = self.policy.predict(shown.T, state.memory, start, deterministic=True)
-        action = namespace.asarray(action)
-        action = action.T if action.ndim == 2 else action
-        if deciding is not None and state.action is not None:
-            action = namespace.where(deciding, action, state.action)
-            memory = select(deciding, memory, state.memory)
-        after = bank.update(predicted, Input(received, None, action))
-        kept = SteeredState(after, memory, namespace.ones((1,)), taken, sums, action if self.interval > 1 else None)
-        told = bank.records(after, received)
+        own, received = self.steered, clear_missing(self.steered.task, measurement)
+        after = own.update(own.predict(state, received), Input(received))
+        told = own.records(after, received)
         known = {name: told[name] for name in LIKELIHOODS if name in told}
-        return kept, {"mean": bank.mean(after), "covariance": bank.covariance(after), **known}
-
-    def _decision(self, state: SteeredState, shown: Any) -> tuple[Any, Any, Any, Any]:
-        """Whether this measurement is decided on, what is shown then, sums and measurements after it."""
-        if self.interval == 1:
-            return None, shown, state.sums, state.taken
-        deciding = namespace.equal(state.taken, 0.0)
-        after = namespace.add(state.taken, 1.0)
-        after = namespace.where(namespace.greater_equal(after, float(self.interval)), 0.0, after)
-        if not self.averaged:
-            return deciding, shown, state.sums, after
-        sums = state.sums + shown[self.averaged]
-        means = namespace.where(state.started > 0.0, sums / self.interval, shown[self.averaged])
-        rows = list(shown)
-        for row, mean in zip(self.averaged, means, strict=True):
-            rows[row] = mean
-        return deciding, namespace.stack(rows), namespace.where(deciding, 0.0, sums), after
-
-    def decides(self, state: SteeredState) -> Any:
-        """Whether a measurement is decided on, as a truth value, ``(1,)``."""
-        return namespace.equal(state.taken, 0.0) if self.interval > 1 else namespace.ones((1,)) > 0.0
-
-
-def select(deciding: Any, one: Any, other: Any) -> Any:
-    """One of two nested tuples of arrays of a batch of one."""
-    pairs = zip(leaves(one), leaves(other), strict=True)
-    chosen = iter([namespace.where(deciding, a, b) for a, b in pairs])
-    return map_arrays(lambda _: next(chosen), one)
+        return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:
@@ -218,7 +157,9 @@ class AskedNetwork(Policy):
         return 1 if self.network.output == "argmax" else len(self.network.layers[-1][1])
 
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
-        """Keep what is shown."""
+        """Keep what is shown; numbers are answered with zeros, whose form alone matters."""
+        if not isinstance(observation, Traced):
+            return numpy.zeros((1,) if self.network.output == "argmax" else (1, self.answers)), ()
         self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
         nodes = [self.graph.input(ANSWER, i) for i in range(self.answers)]
         if self.network.output == "argmax":
@@ -252,19 +193,21 @@ def steps_of(
     if isinstance(maker, EstimatorMaker):
         model = Model(traced, maker.bank)
         policy, network = with_asked_network(maker(plain.task).network, graph)
-        return SteeredSteps(model, policy, every=True), network
+        return SteeredSteps(steer(model, policy, 1)), network
     if kind == "estimator":
         own = make_competitor(maker, traced)
         if not getattr(own, "traceable", False):
             raise NotTraceable("it does not say that it is traceable")
         return EstimatorSteps(traced, own), None
     policy, network = with_asked_network(make_competitor(maker, plain), graph)
+    if isinstance(policy, RandomPolicy):
+        raise NotTraceable("its actions are drawn")
     if not isinstance(policy, Policy):
         raise NotTraceable(
             f"{type(policy).__name__} runs in another library; `filtergym export RUN` writes an agent of a training "
             "run as arrays"
         )
-    return SteeredSteps(Model(traced, control), policy), network
+    return SteeredSteps(steer(Model(traced, control), policy)), network
 
 
 def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
@@ -429,11 +372,6 @@ def _trace(
     rows = count_from()
     z = fill(measurement, [graph.input(MEASUREMENT, next(rows)) for _ in nodes_of(measurement)], graph)
     state = steps.start(begin)
-    if isinstance(state, SteeredState):
-        # The policy's memory has the form of what a first answer leaves; its numbers begin at zero.
-        following, _ = steps.update(state, z)
-        empty = map_arrays(lambda array: namespace.zeros_like(array), (following.memory, following.action))
-        state = state._replace(memory=empty[0], action=empty[1])
     first = nodes_of(state)
     classes = _Classes(graph, first)
     while True:
@@ -446,8 +384,9 @@ def _trace(
             break
     shown = []
     if asked is not None and asked.shown:
-        deciding = nodes_of(steps.decides(before))
-        shown = [*deciding, *asked.shown]
+        steered = steps.steered
+        due = nodes_of(steered.is_due(before)) if steered.interval > 1 else [graph.constant(True)]
+        shown = [*due, *asked.shown]
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])
     place = {member: row for row, member in enumerate(live)}

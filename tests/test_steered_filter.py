@@ -1,0 +1,72 @@
+"""A bank closed by a policy is a filter that computes what the policy answers, asked in Python."""
+
+import numpy as np
+import pytest
+from filtergym.compiler.namespace import NotTraceable
+from filtergym.envs.backend import make_model
+from filtergym.evaluation.competitors import make_competitor
+from filtergym.evaluation.evaluate import control_of
+from filtergym.evaluation.rollout import run_competitor, start_lanes
+from filtergym.evaluation.steered_filter import steer
+
+from filtergym.names import find_competitor, import_problem
+
+pytest.importorskip("llvmlite")
+
+SEEDS = range(8)
+HORIZON = 30
+
+
+class Steer:
+    """Closes the bank of a traced model by a policy."""
+
+    def __init__(self, maker, keywords):
+        self.maker, self.keywords = maker, keywords
+
+    def __call__(self, model):
+        plain = make_model(type(model.task), model.control, **self.keywords)
+        return steer(model, make_competitor(self.maker, plain))
+
+
+def estimates(model, episode):
+    return {"mean": model.mean(episode), "covariance": model.covariance(episode)}
+
+
+@pytest.mark.parametrize(
+    ("environment", "name", "options"),
+    [
+        ("ManeuveringTarget", "imm", {}),
+        ("ManeuveringTarget", "adaptive", {"decision_interval": 3}),
+        ("ManeuveringTarget", "gated:fixed-high", {}),
+        ("ManeuveringTarget", "hard-imm", {}),
+        ("RadarEsmTracking", "forgetting-joint-type", {}),
+        ("RadarEsmTracking", "gated:quasi-optimal", {}),
+        ("LooselyCoupledNavigation", "augmented-gain-mehra", {}),
+        ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
+        ("UavAutopilot", "innovation-adaptive", {}),
+        pytest.param("TightlyCoupledNavigation", "stuck-check", {}, marks=pytest.mark.slow),
+    ],
+)
+def test_a_traced_policy_does_what_it_does_when_it_is_asked(environment, name, options):
+    problem = import_problem(f"filtergym/{environment}-v0")
+    maker = find_competitor(problem, name)
+    control = control_of(maker, "policy", None, problem.task, name)
+    keywords = {"horizon": HORIZON, **getattr(maker, "task_keywords", {}), **options}
+    model = make_model(problem.task, control, backend="compiled", **keywords)
+    asked = run_competitor(model, maker, "policy", SEEDS, estimates)
+    steered = model.with_filter(Steer(maker, keywords))
+    lanes, found = start_lanes(steered, SEEDS), []
+    for _ in range(lanes.decisions_per_episode):
+        found += [report["mean"] for report, _ in lanes.decide(np.zeros(len(SEEDS), dtype=int), estimates)]
+    sigma = np.sqrt(np.diagonal(asked["covariance"], axis1=-2, axis2=-1))
+    # Measured 2e-13 of a deviation: a last bit of the action, over the steps that follow.
+    error = np.abs(np.moveaxis(np.array(found), -1, 0) - asked["mean"]) / np.maximum(sigma, 1e-9)
+    assert error.max() < 1e-10
+
+
+def test_a_policy_that_draws_numbers_is_not_traced():
+    problem = import_problem("filtergym/ManeuveringTarget-v0")
+    maker = find_competitor(problem, "random")
+    model = make_model(problem.task, "gain", backend="compiled")
+    with pytest.raises(NotTraceable):
+        model.with_filter(Steer(maker, {}))
