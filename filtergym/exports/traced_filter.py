@@ -107,10 +107,11 @@ class SteeredSteps:
 
     Args:
         steered: on traced arrays.
+        masked: whether it is an estimator, which never sees what was not received.
     """
 
-    def __init__(self, steered: SteeredFilter) -> None:
-        self.steered = steered
+    def __init__(self, steered: SteeredFilter, masked: bool = False) -> None:
+        self.steered, self.masked = steered, masked
 
     def start(self, initial: Any) -> Steered:
         """The bank at the start of the track."""
@@ -118,7 +119,8 @@ class SteeredSteps:
 
     def update(self, state: Steered, measurement: Any) -> tuple[Steered, dict[str, Any]]:
         """Predict, show, ask, update."""
-        own, received = self.steered, clear_missing(self.steered.task, measurement)
+        own = self.steered
+        received = clear_missing(own.task, measurement) if self.masked else measurement
         after = own.update(own.predict(state, received), Input(received))
         told = own.records(after, received)
         known = {name: told[name] for name in LIKELIHOODS if name in told}
@@ -193,7 +195,7 @@ def steps_of(
     if isinstance(maker, EstimatorMaker):
         model = Model(traced, maker.bank)
         policy, network = with_asked_network(maker(plain.task).network, graph)
-        return SteeredSteps(steer(model, policy, 1)), network
+        return SteeredSteps(steer(model, policy, 1), masked=True), network
     if kind == "estimator":
         own = make_competitor(maker, traced)
         if not getattr(own, "traceable", False):
@@ -296,11 +298,15 @@ class _Classes:
     """Which members of a state are the same number, and which never change.
 
     What starts as one number is taken for one number, and for a constant where it starts as one, until the update
-    disagrees: then they are told apart, and the update is traced again.
+    disagrees: then they are told apart, and the update is traced again. Numbers that are still told apart after some
+    rounds, as in a window that moves by one each time, are not compared any more.
     """
+
+    ROUNDS = 4
 
     def __init__(self, graph: Graph, first: Sequence[int]) -> None:
         self.graph = graph
+        self.rounds = 0
         groups: dict[int, int] = {}
         self.members = [groups.setdefault(node, i) for i, node in enumerate(first)]
         values = {c: graph.values[first[c]] for c in set(self.members)}
@@ -324,6 +330,11 @@ class _Classes:
         }
         if members == self.members and fixed == self.fixed:
             return False
+        self.rounds += 1
+        if self.rounds > self.ROUNDS:
+            apart = {old for old, new in zip(self.members, members, strict=True) if old != new}
+            members = [i if self.members[i] in apart else new for i, new in enumerate(members)]
+            fixed = {c: value for c, value in fixed.items() if c not in apart}
         self.fixed = {new: fixed[c] for new, c in zip(members, self.members, strict=True) if c in fixed}
         self.members = members
         return True
