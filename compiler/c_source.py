@@ -105,18 +105,20 @@ def plain_words(text: str) -> str:
 
 
 def comment(*paragraphs: str, indent: str = "") -> str:
-    """Return a comment of C, a paragraph for each text.
+    """Return a comment of C, a paragraph for each text; one that begins with blanks keeps them.
 
     Args:
         *paragraphs: of anything.
         indent: blanks before every line.
     """
-    lines = [
-        line
-        for text in paragraphs
-        for line in textwrap.wrap(plain_words(text), WIDTH - len(indent), break_on_hyphens=False) or [""]
-    ]
-    return f"{indent}/* " + f"\n{indent}   ".join(lines) + " */"
+    lines: list[str] = []
+    for text in paragraphs:
+        before = " " * (len(text) - len(text.lstrip(" ")))
+        wide = WIDTH - len(indent)
+        lines += textwrap.wrap(
+            plain_words(text), wide, initial_indent=before, subsequent_indent=before, break_on_hyphens=False
+        ) or [""]
+    return f"{indent}/* " + "\n".join(f"{indent}   {line}".rstrip() for line in lines).lstrip() + " */"
 
 
 def literal(value: float, scalar: Scalar = DOUBLE) -> str:

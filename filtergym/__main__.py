@@ -17,7 +17,7 @@ import typer
 from rich.console import Console
 
 from . import __version__
-from .commands import advise, improve, measure, report
+from .commands import advise, export, improve, measure, report
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
@@ -45,7 +45,7 @@ GROUPS: dict[str, Commands] = {
     },
     "Share": {
         "report": report.make,
-        "export": improve.export,
+        "export": export.export,
         "offline": measure.write_offline,
     },
 }

@@ -8,7 +8,8 @@ from ..agents.learned_policy import OBSERVATION_LIMIT, LearnedPolicy
 from ..compiler.c_source import FLOAT, Parameter, Scalar, array_text, function_text, literal
 
 _LAYER = """/* One linear layer: the sums of all rows side by side, each in its order, so that they vectorise. */
-static void {name}_layer(const float *x, int inputs, const float *weight, const float *bias, int outputs, float *y) {{
+static void {name}_layer(
+    const float *restrict x, int inputs, const float *weight, const float *bias, int outputs, float *restrict y) {{
     int i, j;
     for (i = 0; i < outputs; ++i) y[i] = 0.0f;
     for (j = 0; j < inputs; ++j)

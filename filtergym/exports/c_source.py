@@ -33,12 +33,12 @@ from .replay import Replay, mean_rows, replay, run_filter
 from .traced_filter import (
     ANSWER,
     ESTIMATE,
-    INITIAL,
     MEASUREMENT,
     SHOWN,
     STATE,
     Member,
     TracedFilter,
+    count_answers,
 )
 
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
@@ -129,24 +129,22 @@ class Writer:
         name: of the competitor.
         traced: its programs.
         scalar: kind of numbers.
+        components: what is estimated, name and unit.
+
+    Attributes:
         about: paragraphs for the comment of the header.
-        components: what is estimated, and the unit of each.
     """
 
     def __init__(
-        self,
-        name: str,
-        traced: TracedFilter,
-        scalar: Scalar,
-        about: Sequence[str],
-        components: Sequence[tuple[str, str]],
+        self, name: str, traced: TracedFilter, scalar: Scalar, components: Sequence[tuple[str, str]]
     ) -> None:
-        self.traced, self.scalar, self.about, self.components = traced, scalar, about, components
+        self.traced, self.scalar, self.components = traced, scalar, components
+        self.about: list[str] = []
         self.name = own = identifier(name)
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
         parts["estimate"] = traced.estimate
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
-        self.memory = memory_size(traced.network) if traced.network is not None and traced.shown else 0
+        self.memory = memory_size(traced.network) if traced.network is not None else 0
         self.has_state = bool(traced.state or self.memory)
         self.start, self.start_source = self._start()
         self.update, self.update_source = self._update()
@@ -182,7 +180,7 @@ class Writer:
         inner = [Parameter(f"const {state.name} *", "state"), *self._parameters("measurement")]
         inner += [Parameter(f"{state.name} *", "next"), *self._parameters("estimate")]
         between = []
-        if traced.shown and traced.network is not None:
+        if traced.network is not None:
             inner += [Parameter(f"{real} *", "shown"), Parameter(f"const {real} *", "answer")]
             memory = "next->network" if self.memory else "0"
             between = [f"if (shown[0] != {literal(0.0, self.scalar)}) {own}_network(shown + 1, {memory}, answer);"]
@@ -207,13 +205,10 @@ class Writer:
             body = [f"{state.name} after{start};", f"{state.name} *const next = &after;", *body, "*state = after;"]
         elif "next" in " ".join(body):
             body = [f"{state.name} *const next = state;", *body]
-        if between:
-            answers = 1 + max(
-                (step.arguments[1] for step in traced.update.steps if step.operation == "input" and step.arguments[0] == ANSWER),
-                default=0,
-            )
-            count = max(answers, 1 if traced.network is None or traced.network.output == "argmax" else len(traced.network.layers[-1][1]))
-            body = [f"{real} shown[{traced.shown}];", f"{real} answer[{count}] = {{{literal(0.0, self.scalar)}}};", *body]
+        if traced.network is not None:
+            zero = literal(0.0, self.scalar)
+            answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
+            body = [f"{real} shown[{traced.shown}];", answers, *body]
         parameters = self._parameters("state", "measurement", "estimate")
         return f"{source.functions}\n{function_text('void', f'{own}_update', parameters, body)}", source
 
@@ -221,7 +216,8 @@ class Writer:
     def figures(self) -> dict[str, int]:
         """Operations and bytes."""
         size = numpy.dtype(self.scalar.dtype).itemsize
-        weights = network_text(self.traced.network, self.name, self.scalar)[1] if self._has_network else 0
+        network = self.traced.network
+        weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = len(self.traced.state) * size + 4 * self.memory
         return {
             "operations": self.update_source.operations,
@@ -234,10 +230,6 @@ class Writer:
     def replaced(self) -> tuple[float, ...]:
         """Constants that the kind of number does not have."""
         return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
-
-    @property
-    def _has_network(self) -> bool:
-        return self.traced.network is not None and self.traced.shown > 0
 
     # --- files
 
@@ -283,7 +275,7 @@ class Writer:
             f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
             helper_functions([self.traced.start, self.traced.update], self.scalar),
         ]
-        if self._has_network and self.traced.network is not None:
+        if self.traced.network is not None:
             parts.append(network_text(self.traced.network, self.name, self.scalar)[0])
         return _without_blank_runs("\n".join([*parts, self.start, self.update]))
 
@@ -531,9 +523,7 @@ def export_c(
             f"{WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
             + ("export it in double" if scalar is FLOAT else "please report it")
         )
-    task = problem.task
-    plain = next(iter(task.components)) if False else None  # noqa: F841
-    writer = Writer(name, traced, scalar, [], [(c.name, c.unit) for c in _components(problem, scenario, keywords)])
+    writer = Writer(name, traced, scalar, replayed.components)
     writer.about = _about(problem, name, maker, writer, precision, keywords, command)
     figures = Figures(**writer.figures, difference=difference, replaced=writer.replaced)
     test = compile_and_test(writer, replayed)
@@ -543,12 +533,6 @@ def export_c(
         for file, text in files_of(writer, replayed, _notes(figures, replayed, precision)).items():
             (waiting / file).write_text(text, encoding="ascii")
     return figures
-
-
-def _components(problem: Problem, scenario: Any, keywords: Mapping[str, Any] | None) -> Any:
-    from ..envs.backend import make_model
-
-    return make_model(problem.task, None, scenario, **(keywords or {})).task.components
 
 
 def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dict[str, str]:
@@ -573,16 +557,21 @@ def _about(
     keywords: Mapping[str, Any] | None,
     command: str,
 ) -> list[str]:
+    """Paragraphs that say what the filter is."""
     own = writer.name
-    first = (getattr(maker, "__doc__", None) or "").strip().split("\n\n")[0]
+    described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
+    first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")
     parameters = ", ".join(f"{key} = {value!r}" for key, value in (keywords or {}).items())
     return [
-        f"{name} of {problem.id}, in {precision}, for one track. {first}",
-        *([f"Parameters of the task that are not its own: {parameters}."] if parameters else []),
+        f"{name} of {problem.id}, in {precision}, for one track. {first}".strip(),
+        *([f"With parameters of the task: {parameters}."] if parameters else []),
         f"Made by: {command}" if command else "Made by filtergym.",
-        "No allocation, nothing but math.h.",
-        f"cc {' '.join(FLAGS)} test.c {own}.c -lm -o test, then test, compares it with the competitor itself.",
-        f"cc {' '.join(FLAGS)} main.c {own}.c -lm -o run, then run measurements.csv, estimates from a table.",
+        "",
+        "No allocation, nothing but math.h. Compare it with the filter that was judged:",
+        f"    cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test",
+        "Estimates from a table of measurements:",
+        f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
+        "",
     ]
 
 

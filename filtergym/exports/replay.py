@@ -38,8 +38,8 @@ class Replay(NamedTuple):
     """Of the competitor, ``(T, C, E)``."""
     covariance: numpy.ndarray
     """``(T, C, C, E)``."""
-    template: tuple[Any, Any]
-    """Initial estimate and measurement, as NamedTuples."""
+    components: list[tuple[str, str]]
+    """Name and unit of what is estimated."""
 
     @property
     def sigma(self) -> numpy.ndarray:
@@ -103,17 +103,16 @@ def replay(
     started: list[Any] = []
     start_lanes(plain, seeds, lambda episode: started.append(episode.measurement))
     kept: dict[str, list[numpy.ndarray]] = {"measurement": [], "mean": [], "covariance": []}
-    template: Any = None
     # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
     first = start_lanes(plain, seeds[:1]).state.measurement
     traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first))
     for found, _ in islice(rollout(model, maker, seeds, _report, kind=kind, name=name), measurements):
-        template = found["measurement"]
-        kept["measurement"].append(_rows(template, episodes))
+        kept["measurement"].append(_rows(found["measurement"], episodes))
         kept["mean"].append(numpy.array(found["mean"][..., :episodes]))
         kept["covariance"].append(numpy.array(found["covariance"][..., :episodes]))
     arrays = [numpy.stack(values) for values in kept.values()]
-    return traced, Replay(_rows(started[0], episodes), *arrays, (started[0], template))
+    components = [(component.name, component.unit) for component in plain.task.components]
+    return traced, Replay(_rows(started[0], episodes), *arrays, components)
 
 
 class _Network:
@@ -149,7 +148,7 @@ def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float6
         Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
-    network = None if traced.network is None or not traced.shown else _Network(traced.network)
+    network = None if traced.network is None else _Network(traced.network)
     state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
     answers = []
     for measured in replayed.measurements:

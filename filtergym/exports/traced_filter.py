@@ -7,6 +7,7 @@ the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept o
 import ast
 import inspect
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 from itertools import count as count_from
@@ -63,9 +64,7 @@ class TracedFilter(NamedTuple):
     shown: int
     """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
     network: LearnedPolicy | None
-    """That answers between the two parts of ``update``."""
-    template: tuple[Any, Any]
-    """Arrays like the initial estimate and a measurement."""
+    """That answers between the two parts of ``update``; None where none is asked."""
 
 
 class Steps(Protocol):
@@ -139,6 +138,11 @@ def clear_missing(task: Task, measurement: Any) -> Any:
     return map_arrays(lambda own: clear(own, next(masked)), measurement)
 
 
+def count_answers(network: LearnedPolicy) -> int:
+    """Numbers of an action."""
+    return 1 if network.output == "argmax" else len(network.layers[-1][1])
+
+
 class AskedNetwork(Policy):
     """In place of a network while a filter is traced: keeps what it is shown, and answers with inputs.
 
@@ -153,17 +157,12 @@ class AskedNetwork(Policy):
         self.control = network.control  # type: ignore[misc]
         self.shown: list[int] = []
 
-    @property
-    def answers(self) -> int:
-        """Numbers of an answer."""
-        return 1 if self.network.output == "argmax" else len(self.network.layers[-1][1])
-
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
         """Keep what is shown; numbers are answered with zeros, whose form alone matters."""
         if not isinstance(observation, Traced):
-            return numpy.zeros((1,) if self.network.output == "argmax" else (1, self.answers)), ()
+            return numpy.zeros((1,) if self.network.output == "argmax" else (1, count_answers(self.network))), ()
         self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
-        nodes = [self.graph.input(ANSWER, i) for i in range(self.answers)]
+        nodes = [self.graph.input(ANSWER, i) for i in range(count_answers(self.network))]
         if self.network.output == "argmax":
             return Traced(nodes, numpy.int64), ()
         return Traced(numpy.array(nodes)[None], numpy.float64), ()
@@ -257,12 +256,17 @@ def field_words(cls: type) -> dict[str, str]:
         return {}
     lines = tree.body if isinstance(tree, ast.ClassDef) else []
     return {
-        field.target.id: " ".join(below.value.value.split())
+        field.target.id: _without_shapes(below.value.value)
         for field, below in zip(lines, lines[1:], strict=False)
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
         and isinstance(below.value.value, str)
     }  # fmt: skip
+
+
+def _without_shapes(text: str) -> str:
+    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
+    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")
 
 
 def nodes_of(part: Any) -> list[int]:
@@ -419,8 +423,7 @@ def _trace(
         [listed[member] for member in live],
         members_of(estimate),
         len(shown),
-        None if asked is None else asked.network,
-        (initial, measurement),
+        asked.network if shown and asked is not None else None,
     )
 
 
