@@ -25,13 +25,30 @@ PART = 200
 """Statements of a function."""
 WIDTH = 100
 """Characters of a line of a comment."""
-_INFIX = {"add": "+", "subtract": "-", "multiply": "*", "divide": "/", "logical_and": "&&", "logical_or": "||"}
-_INFIX |= {"less": "<", "less_equal": "<=", "greater": ">", "greater_equal": ">=", "equal": "==", "not_equal": "!="}
+_INFIX = {
+    "add": "+",
+    "subtract": "-",
+    "multiply": "*",
+    "divide": "/",
+    "logical_and": "&&",
+    "logical_or": "||",
+}
+_INFIX |= {
+    "less": "<",
+    "less_equal": "<=",
+    "greater": ">",
+    "greater_equal": ">=",
+    "equal": "==",
+    "not_equal": "!=",
+}
 _RESERVED = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long "
-    "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
-    "asm typeof bool true false class new delete this private public template namespace operator main "
-    "NAN INFINITY FLT_MAX FLT_MIN DBL_MAX sign_of remainder_of place_of".split()
+    re.findall(
+        r"\w+",
+        "auto break case char const continue default do double else enum extern float for goto if inline int long "
+        "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+        "asm typeof bool true false class new delete this private public template namespace operator main "
+        "NAN INFINITY FLT_MAX FLT_MIN DBL_MAX sign_of remainder_of place_of",
+    )
 )
 """Words that mean something to C, to its neighbours, or to the text made here."""
 
@@ -146,7 +163,9 @@ def is_beyond(value: float, scalar: Scalar) -> bool:
     )
 
 
-def array_text(name: str, values: numpy.ndarray, scalar: Scalar = DOUBLE, qualifier: str = "static const") -> str:
+def array_text(
+    name: str, values: numpy.ndarray, scalar: Scalar = DOUBLE, qualifier: str = "static const"
+) -> str:
     """Return the definition of a constant array; rows of a matrix stand in lines."""
 
     def braces(part: numpy.ndarray) -> str:
@@ -182,7 +201,12 @@ _HELPERS = {
 def helper_functions(programs: Sequence[Program], scalar: Scalar = DOUBLE, qualifier: str = "static ") -> str:
     """Return the functions that statements of these programs call beside those of ``math.h``."""
     used = {step.operation for program in programs for step in program.steps}
-    words = {"real": scalar.name, "f": scalar.suffix, "zero": literal(0.0, scalar), "one": literal(1.0, scalar)}
+    words = {
+        "real": scalar.name,
+        "f": scalar.suffix,
+        "zero": literal(0.0, scalar),
+        "one": literal(1.0, scalar),
+    }
     return "\n".join(qualifier + text.format(**words) for name, text in _HELPERS.items() if name in used)
 
 
@@ -289,8 +313,10 @@ def write_program(
     count_operations = sum(step.operation not in FREE for step in program.steps)
     together = count_operations <= PART
     slots = {} if together else scratch_slots(program, parts)
-    own = [set(range(len(program.steps))) if together else set(steps) for steps in parts]
-    blocks = [_statements(text, steps, *given, stores, slots) for steps, *given in zip(parts, own, strict=True)]
+    everything = set(range(len(program.steps)))
+    blocks = [
+        _statements(text, steps, everything if together else set(steps), stores, slots) for steps in parts
+    ]
     defined = [
         array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
         for start, length in starts
@@ -322,7 +348,7 @@ def _statements(
     lines: list[str] = []
     fetched: set[int] = set()
     for step in steps:
-        operation, arguments, logical = text.program.steps[step]
+        operation, arguments, _logical = text.program.steps[step]
         if operation not in FREE:
             for argument in arguments[2:] if operation == "take" else arguments:
                 crosses = argument not in own and text.program.steps[argument].operation not in FREE
@@ -341,9 +367,7 @@ def _function(name: str, parameters: Sequence[Parameter], body: Sequence[str], q
     return function_text(f"{qualifier}void", name, parameters, body)
 
 
-def function_text(
-    returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]
-) -> str:
+def function_text(returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]) -> str:
     """Return the definition of a function; parameters that it does not use are marked as such."""
     listed = ", ".join(_declare(parameter) for parameter in parameters)
     words = set(re.findall(r"\w+", "\n".join(body)))

@@ -1,13 +1,13 @@
-"""A program run step by step in NumPy, in any precision: slow, and the measure of what is written in other languages."""
+"""A program run step by step in NumPy, in any precision: slow, and what other languages are compared with."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy
 
 from .program import FUNCTIONS, OPERATIONS, Program
 
-_COMPUTE = {**OPERATIONS, **FUNCTIONS, "where": numpy.where}
+_COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": numpy.where}
 
 
 def first_steps(program: Program, results: int) -> int:
@@ -71,12 +71,3 @@ def _places(index: Any, length: int) -> numpy.ndarray:
     index = numpy.where(index < 0.0, index + length, index)
     inside = numpy.where(index > 0.0, numpy.minimum(index, length - 1.0), 0.0)
     return inside.astype(numpy.int64)
-
-
-def count_operations(program: Program) -> Mapping[str, int]:
-    """Return how often a program does what, without inputs and constants."""
-    counts: dict[str, int] = {}
-    for step in program.steps:
-        if step.operation not in ("input", "constant"):
-            counts[step.operation] = counts.get(step.operation, 0) + 1
-    return counts

@@ -81,7 +81,12 @@ def export(
     if to not in FORMS:
         raise nearest("form of an export", to, FORMS)
     if to == "safetensors":
-        for given, option in ((name, "a filter's name"), (single, "--float"), (scenario, "--scenario"), (settings, "--set")):
+        for given, option in (
+            (name, "a filter's name"),
+            (single, "--float"),
+            (scenario, "--scenario"),
+            (settings, "--set"),
+        ):
             if given:
                 raise ValueError(f"{option} is of a filter as a program: add --to c")
         _export_arrays(Path(environment), out, trust)
@@ -113,7 +118,9 @@ def export(
         highlight=False,
         soft_wrap=True,
     )
-    console.print(f"try it: cd {folder} && cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test", soft_wrap=True)
+    console.print(
+        f"try it: cd {folder} && cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test", soft_wrap=True
+    )
 
 
 def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:

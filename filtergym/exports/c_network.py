@@ -68,7 +68,9 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     """
     arrays = {
         # Of a matrix its columns one after the other.
-        key: numpy.ascontiguousarray(values.T) if key.rpartition("_")[2].isdigit() or "weight" in key else values
+        key: numpy.ascontiguousarray(values.T)
+        if key.rpartition("_")[2].isdigit() or "weight" in key
+        else values
         for key, values in network.arrays.items()
     }
     fields = len(arrays["observation_mean"])

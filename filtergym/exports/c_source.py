@@ -32,8 +32,7 @@ from .c_network import memory_size, network_text
 from .replay import Replay, mean_rows, replay, run_filter
 from .traced_filter import (
     ANSWER,
-    ESTIMATE,
-    MEASUREMENT,
+    LIKELIHOODS,
     SHOWN,
     STATE,
     Member,
@@ -183,7 +182,9 @@ class Writer:
         if traced.network is not None:
             inner += [Parameter(f"{real} *", "shown"), Parameter(f"const {real} *", "answer")]
             memory = "next->network" if self.memory else "0"
-            between = [f"if (shown[0] != {literal(0.0, self.scalar)}) {own}_network(shown + 1, {memory}, answer);"]
+            between = [
+                f"if (shown[0] != {literal(0.0, self.scalar)}) {own}_network(shown + 1, {memory}, answer);"
+            ]
 
         def read(argument: int, row: int) -> str:
             if argument == ANSWER:
@@ -196,13 +197,25 @@ class Writer:
             return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
 
         source = write_program(
-            traced.update, f"{own}_update", inner, read, write, self.scalar, between=between, results=traced.shown
+            traced.update,
+            f"{own}_update",
+            inner,
+            read,
+            write,
+            self.scalar,
+            between=between,
+            results=traced.shown,
         )
         body = list(source.body)
         if self.has_state:
             # What is written is not what is read.
             start = " = *state" if self.memory else ""
-            body = [f"{state.name} after{start};", f"{state.name} *const next = &after;", *body, "*state = after;"]
+            body = [
+                f"{state.name} after{start};",
+                f"{state.name} *const next = &after;",
+                *body,
+                "*state = after;",
+            ]
         elif "next" in " ".join(body):
             body = [f"{state.name} *const next = state;", *body]
         if traced.network is not None:
@@ -282,7 +295,10 @@ class Writer:
     def rows(self) -> str:
         """Text of a header that fills structs from rows of numbers, for main.c and the test."""
         own, real = self.name, self.scalar.name
-        text = [comment("Structs from rows of a table."), f'#ifndef {own.upper()}_ROWS_H\n#define {own.upper()}_ROWS_H\n']
+        text = [
+            comment("Structs from rows of a table."),
+            f"#ifndef {own.upper()}_ROWS_H\n#define {own.upper()}_ROWS_H\n",
+        ]
         text.append(f'#include "{own}.h"\n')
         for part in ("initial", "measurement"):
             struct = self.structs[part]
@@ -300,20 +316,29 @@ class Writer:
 
     def main(self) -> str:
         """Text of a program that reads a table of measurements and writes one of estimates."""
-        own, C = self.name, len(self.components)
+        C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
         given = [*self.columns("initial"), *self.columns("measurement")]
-        told = [member.name for member in self.traced.estimate if not member.shape and member.name != "mean"]
-        told = [name for name in told if name not in ("covariance",)]
         names = [identifier(name) for name, _ in self.components]
-        header = ["track", "measurement", *told, *(f"estimate_{n}" for n in names), *(f"sigma_{n}" for n in names)]
-        mean, covariance = ("", "") if C == 1 else ("[i]", "[i][i]")
-        words = {
-            "own": own, "columns": _string(",".join(given)), "header": _string(",".join(header)),
-            "initial": len(self.columns("initial")), "count": len(given), "C": C, "mean": mean,
-            "covariance": covariance, "digits": 17 if self.scalar is DOUBLE else 9,
-            "told": "".join(f'\n        printf(",%.{17 if self.scalar is DOUBLE else 9}g", (double)estimate.{name});' for name in told),
-        }  # fmt: skip
-        return _MAIN.format(**words)
+        told = [member.name for member in self.traced.estimate if member.name in LIKELIHOODS]
+        header = [
+            "track",
+            "measurement",
+            *told,
+            *(f"estimate_{n}" for n in names),
+            *(f"sigma_{n}" for n in names),
+        ]
+        return _MAIN.format(
+            own=self.name,
+            columns=_string(",".join(given)),
+            header=_string(",".join(header)),
+            initial=len(self.columns("initial")),
+            count=len(given),
+            C=C,
+            digits=digits,
+            mean="" if C == 1 else "[i]",
+            covariance="" if C == 1 else "[i][i]",
+            told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
+        )
 
     def test(self) -> str:
         """Text of a program that compares the filter with the vectors."""
@@ -333,7 +358,9 @@ class Writer:
             "means": numpy.moveaxis(replayed.mean[:T, :, :E], -1, 0).reshape(E * T, -1),
             "sigmas": numpy.moveaxis(replayed.sigma[:T, :, :E], -1, 0).reshape(E * T, -1),
         }
-        text = [comment("Measurements of simulated episodes, and what the competitor itself estimated in double.")]
+        text = [
+            comment("Measurements of simulated episodes, and what the competitor itself estimated in double.")
+        ]
         text.append(f"#define TRACKS {E}\n#define MEASUREMENTS {T}\n")
         for name, values in arrays.items():
             rows = ",\n".join("{" + ", ".join(literal(float(x)) for x in row) + "}" for row in values)
@@ -347,7 +374,9 @@ class Writer:
         for episode in range(replayed.initial.shape[1]):
             for k, measured in enumerate(replayed.measurements[:, :, episode]):
                 initial = replayed.initial[:, episode] if k == 0 else [""] * first
-                lines.append(",".join(str(x) if isinstance(x, str) else repr(float(x)) for x in [*initial, *measured]))
+                lines.append(
+                    ",".join(str(x) if isinstance(x, str) else repr(float(x)) for x in [*initial, *measured])
+                )
         return "\n".join([*lines, ""])
 
 
@@ -620,5 +649,7 @@ def compile_and_test(
             done = subprocess.run(words, cwd=place, capture_output=True, text=True, check=False)
             if done.returncode != 0:
                 said = (done.stderr or done.stdout).strip()[-500:]
-                raise ValueError(f"{words[0]} failed on the exported {writer.name!r}, please report it: {said}")
+                raise ValueError(
+                    f"{words[0]} failed on the exported {writer.name!r}, please report it: {said}"
+                )
     return done.stdout.strip()

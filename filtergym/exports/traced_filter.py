@@ -11,6 +11,7 @@ import re
 import textwrap
 from collections.abc import Sequence
 from itertools import count as count_from
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy
@@ -160,7 +161,9 @@ class AskedNetwork(Policy):
     def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
         """Keep what is shown; numbers are answered with zeros, whose form alone matters."""
         if not isinstance(observation, Traced):
-            return numpy.zeros((1,) if self.network.output == "argmax" else (1, count_answers(self.network))), ()
+            return numpy.zeros(
+                (1,) if self.network.output == "argmax" else (1, count_answers(self.network))
+            ), ()
         self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
         nodes = [self.graph.input(ANSWER, i) for i in range(count_answers(self.network))]
         if self.network.output == "argmax":
@@ -257,7 +260,7 @@ def field_words(cls: type) -> dict[str, str]:
     lines = tree.body if isinstance(tree, ast.ClassDef) else []
     return {
         field.target.id: _without_shapes(below.value.value)
-        for field, below in zip(lines, lines[1:], strict=False)
+        for field, below in pairwise(lines)
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
         and isinstance(below.value.value, str)
@@ -319,7 +322,8 @@ class _Classes:
     def nodes(self) -> list[int]:
         """Expressions of the members before an update."""
         return [
-            self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c) for c in self.members
+            self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
+            for c in self.members
         ]
 
     def split(self, after: Sequence[int]) -> bool:
@@ -378,7 +382,13 @@ def trace_filter(
 
 
 def _trace(
-    task: type[Task], control: str, maker: Any, name: str, plain: Model, template: tuple[Any, Any], graph: Graph
+    task: type[Task],
+    control: str,
+    maker: Any,
+    name: str,
+    plain: Model,
+    template: tuple[Any, Any],
+    graph: Graph,
 ) -> TracedFilter:
     steps, asked = steps_of(task, control, maker, name, plain, graph)
     initial, measurement = (one_lane(part) for part in template)
@@ -427,7 +437,9 @@ def _trace(
     )
 
 
-def _live_members(graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]) -> list[int]:
+def _live_members(
+    graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]
+) -> list[int]:
     """Members that some result depends on, now or later."""
 
     def read(nodes: Sequence[int]) -> set[int]:
