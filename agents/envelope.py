@@ -13,7 +13,7 @@ from ..envs.backend import make_model
 from ..envs.catalogue import find_mixture, make_task, parameter_names
 from ..envs.parameters import freeze
 from ..envs.task import Task
-from ..evaluation.competitors import make_competitor
+from ..evaluation.competitors import Policy, make_competitor
 from ..evaluation.rollout import start_lanes
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.stepping import SteppingPolicy
@@ -26,6 +26,111 @@ MOST_DECISIONS = 400
 """Of an episode that are looked at."""
 TOLERATED = 0.1
 """Share of a field's values outside of what was seen in training that is not spoken of."""
+
+
+WINDOW = 50.0
+"""Decisions over which a running filter judges what it is shown."""
+
+
+class TrainingRange(NamedTuple):
+    """What an agent has seen of each field in its training."""
+
+    fields: tuple[str, ...]
+    """That it takes."""
+    low: numpy.ndarray
+    """Smallest value, ``(fields,)``."""
+    high: numpy.ndarray
+    """Largest value, likewise."""
+
+    def is_outside(self, observation: numpy.ndarray) -> numpy.ndarray:
+        """Which values of observations ``(n, fields)`` were not seen in training."""
+        return numpy.asarray((observation < self.low) | (observation > self.high))
+
+
+class WatchedPolicy(Policy):
+    """A network that goes on answering, and keeps how much of what it is shown was not seen in training.
+
+    Args:
+        policy: the network, with what is around it.
+        range: of its training.
+
+    Attributes:
+        memory: share of each field's values outside, over the last decisions, ``(tracks, fields)``; None before the
+            first.
+    """
+
+    def __init__(self, policy: Any, range: TrainingRange) -> None:
+        super().__init__(policy.model)
+        self.control = policy.model.control  # type: ignore[misc]  # made for it
+        self.policy, self.range = policy, range
+        self.columns = policy.model.columns(range.fields)
+        self.memory: numpy.ndarray | None = None
+
+    def begin(self, seeds: Sequence[int]) -> Any:
+        """Begin the policy's memory."""
+        return self.policy.begin(seeds)
+
+    def predict(
+        self,
+        observation: numpy.ndarray,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[numpy.ndarray, Any]:
+        """Look at what is shown, and let the network answer."""
+        outside = self.range.is_outside(numpy.atleast_2d(observation)[:, self.columns])
+        before = 0.0 * outside if self.memory is None else self.memory
+        if episode_start is not None:
+            before = numpy.where(numpy.reshape(episode_start, (-1, 1)), 0.0, before)
+        self.memory = before + (outside - before) / WINDOW
+        answer: tuple[numpy.ndarray, Any] = self.policy.predict(
+            observation, state, episode_start, deterministic
+        )
+        return answer
+
+    def describe(self) -> list[str]:
+        """Say for each track which field is outside too often; empty where none is."""
+        if self.memory is None:
+            return []
+        most, share = self.memory.argmax(axis=1), self.memory.max(axis=1)
+        return [
+            f"{100.0 * much:.0f} % of the last values of {self.range.fields[field]} lie outside of all that it saw in "
+            "training"
+            if much > TOLERATED
+            else ""
+            for field, much in zip(most, share, strict=True)
+        ]
+
+
+def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
+    """Fly some episodes of an agent's training again; None where nobody knows how it was trained.
+
+    Args:
+        cls: the task.
+        maker: as of :func:`departure`.
+    """
+    stored = _stored(maker)
+    if stored is None:
+        return None
+    run = stored.header["run"]
+    seen = _observations(
+        cls, stored, run.get("scenario"), _own_parameters(cls, run), episode_seeds("validation", 1, EPISODES)
+    )
+    return TrainingRange(tuple(stored.header["fields"]), seen.min(axis=0), seen.max(axis=0))
+
+
+def _stored(maker: Any) -> Any:
+    """Return what was loaded of a learned policy or estimator; None where its training is not known."""
+    stored = getattr(maker, "policy", maker)
+    header = getattr(stored, "header", None)
+    return None if header is None else stored
+
+
+def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters of the task that an agent was trained under."""
+    known = parameter_names(cls)
+    given = run.get("hyperparameters", {}).get("env_kwargs", {})
+    return {name: value for name, value in given.items() if name in known}
 
 
 class Departure(NamedTuple):
@@ -58,14 +163,11 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
         scenario: that it is to act in.
         keywords: parameters of the task there.
     """
-    stored = getattr(maker, "policy", maker)
-    header = getattr(stored, "header", None)
-    if header is None or find_mixture(cls, header["run"].get("scenario")) is not None:
+    stored = _stored(maker)
+    if stored is None or find_mixture(cls, stored.header["run"].get("scenario")) is not None:
         return None
-    run = header["run"]
-    known = parameter_names(cls)
-    given = run.get("hyperparameters", {}).get("env_kwargs", {})
-    own = {name: value for name, value in given.items() if name in known}
+    header, run = stored.header, stored.header["run"]
+    own = _own_parameters(cls, run)
     trained = make_task(cls, run.get("scenario"), **own).parameters
     differing = {name: (getattr(trained, name), value) for name, value in keywords.items()}
     # How long an episode is, is no other problem.
@@ -73,9 +175,10 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
     now, then = (cls.default_scenario if one is None else one for one in (scenario, run.get("scenario")))
     if isinstance(now, str) and now == then and not (own or differing):
         return None  # it is what it was trained on, and need not be flown
-    seen = _observations(cls, stored, run.get("scenario"), own, episode_seeds("validation", 1, EPISODES))
+    seen = training_range(cls, maker)
+    assert seen is not None
     shown = _observations(cls, stored, scenario, keywords, episode_seeds("test", 0, EPISODES_NOW))
-    outside = ((shown < seen.min(axis=0)) | (shown > seen.max(axis=0))).mean(axis=0)
+    outside = seen.is_outside(shown).mean(axis=0)
     most = int(outside.argmax())
     often = outside[most] > TOLERATED
     if not often and not differing:

@@ -331,29 +331,33 @@ class CompiledModel(Model):
                 warn_of(f"{function.__qualname__} of {self.task.id}", error)
         return function(self._plain, *parts)
 
+    def start_filter(self, initial: Any, truth: Any = None) -> Any:
+        """State of the filter at the start of the track."""
+        if self.filter.in_python:
+            return super().start_filter(initial, truth)
+        return self.run(_start_filter, initial, truth)[0]
+
+    def predict_filter(self, state: Any, measurement: Any) -> Any:
+        """State of the filter when a measurement has come."""
+        return self.programs.filter_prediction(state, measurement, threads=self.threads)[0]
+
+    def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
+        """State of the filter when the measurement is taken in."""
+        if self.filter.in_python:
+            return super().update_filter(state, measurement, action, truth)
+        return self.programs.filter_update(truth, state, measurement, action, threads=self.threads)[0]
+
     def begin(self, uniforms: Array, normals: Array) -> Episode:
         """Episode at the start of the track."""
         truth, initial = self.run(_begin_world, uniforms, normals)
-        known = self.truth_for_filter(truth)
-        if self.filter.in_python:
-            return Episode(truth, initial, self.filter.begin(Input(initial, known)))
-        return Episode(truth, initial, self.run(_start_filter, initial, known)[0])
+        return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2."""
-        functions, threads = self.programs, self.threads
         given = episode.filter, episode.measurement
         feedback = self.filter.feedback(*given) if self.filter.in_python else self.run(_feedback, *given)
-        truth, measurement = functions.world_advance(episode.truth, feedback, noise, threads=threads)
-        state, _ = functions.filter_prediction(episode.filter, measurement, threads=threads)
-        return Episode(truth, measurement, state)
-
-    def act(self, episode: Episode, action: Array) -> Episode:
-        """Step 4."""
-        if self.filter.in_python:
-            return super().act(episode, action)
-        arguments = (self.truth_for_filter(episode.truth), episode.filter, episode.measurement, action)
-        return episode._replace(filter=self.programs.filter_update(*arguments, threads=self.threads)[0])
+        truth, measurement = self.programs.world_advance(episode.truth, feedback, noise, threads=self.threads)
+        return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
 
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
@@ -547,6 +551,116 @@ class Stepper:
         self._shown, self._given = memory, False
         for *_, predict in (*self._calls, *self._begin):
             predict.replace(len(predict.arrays) - 1, memory)
+
+
+class FilterStepper:
+    """The filter of a compiled model in memory of its own, to which measurements come from outside.
+
+    Args:
+        model: compiled.
+        report: made of measurement and filter after every update.
+        width: lanes, a multiple of eight.
+    """
+
+    def __init__(self, model: Any, report: Report, width: int) -> None:
+        update, _, predict, episode = model.programs.later
+        tell = model.programs.report_program(report)
+        truths, measured, states = (len(leaves(part)) for part in episode)
+        count = itertools.count()
+        self._template, self._kinds = (
+            map_arrays(lambda _: next(count), episode.filter),
+            _kinds(leaves(episode.filter)),
+        )
+        self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
+        self.width = width
+
+        def memory(arrays: Sequence[Leaf]) -> list[numpy.ndarray]:
+            return [empty_lanes(leaf.shape, width) for leaf in arrays]
+
+        unknown = memory(tell.inputs[:truths])
+        self._measurement = memory(tell.inputs[truths : truths + measured])
+        predicted, self._shown = (
+            memory(predict.outputs[:-1]),
+            numpy.empty((width, *predict.outputs[-1].shape)),
+        )
+        written, self._reported = memory(update.outputs), memory(tell.outputs)
+        self._state, self._action = written[:states], empty_lanes(update.inputs[-1].shape, width)
+        self._action[...] = 0.0
+        given = [*predicted, *self._measurement, self._action]
+        self._kept = [(own, given[i]) for own, i in zip(written, update.same, strict=True) if i is not None]
+        self._predict = predict.bound([*self._state, *self._measurement], [*predicted, self._shown])
+        self._update = update.bound(given, written)
+        self._tell = tell.bound([*unknown, *self._measurement, *self._state], self._reported)
+
+    @property
+    def state(self) -> Any:
+        """State of the filter, in arrays that stay as they are."""
+        return _copy_numbers(self._template, self._state, self._kinds)
+
+    @state.setter
+    def state(self, state: Any) -> None:
+        for memory, values in zip(self._state, leaves(state), strict=True):
+            memory[...] = values
+
+    def predict(self, measurement: Any) -> None:
+        """Let a measurement come."""
+        for memory, values in zip(self._measurement, leaves(measurement), strict=True):
+            memory[...] = values
+        self._predict(0, self.width)
+
+    def observe(self) -> Array:
+        """What is shown, ``(fields, width)``, until the next measurement."""
+        return self._shown.T
+
+    def update(self, action: Array) -> None:
+        """Take the measurement in."""
+        self._action[...] = action
+        self._update(0, self.width)
+        for memory, values in self._kept:
+            memory[...] = values
+
+    def report(self) -> Any:
+        """Return the report, in arrays ``(..., width)`` that stay as they are."""
+        self._tell(0, self.width)
+        return _copy_numbers(self._report_template, self._reported, self._report_kinds)
+
+
+class ModelFilterStepper:
+    """The same for any model, by its functions, in arrays that never change.
+
+    Args:
+        model: any.
+        report: as of :class:`FilterStepper`.
+        width: likewise.
+    """
+
+    def __init__(self, model: Model, report: Report, width: int) -> None:
+        self._model, self._report, self.width = model, report, width
+        self.state: Any = None
+        self._measurement: Any = None
+
+    def predict(self, measurement: Any) -> None:
+        """Let a measurement come."""
+        self._measurement = measurement
+        self.state = self._model.predict_filter(self.state, measurement)
+
+    def observe(self) -> Array:
+        """What is shown, ``(fields, width)``."""
+        return self._model.observe(Episode(None, self._measurement, self.state))
+
+    def update(self, action: Array) -> None:
+        """Take the measurement in."""
+        self.state = self._model.update_filter(self.state, self._measurement, action)
+
+    def report(self) -> Any:
+        """Return the report, in arrays ``(..., width)``."""
+        return self._model.run(self._report, Episode(None, self._measurement, self.state))
+
+
+def filter_stepper(model: Model, report: Report, width: int) -> FilterStepper | ModelFilterStepper:
+    """Return what steps the filter of a model alone."""
+    kind = FilterStepper if can_step(model, report) else ModelFilterStepper
+    return kind(model, report, width)
 
 
 def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:

@@ -124,6 +124,20 @@ class Model:
         """Truth as the filter is given it: None unless it ``knows`` something."""
         return truth if self.filter.knows else None
 
+    # --- the filter's part of a step
+
+    def start_filter(self, initial: Any, truth: Any = None) -> Any:
+        """State of the filter at the start of the track."""
+        return self.filter.begin(Input(initial, truth))
+
+    def predict_filter(self, state: Any, measurement: Any) -> Any:
+        """State of the filter when a measurement has come, before it is taken in."""
+        return self.filter.predict(state, measurement)
+
+    def update_filter(self, state: Any, measurement: Any, action: Array, truth: Any = None) -> Any:
+        """State of the filter when the measurement is taken in, by a bank with the action."""
+        return self.filter.update(state, Input(measurement, truth, action))
+
     # --- what the engine calls
 
     def begin(self, uniforms: Array, normals: Array) -> Episode:
@@ -134,13 +148,13 @@ class Model:
             normals: ``(noise.initial_normals, N)``.
         """
         truth, initial = self.task.world.begin(Draws(uniforms, self.task.xp), normals)
-        return Episode(truth, initial, self.filter.begin(Input(initial, self.truth_for_filter(truth))))
+        return Episode(truth, initial, self.start_filter(initial, self.truth_for_filter(truth)))
 
     def measure(self, episode: Episode, noise: Array) -> Episode:
         """Steps 1 and 2; ``noise`` is ``(noise.normals + noise.row_uniforms, N)``."""
         feedback = self.filter.feedback(episode.filter, episode.measurement)
         truth, measurement = self.task.world.advance(episode.truth, noise, feedback)
-        return Episode(truth, measurement, self.filter.predict(episode.filter, measurement))
+        return Episode(truth, measurement, self.predict_filter(episode.filter, measurement))
 
     def observe(self, episode: Episode) -> Array:
         """Step 3: what the agent is shown, ``(len(fields), N)``."""
@@ -151,8 +165,8 @@ class Model:
 
     def act(self, episode: Episode, action: Array) -> Episode:
         """Step 4: the filter takes the measurement in, a bank with the action."""
-        given = Input(episode.measurement, self.truth_for_filter(episode.truth), action)
-        return episode._replace(filter=self.filter.update(episode.filter, given))
+        truth = self.truth_for_filter(episode.truth)
+        return episode._replace(filter=self.update_filter(episode.filter, episode.measurement, action, truth))
 
     def mean(self, episode: Episode) -> Array:
         """Estimate, ``(len(components), N)``, in the units of ``components``."""

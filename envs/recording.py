@@ -173,6 +173,13 @@ class Recording:
         there = numpy.arange(self.seconds.shape[1]) < self.rows[:, None]
         return bool(numpy.isfinite(self.truth[there]).all())
 
+    def has_interval(self, seconds: float) -> bool:
+        """Whether measurements come that many seconds apart, the first that far from the start of the track."""
+        times = seconds * numpy.arange(1, self.seconds.shape[1] + 1)
+        late = numpy.abs(self.seconds - times)
+        # NaN beyond the end of a shorter episode. Times in a file are rounded.
+        return bool(numpy.nanmax(late, initial=0.0) <= 1e-6 * seconds + 1e-9 * times[-1])
+
     # --- as a scenario
 
     def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
@@ -432,25 +439,34 @@ def _first(values: numpy.ndarray) -> int:
     return int(numpy.argmin(numpy.isfinite(values).reshape(len(values), -1).all(axis=1)))
 
 
+def measure_examples(task: Task) -> tuple[Any, Any, Any]:
+    """What a task of NumPy says of a start of the track, one measurement, and what was fed back in between; eight
+    episodes side by side.
+    """
+    world = task.World(task)
+    draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
+    truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
+    bank = Model(task, task.controls[0]).filter
+    feedback = bank.feedback(bank.start(initial), initial)
+    row = numpy.zeros((world.normals + world.row_uniforms, 8))
+    row[world.normals :] = 0.5
+    return initial, world.advance(truth, row, feedback)[1], feedback
+
+
 def measure_once(task: Task) -> tuple[Any, Any]:
     """What a task of NumPy says of a start of the track, and one measurement; eight episodes side by side.
 
     Raises:
         ValueError: if what is measured depends on what is estimated.
     """
-    world = task.World(task)
-    draws = Draws.counting(numpy.full((1, 8), 0.5), numpy)
-    truth, initial = world.begin(draws, numpy.zeros((world.initial_normals, 8)))
-    bank = Model(task, task.controls[0]).filter
-    if bank.feedback(bank.start(initial), initial) is not None:
+    initial, measurement, feedback = measure_examples(task)
+    if feedback is not None:
         raise ValueError(
             f"{task.id} with these parameters is a closed loop, in which the estimate decides what is measured next: "
             "what the sensors said to one estimate is not what they would have said to another, and can be neither "
             "recorded nor replayed"
         )
-    row = numpy.zeros((world.normals + world.row_uniforms, 8))
-    row[world.normals :] = 0.5
-    return initial, world.advance(truth, row, None)[1]
+    return initial, measurement
 
 
 def fill_arrays(like: Any, values: Callable[[str], Array], xp: Any) -> Any:

@@ -49,6 +49,7 @@ import numpy
 from ..filters.array_namespace import lane_arrays, stack_nested
 from .draws import Draws
 from .filter import Bank
+from .live_input import LiveInput
 from .log_format import LogFormat
 from .observation import Array
 from .world import World
@@ -131,6 +132,8 @@ class Task(ABC):
     """What an action means under each control, in words."""
     log_format: ClassVar[LogFormat | None] = None
     """Tables of real measurements that can be read; None where they cannot."""
+    live_input: ClassVar[type[LiveInput]] = LiveInput
+    """Makes measurements of values that come one by one."""
     scenarios: ClassVar[Mapping[str, Scenario]]
     default_scenario: ClassVar[str] = "random"
     components: tuple[Component, ...]
@@ -222,10 +225,7 @@ class Task(ABC):
         """
         seconds: float | None = self._sampling_interval()
         if seconds is not None and self.recording is not None:
-            times = seconds * numpy.arange(1, self.recording.seconds.shape[1] + 1)
-            late = numpy.abs(self.recording.seconds - times)
-            # NaN beyond the end of a shorter episode. Times in a file are rounded.
-            return seconds if numpy.nanmax(late, initial=0.0) <= 1e-6 * seconds + 1e-9 * times[-1] else None
+            return seconds if self.recording.has_interval(seconds) else None
         return seconds
 
     def _sampling_interval(self) -> float | None:

@@ -17,6 +17,7 @@ from .envs.trajectory import Trajectory
 from .evaluation.competitors import FunctionPolicy, Likelihood
 
 if TYPE_CHECKING:
+    from .live import online
     from .names import evaluate, make_policy, record, tidy_records
 
 __version__ = "0.1.0"
@@ -28,6 +29,7 @@ __all__ = [
     "Trajectory",
     "evaluate",
     "make_policy",
+    "online",
     "read_flights",
     "read_recording",
     "record",
@@ -65,6 +67,10 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
 
 def __getattr__(name: str) -> Any:
     # On first use: an evaluation brings xarray, and making environments needs none of it.
+    if name == "online":
+        from . import live
+
+        return live.online
     if name not in ("evaluate", "make_policy", "record", "tidy_records"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from . import names

@@ -6,7 +6,7 @@ SMALLEST_RANGE = 1.0
 """Metres; nearer than this the azimuth is undefined and the variances are evaluated here."""
 
 
-def cartesian_variances(position: Array, range_sigma: float, bearing_sigma: float) -> Array:
+def cartesian_variances(position: Array, range_sigma: Array, bearing_sigma: Array) -> Array:
     """Variances along x and y of a polar measurement, equations (22) and (23) of the IMM paper.
 
     ``sigma_x^2 = cos^2(b) sigma_r^2 + r^2 sin^2(b) sigma_b^2`` and the same with sine and cosine exchanged
@@ -14,8 +14,8 @@ def cartesian_variances(position: Array, range_sigma: float, bearing_sigma: floa
 
     Args:
         position: x and y where the variances are evaluated, ``(2, ...)``, m.
-        range_sigma: standard deviation of the range, m.
-        bearing_sigma: standard deviation of the azimuth, rad.
+        range_sigma: standard deviation of the range, m; a number or ``(...)``.
+        bearing_sigma: standard deviation of the azimuth, rad, likewise.
 
     Returns:
         ``(2, ...)``, m^2.

@@ -16,6 +16,7 @@ from ..model import Model
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .kalman_net import KalmanNetBank
+from .live import PositionInput
 from .logs import LOG_FORMAT
 from .parameters import AXES, LooselyCoupledNavigationParameters
 from .scenarios import SCENARIOS
@@ -98,6 +99,7 @@ class LooselyCoupledNavigation(Task):
     Parameters = LooselyCoupledNavigationParameters
     World = InsGnssWorld
     log_format = LOG_FORMAT
+    live_input = PositionInput
     actions = {
         "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
         "`receiver_scale` to the power of a positive, `receiver_reduction` to that of a negative action for the "

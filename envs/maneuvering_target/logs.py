@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 
 from ...filters import polar
+from ..live_input import Feed
 from ..log_format import LogFormat, TrackLog, TrackStart
 from ..plausibility import check_bearings
 from ..recorded_tables import Columns
@@ -141,8 +142,10 @@ def _gap_notes(rows: numpy.ndarray) -> tuple[str, ...]:
     )
 
 
-def has_regular_scans(recording: Recording, p: ManeuveringTargetParameters) -> bool:
+def has_regular_scans(recording: Recording | Feed, p: ManeuveringTargetParameters) -> bool:
     """Whether every scan of a recording has a plot, and all are one sampling interval apart, to the last bit."""
+    if isinstance(recording, Feed):
+        return recording.regular
     there = numpy.isfinite(recording.seconds)
     said = recording.measurements
     return all(

@@ -18,6 +18,7 @@ from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .kalman_net import KalmanNetBank
+from .live import PlotInput
 from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
 from .parameters import ManeuveringTargetParameters
 from .scenarios import SCENARIOS
@@ -97,6 +98,7 @@ class ManeuveringTarget(Task):
     Parameters = ManeuveringTargetParameters
     World = RadarWorld
     log_format = LOG_FORMAT
+    live_input = PlotInput
     actions = {
         "evidence": "times `evidence_scale` nats, added to the log-posterior of each mode; **0 is the paper's IMM**",
         "gains": "position gains of the filters of the paper's IMM: `logit alpha = logit gain + gain_logits a`, with "

@@ -15,6 +15,7 @@ from ..model import Episode, Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
 from .banks import ClassBank, one_hot
+from .live import ScanInput
 from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
 from .scenarios import SCENARIOS
@@ -109,6 +110,7 @@ class RadarEsmTracking(Task):
     Parameters = RadarEsmTrackingParameters
     World = RadarEsmWorld
     log_format = LOG_FORMAT
+    live_input = ScanInput
     actions = {
         "evidence": "times `evidence_scale` nats, added to log P; **0 is the paper's algorithm**",
         "mode": "the class that is believed",

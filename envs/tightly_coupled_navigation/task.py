@@ -25,6 +25,7 @@ from ..model import Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
 from .banks import HypothesisBank, NoiseBank, RobustBank
+from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
 from .world import NavigationWorld
@@ -99,6 +100,7 @@ class TightlyCoupledNavigation(Task):
     )
     Parameters = TightlyCoupledNavigationParameters
     World = NavigationWorld
+    live_input = ReceiverInput
     actions = {
         "gain": "what the standard deviation of the noise is taken to be, over the nominal one, for each "
         "sensor group (pseudoranges, rates, accelerometers, attitude): 300 to the power of a "

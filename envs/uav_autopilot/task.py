@@ -23,6 +23,7 @@ from ..model import Episode, Model
 from ..observation import Array
 from ..task import PaperPolicy, Task
 from .banks import GainBank, ModeBank, NoiseBank
+from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
 from .scenarios import SCENARIOS
@@ -104,6 +105,7 @@ class UavAutopilot(Task):
     )
     Parameters = UavAutopilotParameters
     World = AircraftWorld
+    live_input = SensorInput
     actions = {
         "noise": "the process noise Q of the filter is scaled by 10^(1.5 a) (`process_decades`), the standard deviation of "
         "each sensor by 10^(0.8 a) (`sensor_decades`), in the update by the measurement that was just shown; "

@@ -1,0 +1,198 @@
+"""Measurements that come one by one from outside, in place of a simulated world.
+
+A :class:`Feed` stands in a task where a recording would; what comes is made into the task's ``Measurement`` by its
+:class:`LiveInput`.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy
+
+from ..compiler.functions import leaves, map_arrays
+
+if TYPE_CHECKING:
+    from .task import Task
+
+Memory = dict[str, Any]
+"""What an input remembers of the measurements before: arrays ``(..., N)`` by name."""
+
+
+@dataclass(frozen=True)
+class Feed:
+    """Stands in a task in a recording's place: what is measured comes from outside, and nobody knows the truth.
+
+    Args:
+        regular: whether every measurement comes, one sampling interval after the one before.
+    """
+
+    regular: bool = False
+    truth: ClassVar[None] = None
+    has_whole_truth: ClassVar[bool] = False
+
+    def has_interval(self, seconds: float) -> bool:
+        """Whether measurements come that many seconds apart; where times do not matter to the filters, they do."""
+        return True
+
+    def lengths_within(self, horizon: int, decision_interval: int) -> tuple[int, ...]:
+        """No episodes: it goes on as long as measurements come."""
+        return ()
+
+    def world(self, task: "Task") -> Any:
+        """Return the task's own world, which nobody asks."""
+        return task.World(task)
+
+
+class LiveInput:
+    """Makes measurements of values as they come.
+
+    This one serves every task: the values are the arrays of its ``Measurement``, by their names. Where the sensors of a
+    task say the same in plainer words, it has a subclass.
+
+    Args:
+        task: on NumPy arrays.
+        initial: an initial estimate, for its names and shapes.
+        measurement: a measurement, likewise.
+        tracks: how many come side by side, N.
+
+    Attributes:
+        values: names of what it takes at a measurement, and what they are.
+        start_values: likewise at the start, beside mean and covariance.
+    """
+
+    counter: ClassVar[str] = "number"
+    """Array of the measurement that counts measurements."""
+    values: Mapping[str, str]
+    start_values: Mapping[str, str]
+
+    def __init__(self, task: "Task", initial: Any, measurement: Any, tracks: int) -> None:
+        self.task, self.tracks = task, tracks
+        self.parameters: Any = task.parameters
+        self.initial, self.measurement = initial, measurement
+        self.values, self.start_values = self.describe()
+
+    def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Return what :attr:`values` and :attr:`start_values` are."""
+
+        def shapes(part: Any, left_out: Iterable[str]) -> dict[str, str]:
+            return {
+                name: f"shape {array.shape[:-1]}"
+                for name, array in part._asdict().items()
+                if name not in left_out
+            }
+
+        return shapes(self.measurement, [self.counter]), shapes(self.initial, ["mean", "covariance"])
+
+    def read(self, values: Mapping[str, Any], name: str, shape: tuple[int, ...] = ()) -> numpy.ndarray:
+        """Return a value as an array ``(*shape, N)``; NaN where it did not come.
+
+        Raises:
+            ValueError: for another shape.
+        """
+        value: Any = values.get(name)
+        array = numpy.asarray(numpy.nan if value is None else value, dtype=float)
+        if array.shape == shape:
+            array = array[..., None]
+        elif value is None:
+            array = numpy.full((*shape, 1), numpy.nan)
+        try:
+            return numpy.broadcast_to(array, (*shape, self.tracks))
+        except ValueError:
+            tracks = f", or (..., {self.tracks}) for {self.tracks} tracks" if self.tracks > 1 else ""
+            raise ValueError(f"{name} must have shape {shape}{tracks}, got {numpy.shape(value)}") from None
+
+    def read_all(self, values: Mapping[str, Any], names: Iterable[str], what: str) -> numpy.ndarray:
+        """Return some numbers as ``(len(names), N)``.
+
+        Raises:
+            ValueError: if one is missing.
+        """
+        found = numpy.stack([self.read(values, name) for name in names])
+        if not numpy.isfinite(found).all():
+            raise ValueError(f"{self.task.id} needs {', '.join(names)} {what}, got {_listed(values)}")
+        return found
+
+    def check_names(self, values: Mapping[str, Any], known: Mapping[str, str]) -> None:
+        """Raise ValueError for a value of another name."""
+        unknown = [name for name in values if name not in known]
+        if unknown:
+            listed = ", ".join(f"{name} ({text})" for name, text in known.items())
+            raise ValueError(f"unknown value {unknown[0]!r}: {self.task.id} takes {listed or 'no more'}")
+
+    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Initial estimate of the task's NamedTuple, and memory.
+
+        Args:
+            time: of the start, s, ``(N,)``.
+            given: ``mean``, ``covariance`` and other values by name; arrays of one track, or with N last.
+
+        Raises:
+            ValueError: for what is missing, unknown, or of another shape.
+        """
+        return self.fill(self.initial, given, "at the start"), {
+            "time": time,
+            "count": numpy.zeros(self.tracks),
+        }
+
+    def fill(self, like: Any, given: Mapping[str, Any], what: str) -> Any:
+        """NamedTuple of arrays ``(..., N)``, in the types of another.
+
+        Raises:
+            ValueError: for what is missing or not finite.
+        """
+        found = {}
+        for name, array in like._asdict().items():
+            values = self.read(given, name, array.shape[:-1])
+            if not numpy.isfinite(values).all():
+                raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(given)}")
+            found[name] = values > 0.5 if array.dtype.kind == "b" else values.astype(array.dtype)
+        return type(like)(**found)
+
+    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Make the measurement of the values that came at a time.
+
+        Args:
+            memory: of the measurements before.
+            time: s, ``(N,)``.
+            values: by name; what did not come is None, NaN or left out.
+
+        Raises:
+            ValueError: for what is missing, unknown, or of another shape.
+        """
+        given = {**values, self.counter: memory["count"] + 1.0}
+        field = self.task.World.received_field
+        if field:
+            shape = getattr(self.measurement, field).shape[:-1]
+            received = self.read(values, field, shape)
+            there = numpy.isfinite(received)
+            if self.measurement.available.ndim == 1:
+                there = there.all(axis=tuple(range(len(shape))))
+            if "available" in values:
+                there = there & (self.read(values, "available", self.measurement.available.shape[:-1]) > 0.0)
+            given |= {field: self.replace_missing(memory, received, there), "available": there}
+        return self.fill(self.measurement, given, "at every measurement"), {
+            **memory,
+            "time": time,
+            "count": given[self.counter],
+        }
+
+    def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
+        """Numbers that stand for what was not received; zeros."""
+        return numpy.where(there & numpy.isfinite(received), received, 0.0)
+
+
+def _listed(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value!r:.40}" for name, value in values.items()) or "nothing"
+
+
+def merge_tracks(old: Any, new: Any, chosen: numpy.ndarray) -> Any:
+    """Nested tuples of arrays ``(..., N)`` in which some tracks are those of others.
+
+    Args:
+        old: all tracks.
+        new: likewise.
+        chosen: which are taken from ``new``, booleans, ``(N,)``.
+    """
+    arrays = iter(leaves(new))
+    return map_arrays(lambda array: numpy.where(chosen, next(arrays), array), old)

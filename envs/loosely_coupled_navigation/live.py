@@ -1,0 +1,52 @@
+"""Positions by INS and receiver as they come, as measurements of LooselyCoupledNavigation."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy
+
+from ..live_input import LiveInput, Memory
+from .world import Measurement
+
+
+class PositionInput(LiveInput):
+    """The position by the INS at every measurement, and a fix where there is one."""
+
+    def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Return what is said in metres."""
+        values = {
+            "ins": "m, position by the INS alone, one number for each axis",
+            "fix": "m, position by the receiver, likewise; left out where there is none",
+            "sigma": "m, standard deviation of each axis of the fix, as reported; default: the parameters'",
+        }
+        return values, {"ins": "m, position by the INS at the start; default: the mean"}
+
+    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Start where INS and track are."""
+        initial, memory = super().start(time, {n: v for n, v in given.items() if n != "ins"})
+        ins = self.read(given, "ins", (self.parameters.axes,)) if "ins" in given else initial.mean
+        return initial, {**memory, "ins": ins}
+
+    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Take increment and fix; a fix of some axes is none."""
+        self.check_names(values, self.values)
+        p = self.parameters
+        values = {
+            **values,
+            **{name: numpy.atleast_1d(values[name]) for name in ("ins", "fix") if name in values},
+        }
+        ins, fix = self.read(values, "ins", (p.axes,)), self.read(values, "fix", (p.axes,))
+        if not numpy.isfinite(ins).all():
+            raise ValueError(f"{self.task.id} needs ins at every measurement, {p.axes} finite numbers (m)")
+        sigma = self.read(values, "sigma")
+        there = numpy.isfinite(fix).all(axis=0)
+        number = memory["count"] + 1.0
+        measurement = Measurement(
+            number,
+            ins,
+            ins - memory["ins"],
+            numpy.where(there, fix, 0.0),
+            there.astype(float),
+            numpy.where(numpy.isfinite(sigma), sigma, p.receiver_variance**0.5),
+        )
+        return measurement, {"time": time, "count": number, "ins": ins}

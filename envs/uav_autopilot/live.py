@@ -1,0 +1,38 @@
+"""What sensors and autopilot of an aircraft say as they say it, as measurements of UavAutopilot."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy
+
+from ..live_input import LiveInput, Memory
+
+
+class SensorInput(LiveInput):
+    """Readings of the sensors, the command and the control in force; a sensor that drops out holds its last reading."""
+
+    def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
+        """Return readings, command and control with their units."""
+        sensors = ", ".join(self.task.sensors)  # type: ignore[attr-defined]
+        values = {
+            "reading": f"of each sensor ({sensors}) in the unit of its coordinate; NaN in a dropout",
+            "command": "in the unit of the output",
+            "control": "in force since the measurement before: what was fed back",
+        }
+        return values, {"command": "at the start, in the unit of the output"}
+
+    def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Start with no reading; nothing is commanded unless it is said."""
+        initial, memory = super().start(time, {"command": 0.0, **given})
+        sensors = self.measurement.reading.shape[0]
+        return initial, {**memory, "reading": numpy.zeros((sensors, self.tracks))}
+
+    def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
+        """Take the readings that came."""
+        self.check_names(values, self.values)
+        measurement, after = super().measure(memory, time, values)
+        return measurement, {**after, "reading": measurement.reading}
+
+    def replace_missing(self, memory: Memory, received: numpy.ndarray, there: numpy.ndarray) -> numpy.ndarray:
+        """Hold the last reading."""
+        return numpy.where(there, received, memory["reading"])

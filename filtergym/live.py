@@ -1,0 +1,84 @@
+"""Run what competes in a loop of one's own."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from .agents.envelope import WatchedPolicy, training_range
+from .agents.learned_estimator import EstimatorMaker
+from .baselines.problem import Problem
+from .envs.backend import make_model
+from .envs.catalogue import find_scenario
+from .envs.live_input import Feed
+from .evaluation.competitors import kind_of, make_competitor
+from .evaluation.evaluate import control_of
+from .evaluation.online import OnlineFilter
+from .names import find_competitor, import_problem, with_normalisation
+
+
+def online(
+    env: str,
+    policy: Any,
+    control: str | None = None,
+    scenario: Any = None,
+    *,
+    tracks: int = 1,
+    regular: bool = False,
+    backend: str = "auto",
+    trust: bool = False,
+    **keywords: Any,
+) -> OnlineFilter:
+    """Make a filter that runs in a loop of your own: a policy in its bank, an estimator, an agent, or one of yours.
+
+    Call its ``start`` once, then ``update`` with every measurement.
+
+    Args:
+        env: environment id, such as ``"filtergym/ManeuveringTarget-v0"``.
+        policy: a name or a path, see :func:`~filtergym.names.competitor`, or an object or a class as in
+            :func:`~filtergym.evaluate`.
+        control: demand this control; by default the policy's own.
+        scenario: whose parameters are taken; default: the environment's.
+        tracks: how many are followed side by side.
+        regular: every measurement comes, one sampling interval after the one before; some filters are then simpler.
+        backend: what computes, "auto", "compiled" or "numpy".
+        trust: load a model's zip, which can execute code.
+        **keywords: parameters of the task.
+
+    Raises:
+        ValueError: for unknown names, and what needs the truth or later measurements.
+    """
+    problem = import_problem(env)
+    named = isinstance(policy, str | Path)
+    name = str(policy) if named else type(policy).__name__
+    maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
+    return make_online(problem, name, maker, control, scenario, tracks, regular, backend, keywords)
+
+
+def make_online(
+    problem: Problem,
+    name: str,
+    maker: Any,
+    control: str | None,
+    scenario: Any,
+    tracks: int,
+    regular: bool,
+    backend: str,
+    keywords: dict[str, Any],
+) -> OnlineFilter:
+    """Make the filter of a competitor; arguments and refusals as of :func:`online`."""
+    kind = kind_of(maker)
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
+    chosen = dataclasses.replace(
+        find_scenario(problem.task, scenario, keywords), flights=(), recording=Feed(regular)
+    )
+    own = control_of(maker, kind, control, problem.task, name)
+    model = make_model(problem.task, own, chosen, backend=backend, **keywords)
+    range = training_range(problem.task, maker)
+    if range is None:
+        return OnlineFilter(model, maker, kind, name, tracks)
+    if isinstance(maker, EstimatorMaker):
+        estimator = maker(model.task)
+        watch = estimator.network = WatchedPolicy(estimator.network, range)
+        return OnlineFilter(model, estimator, kind, name, tracks, watch)
+    watch = WatchedPolicy(make_competitor(maker, model), range)
+    return OnlineFilter(model, watch, kind, name, tracks, watch)

@@ -1,0 +1,294 @@
+"""A filter in a loop of one's own gives what an evaluation gives, whatever it is."""
+
+import pickle
+
+import numpy as np
+import pytest
+from filtergym.envs.backend import make_model
+from filtergym.envs.catalogue import read_recording
+from filtergym.envs.task import named_arrays
+from filtergym.evaluation.competitors import kind_of
+from filtergym.evaluation.evaluate import control_of
+from filtergym.evaluation.rollout import run_competitor, start_lanes
+
+import filtergym
+from filtergym.names import find_competitor, import_problem
+
+RADAR, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
+ESM, UAV = "filtergym/RadarEsmTracking-v0", "filtergym/UavAutopilot-v0"
+TIGHT = "filtergym/TightlyCoupledNavigation-v0"
+STATE, COVARIANCE = [1e4, 2e4, -200.0, 50.0], np.diag([1e4, 1e4, 400.0, 400.0])
+
+
+def with_measurement(model, episode):
+    return {"estimate": model.mean(episode), **dict(named_arrays(episode.measurement))}
+
+
+@pytest.mark.parametrize(
+    ("id", "name", "options"),
+    [
+        (RADAR, "imm", {}),
+        (RADAR, "kalman-imm-turn-tuned", {}),
+        (RADAR, "kalman-net", {}),
+        (RADAR, "bptt", {"decision_interval": 3}),
+        (RADAR, "adaptive-rearm", {"scenario": "missed-detections"}),
+        (ESM, "forgetting-joint-type", {}),
+        (LOOSE, "innovation-adaptive", {"decision_interval": 5}),
+        (LOOSE, "kalman-net", {}),
+        (UAV, "innovation-adaptive", {}),
+        (UAV, "sage-husa", {}),
+        pytest.param(TIGHT, "nis-adaptive", {}, marks=pytest.mark.slow),
+        pytest.param(TIGHT, "huber", {}, marks=pytest.mark.slow),
+    ],
+)
+def test_the_same_measurements_give_the_same_bits(id, name, options, monkeypatch):
+    problem, count, seeds = import_problem(id), 30, [3, 4, 5]
+    maker, scenario = find_competitor(problem, name), options.get("scenario")
+    keywords = {"horizon": count, **getattr(maker, "task_keywords", {}), **options}
+    keywords.pop("scenario", None)
+    kind = kind_of(maker)
+    model = make_model(
+        problem.task, control_of(maker, kind, None, problem.task, name), scenario, backend="auto", **keywords
+    )
+    flown = run_competitor(model, maker, kind, seeds, with_measurement)
+    begun = []
+    start_lanes(model, seeds, begun.append)
+    filter = filtergym.online(id, name, tracks=3, scenario=scenario, regular=scenario is None, **keywords)
+
+    def start(time, given):
+        return first_tracks(begun[0].measurement), {"time": time, "k": 0}
+
+    def measure(memory, time, values):
+        arrays = iter(dict(named_arrays(filter.input.measurement)))
+        k = memory["k"]
+        measured = map_leaves(
+            lambda _: np.moveaxis(flown[next(arrays)][:, k], 0, -1), filter.input.measurement
+        )
+        return measured, {"time": time, "k": k + 1}
+
+    monkeypatch.setattr(filter.input, "start", start)
+    monkeypatch.setattr(filter.input, "measure", measure)
+    filter.start()
+    for k in range(count):
+        if k == 7:
+            ahead = filter.predict(100.0)
+            saved = pickle.loads(pickle.dumps(filter.save()))
+            filter.update(101.0)
+            filter.restore(saved)
+        estimate = filter.update(float(k + 1))
+        np.testing.assert_array_equal(estimate.mean.T, flown["estimate"][:, k], err_msg=f"measurement {k}")
+        if k == 7:
+            np.testing.assert_array_equal(ahead.mean, estimate.mean)
+
+
+def map_leaves(function, part):
+    return type(part)(*(map_leaves(function, p) if isinstance(p, tuple) else function(p) for p in part))
+
+
+def first_tracks(part):
+    return map_leaves(lambda array: array[..., :3], part)
+
+
+LOGS = {
+    RADAR: (
+        "time,x,y,sigma_x,sigma_y\n"
+        "0,1000,2000,30,20\n4,1200,2050,30,20\n8,1410,2090,30,25\n12,,,,\n17,1800,2200,30,20\n20,2010,2260,20,20\n",
+        ("x", "y", "sigma_x", "sigma_y"),
+        2,
+    ),
+    f"{RADAR} polar": (
+        "time,range,azimuth\n0,20000,30\n4,20300,30.5\n8,20600,31.1\n12,20900,31.5\n16.5,21250,32\n",
+        ("range", "azimuth"),
+        2,
+    ),
+    ESM: (
+        "time,range,range_rate,decision,radar_bearing,esm_bearing\n"
+        "0,30000,-200,1,10,9.5\n2,29600,-201,,10,\n4,29210,-199,0,359.5,0.4\n6,28800,-198,2,3,3.2\n",
+        ("range", "range_rate", "decision", "radar_bearing", "esm_bearing"),
+        1,
+    ),
+    LOOSE: (
+        "time,ins,fix,sigma\n0,1.5,1.0,1\n0.01,1.6,1.2,1\n0.02,1.7,,1\n0.03,1.9,1.1,2\n0.04,2.1,1.6,1\n",
+        ("ins", "fix", "sigma"),
+        1,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", LOGS)
+def test_rows_that_come_one_by_one_make_the_measurements_of_their_log(case, tmp_path):
+    id = case.split(" ")[0]
+    text, names, begun = LOGS[case]
+    path = tmp_path / "log.csv"
+    path.write_text(text)
+    recording = read_recording(path, id)
+    rows = np.genfromtxt(path, delimiter=",", names=True)
+    filter = filtergym.online(id, import_problem(id).paper, **recording.parameters)
+    first = {name: rows[name][0] for name in names}
+    mean, covariance = (recording.initial[name][0] for name in ("mean", "covariance"))
+    filter.start(mean, covariance, rows["time"][begun - 1], **(first if id == ESM else {}))
+    for k, row in enumerate(rows[begun:]):
+        measurement, _ = filter.input.measure(
+            filter._running().input, np.array([row["time"]]), {name: row[name] for name in names}
+        )
+        for name, array in named_arrays(measurement):
+            expected = recording.measurements[name][0, k]
+            assert array[..., 0].dtype == expected.dtype or expected.dtype.kind in "fi"
+            np.testing.assert_array_equal(array[..., 0], expected, err_msg=name)
+        filter.update(row["time"], **{name: row[name] for name in names})
+
+
+def test_a_radar_track_in_plain_words():
+    filter = filtergym.online(RADAR, "kalman-imm-turn", sampling_interval=4.0)
+    filter.start(STATE, COVARIANCE, time=100.0)
+    first = filter.update(104.0, x=9.2e3, y=20.2e3)
+    assert first.names[0] == "position_x"
+    assert first.units[2] == "m/s"
+    assert first.time == 104.0
+    assert first["position_x"] == first.mean[0] == pytest.approx(9.2e3, abs=100.0)
+    np.testing.assert_allclose(first.sigma**2, np.diag(first.covariance))
+    assert first.nis > 0.0
+    assert first.nis_degrees == 2.0
+    assert np.isfinite(first.log_likelihood)
+    assert str(first).startswith("position_x 9")
+    assert " m/s" in str(first)
+    missed = filter.update()
+    assert missed.time == 108.0
+    assert np.isnan(missed.nis)
+    assert missed.sigma[0] > first.sigma[0]
+    late = filter.update(
+        115.5, range=float(np.hypot(6.8e3, 20.8e3)), azimuth=np.degrees(np.arctan2(6.8, 20.8))
+    )
+    assert late["position_x"] == pytest.approx(6.8e3, abs=300.0)
+    assert "update takes x (m, east of the radar)" in repr(filter)
+
+
+def test_tracks_start_anew_alone():
+    def feed(filter, count, first=0):
+        return [
+            filter.update(
+                4.0 * (k + 1),
+                x=np.array([1e4, 3e4]) - 800.0 * k,
+                y=np.array([2e4, np.nan if k == 2 else 1e4]) + 210.0 * k,
+            )
+            for k in range(first, count)
+        ][-1]
+
+    for name in ("bptt", "adaptive", "kalman-imm-turn"):
+        both = filtergym.online(RADAR, name, tracks=2)
+        start = np.array([STATE, [3e4, 1e4, -200.0, 50.0]]).T
+        both.start(start, np.repeat(COVARIANCE[:, :, None], 2, axis=2))
+        feed(both, 5)
+        both.start(start, np.repeat(COVARIANCE[:, :, None], 2, axis=2), time=20.0, tracks=[1])
+        last = feed(both, 9, 5)
+        kept = filtergym.online(RADAR, name, tracks=2)
+        kept.start(start, np.repeat(COVARIANCE[:, :, None], 2, axis=2))
+        np.testing.assert_array_equal(feed(kept, 9).mean[:, 0], last.mean[:, 0])
+        anew = filtergym.online(RADAR, name, tracks=2)
+        anew.start(start, np.repeat(COVARIANCE[:, :, None], 2, axis=2), time=20.0)
+        np.testing.assert_array_equal(feed(anew, 9, 5).mean[:, 1], last.mean[:, 1])
+
+
+class Last:
+    """The last plot; it counts in the object, so that it runs in Python."""
+
+    kind = "estimator"
+
+    def start(self, initial, N):
+        return {"mean": initial.mean.copy(), "plots": 0}
+
+    def update(self, measurement, memory):
+        memory["plots"] += 1
+        seen = ~np.isnan(measurement.position)
+        memory["mean"][:2] = np.where(seen, measurement.position, memory["mean"][:2])
+        covariance = np.repeat(np.diag([1e4, 1e4, 1e2, 1e2])[:, :, None], measurement.scan.shape[0], axis=2)
+        return memory["mean"] + memory["plots"] * np.array([0, 0, 1.0, 0])[:, None], covariance, memory
+
+
+def test_a_users_own_runs_is_saved_and_restored():
+    filter = filtergym.online(RADAR, Last)
+    filter.start(STATE, COVARIANCE)
+    assert filter.update(5.0, x=1.0, y=2.0).mean.tolist() == [1.0, 2.0, -199.0, 50.0]
+    saved = filter.save()
+    assert filter.predict(10.0).mean.tolist() == [1.0, 2.0, -198.0, 50.0]
+    assert filter.update(10.0, x=3.0, y=4.0).mean.tolist() == [3.0, 4.0, -198.0, 50.0]
+    filter.restore(saved)
+    assert filter.update(10.0).mean.tolist() == [1.0, 2.0, -198.0, 50.0]
+    with pytest.raises(ValueError, match="cannot start single tracks anew"):
+        filter.start(STATE, COVARIANCE, tracks=[0])
+
+
+def test_an_agent_says_when_what_comes_is_unlike_its_training():
+    filter = filtergym.online(RADAR, "bptt", sampling_interval=5.0)
+    filter.start(STATE, COVARIANCE)
+    rng = np.random.default_rng(1)
+    for k in range(40):
+        x, y = 1e4 - 1000.0 * (k + 1) + 100.0 * rng.normal(), 2e4 + 250.0 * (k + 1) + 100.0 * rng.normal()
+        said = filter.update(x=x, y=y).departure
+    assert said == ""
+    for _ in range(40):
+        said = filter.update(x=x, y=y, sigma_x=0.5, sigma_y=0.5).departure
+    assert "lie outside of all that it saw in training" in said
+    filter.start(STATE, COVARIANCE)
+    assert filter.update(x=9e3, y=2e4).departure == ""
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda f: f.update(x=1.0, y=2.0), "has not been started: call start first"),
+        (lambda f: f.start(STATE), "needs covariance at the start, finite, got mean="),
+        (lambda f: f.start(STATE[:3], COVARIANCE), r"mean must have shape \(4,\), got \(3,\)"),
+        (lambda f: f.start(STATE, COVARIANCE, position=3), "unknown value 'position'"),
+        (lambda f: f.start(STATE, COVARIANCE, time=np.nan), "time must be finite seconds"),
+        (lambda f: f.update(1.0, X=1.0), r"unknown value 'X': .* takes x \(m, east"),
+        (
+            lambda f: f.update(-1.0, x=1.0, y=2.0),
+            "time must increase: the last measurement was at 0.0 s",
+        ),
+        (lambda f: f.update(x=[1.0, 2.0], y=2.0), r"x must have shape \(\), got \(2,\)"),
+    ],
+)
+def test_what_is_wrong_is_said(call, sentence):
+    filter = filtergym.online(RADAR, "imm")
+    if "call start" not in sentence:
+        filter.start(STATE, COVARIANCE)
+    with pytest.raises(ValueError, match=sentence):
+        call(filter)
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("kalman-smoother", "is of kind smoother and cannot run online"),
+        ("known-turn", "is of kind reference and cannot run online"),
+        ("imms", "unknown policy 'imms'"),
+    ],
+)
+def test_what_cannot_run_ahead_is_refused(name, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        filtergym.online(RADAR, name)
+
+
+def test_what_an_environment_needs_is_said():
+    filter = filtergym.online(LOOSE, "plain-reduced")
+    filter.start([0.0], [[0.0]])
+    filter.update(ins=0.1, fix=0.2)
+    with pytest.raises(ValueError, match="needs ins at every measurement"):
+        filter.update(fix=0.2)
+    esm = filtergym.online(ESM, "quasi-optimal")
+    with pytest.raises(ValueError, match="needs range, range_rate at every scan"):
+        esm.start(range=3e4)
+    esm.start(range=3e4, range_rate=-200.0)
+    with pytest.raises(ValueError, match="emitter type from 0 to"):
+        esm.update(range=3e4, range_rate=-200.0, decision=7)
+    with pytest.raises(ValueError, match="a decision needs radar_bearing"):
+        esm.update(range=3e4, range_rate=-200.0, decision=1)
+    assert esm.update(range=3e4, range_rate=-200.0, decision=1, bearing_difference=0.4).time > 0.0
+    uav = filtergym.online(UAV, "kalman")
+    sensors, states = uav.input.measurement.reading.shape[0], len(uav.names)
+    uav.start(np.zeros(states), np.eye(states))
+    held = uav.update(reading=np.full(sensors, np.nan), command=1.0, control=0.0)
+    assert np.isfinite(held.mean).all()
+    with pytest.raises(ValueError, match="needs command at every measurement"):
+        uav.update(reading=np.zeros(sensors), control=0.0)
