@@ -121,9 +121,9 @@ def training_range(cls: type[Task], maker: Any) -> TrainingRange | None:
 
 def _stored(maker: Any) -> Any:
     """Return what was loaded of a learned policy or estimator; None where its training is not known."""
-    stored = getattr(maker, "policy", maker)
-    header = getattr(stored, "header", None)
-    return None if header is None else stored
+    for inside in ("maker", "policy"):  # of a gate, of an estimator
+        maker = getattr(maker, inside, maker)
+    return maker if getattr(maker, "header", None) is not None else None
 
 
 def _own_parameters(cls: type[Task], run: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from typing import Any
 
 from .agents.envelope import WatchedPolicy, training_range
 from .agents.learned_estimator import EstimatorMaker
-from .baselines.problem import Problem
 from .envs.backend import make_model
 from .envs.catalogue import find_scenario
 from .envs.live_input import Feed
@@ -51,21 +50,6 @@ def online(
     named = isinstance(policy, str | Path)
     name = str(policy) if named else type(policy).__name__
     maker = find_competitor(problem, policy, trust) if named else with_normalisation(policy)
-    return make_online(problem, name, maker, control, scenario, tracks, regular, backend, keywords)
-
-
-def make_online(
-    problem: Problem,
-    name: str,
-    maker: Any,
-    control: str | None,
-    scenario: Any,
-    tracks: int,
-    regular: bool,
-    backend: str,
-    keywords: dict[str, Any],
-) -> OnlineFilter:
-    """Make the filter of a competitor; arguments and refusals as of :func:`online`."""
     kind = kind_of(maker)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(

@@ -1,6 +1,8 @@
 """A filter in a loop of one's own gives what an evaluation gives, whatever it is."""
 
 import pickle
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -163,6 +165,15 @@ def test_a_radar_track_in_plain_words():
     assert "update takes x (m, east of the radar)" in repr(filter)
 
 
+def test_a_target_that_stands_has_no_direction_but_an_estimate():
+    filter = filtergym.online(RADAR, "kalman-net")
+    filter.start([2e4, 3e4, 0.0, 0.0], np.diag([1e4, 1e4, 600.0, 600.0]))
+    with np.errstate(all="raise"):
+        estimates = [filter.update(x=2e4 + 10.0 * k, y=3e4).mean for k in range(3)]
+    np.testing.assert_allclose(estimates[0][:2], [2e4, 3e4], atol=1e-6)
+    assert np.isfinite(estimates).all()
+
+
 def test_tracks_start_anew_alone():
     def feed(filter, count, first=0):
         return [
@@ -231,6 +242,12 @@ def test_an_agent_says_when_what_comes_is_unlike_its_training():
     assert "lie outside of all that it saw in training" in said
     filter.start(STATE, COVARIANCE)
     assert filter.update(x=9e3, y=2e4).departure == ""
+
+
+def test_the_example_of_the_page_prints_what_the_page_says(capsys):
+    docs = Path(__file__).parent.parent / "docs"
+    runpy.run_path(str(docs / "examples" / "live_track.py"))
+    assert capsys.readouterr().out in (docs / "live.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -81,15 +81,21 @@ class Track(NamedTuple):
     """Its correlation between along and across, ``(N,)``."""
 
 
-def speed_of(velocity: Array, least: float = 1e-3) -> Array:
+STANDING = 1e-3
+"""Speed below which a target has no direction, m/s."""
+
+
+def speed_of(velocity: Array, least: float = STANDING) -> Array:
     """Speed, ``(N,)``, smoothly never below the least, m/s."""
     return (velocity[0] * velocity[0] + velocity[1] * velocity[1] + least**2) ** 0.5
 
 
 def frame_of(velocity: Array) -> Array:
-    """Rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``."""
+    """Rows of U^T: the direction of a velocity, and the one to its left, ``(2, 2, N)``; of what stands, the axes."""
     xp = namespace(velocity)
+    moves = velocity[0] * velocity[0] + velocity[1] * velocity[1] > STANDING**2
     direction = velocity / speed_of(velocity)
+    direction = xp.stack([xp.where(moves, direction[0], 1.0), xp.where(moves, direction[1], 0.0)])
     return xp.stack([direction, xp.stack([-direction[1], direction[0]])])
 
 

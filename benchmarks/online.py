@@ -1,0 +1,173 @@
+"""Filters in a loop of one's own: the same bits as a replay, and the time of an update beside filterpy and Stone Soup.
+
+Tracks with scans that missed the target are written as a log. Each is replayed by an evaluation, and fed row by row to
+the running filter, which is saved and restored by pickle on the way. Then every filter takes the same plots, one track.
+
+Example: python benchmarks/online.py --tracks 5 --plots 2000
+"""
+
+import argparse
+import gc
+import pickle
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy
+from filtergym.envs.catalogue import read_recording
+from filtergym.envs.recording import Recording
+
+import filtergym
+
+ID = "filtergym/ManeuveringTarget-v0"
+COMPETITORS = ("imm", "kalman-imm", "kalman-imm-turn", "adaptive-rearm", "sage-husa", "bptt", "kalman-net")
+T, SIGMA, MISSED, SAVED_EVERY = 4.0, 100.0, 0.1, 500
+
+
+def write_log(path: Path, tracks: int, plots: int) -> numpy.ndarray:
+    """Write tracks of a target that wanders, and return the rows: track, time, x, y."""
+    rng = numpy.random.default_rng(0)
+    rows = []
+    for track in range(tracks):
+        velocity = numpy.array([120.0, -60.0]) + numpy.cumsum(rng.normal(scale=4.0, size=(plots, 2)), axis=0)
+        velocity -= numpy.linspace(0.0, 1.0, plots)[:, None] * velocity.mean(axis=0)
+        position = numpy.array([2e4, 3e4]) + T * numpy.cumsum(velocity - velocity.mean(axis=0), axis=0)
+        position += SIGMA * rng.standard_normal(position.shape)
+        position[2:][rng.random(plots - 2) < MISSED] = numpy.nan
+        seconds = T * numpy.arange(plots) + rng.uniform(-0.2, 0.2, plots)
+        rows.append(numpy.column_stack([numpy.full(plots, track), seconds, position]))
+    table = numpy.round(numpy.concatenate(rows), 6)
+    lines = [",".join("" if numpy.isnan(v) else repr(float(v)) for v in row) for row in table]
+    path.write_text("recording,time,x,y\n" + "\n".join(lines) + "\n")
+    return table
+
+
+def differing_updates(name: str, recording: Recording, table: numpy.ndarray) -> tuple[int, int]:
+    """Count updates, and those whose estimate is not that of the replay to the last bit."""
+    replayed = filtergym.evaluate(
+        ID, name, recording, episodes=len(recording.names), tracks=True, sampling_interval=T
+    )
+    filter = filtergym.online(ID, name, sampling_interval=T)
+    count = differing = 0
+    for episode, track in enumerate(numpy.unique(table[:, 0])):
+        rows = table[table[:, 0] == track]
+        filter.start(recording.initial["mean"][episode], recording.initial["covariance"][episode], rows[1, 1])
+        wanted = replayed["estimate"].values[
+            0, list(replayed["flight"].values).index(recording.names[episode])
+        ]
+        for k, (_, seconds, x, y) in enumerate(rows[2:]):
+            estimate = filter.update(seconds, x=x, y=y)
+            if k < len(wanted) and numpy.isfinite(wanted[k]).all():
+                count, differing = count + 1, differing + (not numpy.array_equal(estimate.mean, wanted[k]))
+            if k % SAVED_EVERY == SAVED_EVERY - 1:
+                state = pickle.dumps(filter.save())
+                filter = filtergym.online(ID, name, sampling_interval=T)
+                filter.restore(pickle.loads(state))
+    return count, differing
+
+
+def own_update(name: str, backend: str) -> Callable[[float, float, float], object]:
+    """Return an update of a running filter."""
+    filter = filtergym.online(ID, name, backend=backend)
+    filter.start([2e4, 3e4, 0.0, 0.0], numpy.diag([1e4, 1e4, 600.0, 600.0]))
+    return lambda seconds, x, y: filter.update(seconds, x=x, y=y)
+
+
+def filterpy_update() -> Callable[[float, float, float], object]:
+    """Return an update of filterpy's IMM of two Kalman filters."""
+    from filterpy.kalman import IMMEstimator, KalmanFilter
+
+    filters = []
+    for acceleration in (0.0, 2.775):
+        one = KalmanFilter(dim_x=4, dim_z=2)
+        G = numpy.vstack([T**2 / 2 * numpy.eye(2), T * numpy.eye(2)])
+        one.x, one.F, one.H = (
+            numpy.array([2e4, 3e4, 0.0, 0.0]),
+            numpy.eye(4) + T * numpy.eye(4, k=2),
+            numpy.eye(2, 4),
+        )
+        one.P, one.R = numpy.diag([1e4, 1e4, 600.0, 600.0]), SIGMA**2 * numpy.eye(2)
+        one.Q = acceleration**2 * G @ G.T
+        filters.append(one)
+    estimator = IMMEstimator(filters, numpy.array([0.5, 0.5]), numpy.array([[0.9, 0.1], [0.1, 0.9]]))
+
+    def update(seconds: float, x: float, y: float) -> None:
+        estimator.predict()
+        estimator.update(numpy.array([x, y]))
+
+    return update
+
+
+def stone_soup_update() -> Callable[[float, float, float], object]:
+    """Return an update of Stone Soup's Kalman filter."""
+    from datetime import datetime, timedelta
+
+    from stonesoup.models.measurement.linear import LinearGaussian
+    from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+    from stonesoup.predictor.kalman import KalmanPredictor
+    from stonesoup.types.detection import Detection
+    from stonesoup.types.hypothesis import SingleHypothesis
+    from stonesoup.types.state import GaussianState
+    from stonesoup.updater.kalman import KalmanUpdater
+
+    predictor = KalmanPredictor(
+        CombinedLinearGaussianTransitionModel([ConstantVelocity(7.7), ConstantVelocity(7.7)])
+    )
+    sensor = LinearGaussian(4, [0, 2], SIGMA**2 * numpy.eye(2))
+    updater, begun = KalmanUpdater(sensor), datetime(2000, 1, 1)
+    track = GaussianState([[2e4], [0.0], [3e4], [0.0]], numpy.diag([1e4, 600.0, 1e4, 600.0]), timestamp=begun)
+
+    def update(seconds: float, x: float, y: float) -> None:
+        nonlocal track
+        moment = begun + timedelta(seconds=seconds)
+        prediction = predictor.predict(track, timestamp=moment)
+        detection = Detection([[x], [y]], timestamp=moment, measurement_model=sensor)
+        track = updater.update(SingleHypothesis(prediction, detection))
+
+    return update
+
+
+def latencies(update: Callable[[float, float, float], object], updates: int) -> numpy.ndarray:
+    """Return seconds of each update, after some that are not counted."""
+    rng = numpy.random.default_rng(1)
+    plots = numpy.array([2e4, 3e4]) + SIGMA * rng.standard_normal((updates + 100, 2))
+    found = numpy.empty(len(plots))
+    gc.disable()
+    for k, (x, y) in enumerate(plots):
+        begin = time.perf_counter()
+        update(T * (k + 1), x, y)
+        found[k] = time.perf_counter() - begin
+    gc.enable()
+    return found[100:]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--tracks", type=int, default=5)
+    parser.add_argument("--plots", type=int, default=2000, help="of each track")
+    parser.add_argument("--updates", type=int, default=5000, help="that are timed")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        table = write_log(path, asked.tracks, asked.plots)
+        recording = read_recording(path, ID, speeds=(0.001, 1000.0), sampling_interval=T)
+        print(f"{'':32} {'updates':>8} {'other bits than a replay':>25}")
+        for name in COMPETITORS:
+            count, differing = differing_updates(name, recording, table)
+            print(f"{name:32} {count:8,} {differing:25,}", flush=True)
+    cases = {name: own_update(name, "auto") for name in COMPETITORS}
+    cases |= {"kalman-imm, NumPy": own_update("kalman-imm", "numpy")}
+    cases |= {"filterpy, IMM of two": filterpy_update(), "Stone Soup, one Kalman filter": stone_soup_update()}
+    found = {name: latencies(update, asked.updates) for name, update in cases.items()}
+    peer = float(numpy.median(found["filterpy, IMM of two"]))
+    print(f"\n{'one track, us an update':32} {'median':>8} {'99.9 %':>8} {'filterpy / this':>16}")
+    for name, seconds in found.items():
+        median, late = numpy.median(seconds), numpy.quantile(seconds, 0.999)
+        print(f"{name:32} {1e6 * median:8.0f} {1e6 * late:8.0f} {peer / median:16.1f}")
+
+
+if __name__ == "__main__":
+    main()
