@@ -35,11 +35,20 @@ from filtergym.evaluation.evaluate import control_of
 from filtergym.evaluation.rollout import rollout, start_lanes
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.steered_filter import steer
+from peer_imm import imm_steps_per_second
+
 from filtergym.exports.c_source import FLAGS, Writer, files_of
 from filtergym.exports.replay import Replay, mean_rows, replay, run_filter
-from filtergym.exports.traced_filter import ANSWER, ESTIMATE, MEASUREMENT, SHOWN, STATE, TracedFilter, one_lane
+from filtergym.exports.traced_filter import (
+    ANSWER,
+    ESTIMATE,
+    MEASUREMENT,
+    SHOWN,
+    STATE,
+    TracedFilter,
+    one_lane,
+)
 from filtergym.names import find_competitor
-from peer_imm import imm_steps_per_second
 
 COLUMNS = (
     "environment", "competitor", "operations", "state_bytes", "weight_bytes", "double_sigmas", "float_sigmas",
@@ -85,7 +94,9 @@ int main(int argc, char **argv) {{
 """
 
 
-def run_in_c(name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compiler: str) -> tuple[float, float, Writer]:
+def run_in_c(
+    name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compiler: str
+) -> tuple[float, float, Writer]:
     """Largest difference, in standard deviations, nanoseconds an update, and what wrote the files."""
     writer = Writer(name, traced, scalar, given.components)
     T, E = len(given.measurements), given.initial.shape[1]
@@ -107,7 +118,11 @@ def run_in_c(name: str, traced: TracedFilter, given: Replay, scalar: Scalar, com
             [compiler, *FLAGS, "batch.c", f"{writer.name}.c", "-lm", "-o", "batch"], cwd=folder, check=True
         )
         done = subprocess.run(
-            [folder / "batch", "in", "out", str(E), str(T)], cwd=folder, check=True, capture_output=True, text=True
+            [folder / "batch", "in", "out", str(E), str(T)],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+            text=True,
         )
         means = numpy.frombuffer((folder / "out").read_bytes()).reshape(E, T, -1)
     return given.largest_difference(numpy.moveaxis(means, 0, -1)), float(done.stdout), writer
@@ -151,9 +166,7 @@ def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
         return least_time(lambda: own.update(received, memory), 3)
     steered = steer(plain, make_competitor(maker, plain))
     state = steered.start(started[0])
-    return least_time(
-        lambda: steered.update(steered.predict(state, measurement), Input(measurement)), 3
-    )
+    return least_time(lambda: steered.update(steered.predict(state, measurement), Input(measurement)), 3)
 
 
 def least_time(call: Any, count: int) -> float:
@@ -174,7 +187,9 @@ def ranked(problem: Problem) -> list[str]:
     return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
 
 
-def lines(problem: Problem, names: list[str], episodes: int, measurements: int, compiler: str) -> Iterator[dict[str, Any]]:
+def lines(
+    problem: Problem, names: list[str], episodes: int, measurements: int, compiler: str
+) -> Iterator[dict[str, Any]]:
     """A line for each competitor."""
     for name in names:
         maker = find_competitor(problem, name)
@@ -187,19 +202,30 @@ def lines(problem: Problem, names: list[str], episodes: int, measurements: int, 
         double, double_ns, writer = run_in_c(name, traced, given, DOUBLE, compiler)
         line |= {"double_sigmas": double, "double_ns": double_ns}
         found = writer.figures
-        line |= {"operations": found["operations"], "state_bytes": found["state_bytes"], "weight_bytes": found["constant_bytes"]}
+        line |= {
+            "operations": found["operations"],
+            "state_bytes": found["state_bytes"],
+            "weight_bytes": found["constant_bytes"],
+        }
         if found["operations"] > 10_000:
             # What takes a compiler minutes is run in float by NumPy.
-            line["float_sigmas"] = given.largest_difference(run_filter(traced, given, numpy.float32)[:, mean_rows(traced)])
+            line["float_sigmas"] = given.largest_difference(
+                run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
+            )
         else:
             line["float_sigmas"], line["float_ns"], _ = run_in_c(name, traced, given, FLOAT, compiler)
         with numpy.errstate(all="ignore"):
-            line |= {"llvm_ns": llvm_nanoseconds(traced, given), "numpy_ns": numpy_nanoseconds(problem, name, maker)}
+            line |= {
+                "llvm_ns": llvm_nanoseconds(traced, given),
+                "numpy_ns": numpy_nanoseconds(problem, name, maker),
+            }
         yield line
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--environment", action="append")
     parser.add_argument("--policy", action="append")
     parser.add_argument("--episodes", type=int, default=100)
@@ -213,7 +239,9 @@ def main() -> None:
     found: list[dict[str, Any]] = []
     for id in asked.environment or list(catalogue()):
         problem = problem_of(id)
-        for line in lines(problem, asked.policy or ranked(problem), asked.episodes, asked.measurements, asked.compiler):
+        for line in lines(
+            problem, asked.policy or ranked(problem), asked.episodes, asked.measurements, asked.compiler
+        ):
             found.append(line)
             print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)
     if asked.out is not None:
@@ -227,9 +255,13 @@ def main() -> None:
         print(f"{key}: median {numpy.median(values):.1e}, largest {max(values, default=math.nan):.1e}")
     for key in ("llvm_ns", "numpy_ns"):
         ratios = [line[key] / line["double_ns"] for line in written]
-        print(f"{key} over double_ns: median {numpy.median(ratios):.3g}, {min(ratios):.2g} to {max(ratios):.2g}")
+        print(
+            f"{key} over double_ns: median {numpy.median(ratios):.3g}, {min(ratios):.2g} to {max(ratios):.2g}"
+        )
     try:
-        print(f"filterpy's IMM of two filters of four states: {1e9 / imm_steps_per_second(2000):,.0f} ns an update")
+        print(
+            f"filterpy's IMM of two filters of four states: {1e9 / imm_steps_per_second(2000):,.0f} ns an update"
+        )
     except ImportError:
         print("filterpy is not installed")
 

@@ -3,16 +3,18 @@
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.filter import Initial
+from filtergym.filters import kalman
+
 from filtergym.exports import c_source
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
 from filtergym.exports.replay import mean_rows, replay, run_filter
-from filtergym.filters import kalman
 from filtergym.names import find_competitor
 
 EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'
@@ -136,7 +138,7 @@ class InPython:
 
 
 def test_an_estimator_in_python_is_refused():
-    with pytest.raises(ValueError, match="cannot be exported.*does not say that it is traceable"):
+    with pytest.raises(ValueError, match=r"cannot be exported.*does not say that it is traceable"):
         replayed("ManeuveringTarget", InPython, episodes=1, measurements=1)
 
 
@@ -205,6 +207,20 @@ def test_a_table_of_another_form_is_refused(tmp_path):
         [tmp_path / "run"], input=f"{header}\r\n{first}\r\n\r\n", capture_output=True, text=True, check=True
     )
     assert len(windows.stdout.splitlines()) == 2
+
+
+def test_the_program_of_the_page_follows_a_track(tmp_path):
+    page = (Path(__file__).parent.parent / "docs" / "device.md").read_text(encoding="utf-8")
+    own = re.search(r"```c\n(.*?)```", page, re.DOTALL)[1]
+    writer, given = writer_of("ManeuveringTarget", "kalman-imm-tuned")
+    for file, text in {**files_of(writer, given), "own.c": own}.items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, "-O0", "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    plots = "".join(f"{6 * k},{40000 - 900 * k},{12000 + 120 * k}\n" for k in range(1, 20))
+    done = subprocess.run([tmp_path / "own"], input=plots, capture_output=True, text=True, check=True)
+    last = [float(x) for x in re.findall(r"-?[\d.]+(?= m)", done.stdout.splitlines()[-1])]
+    np.testing.assert_allclose(last, [40000 - 900 * 19, 12000 + 120 * 19, -150.0, 20.0], rtol=0.02)
 
 
 class Stranger:

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from ..agents.export import export_run
-from ..baselines.problem import problem_of
+from ..baselines.fitted_filters import SUFFIX
+from ..baselines.problem import Problem, problem_of
 from ..compiler.c_source import identifier
 from ..envs.catalogue import check_names, nearest
 from ..names import find_competitor
@@ -97,8 +98,7 @@ def export(
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
     maker = find_competitor(problem, name, trust)
-    # Of a file its own name, without the folder.
-    words = Path(name).name.partition(".")[0] if Path(name).suffix else name
+    words = _own_name(problem, name)
     from ..exports.c_source import export_c
 
     folder = out or Path(identifier(words))
@@ -121,6 +121,14 @@ def export(
     console.print(
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test", soft_wrap=True
     )
+
+
+def _own_name(problem: Problem, name: str) -> str:
+    """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
+    for ending in (SUFFIX, ".safetensors", ".zip"):
+        if name.endswith(ending):
+            return Path(name).name.removesuffix(ending).removeprefix(f"{problem.short_name}.")
+    return Path(name).name if Path(name).is_dir() else name
 
 
 def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:

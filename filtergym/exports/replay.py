@@ -58,10 +58,15 @@ class Replay(NamedTuple):
 
 def _report(model: Model, episode: Episode) -> dict[str, Any]:
     """What a filter was given, and what it estimated."""
+    mean, covariance = model.mean(episode), model.covariance(episode)
+    return {"measurement": episode.measurement, "mean": mean, "covariance": covariance}
+
+
+def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
+    """Of an estimator also why an episode is lost: the last valid answer is held then."""
     return {
-        "measurement": episode.measurement,
-        "mean": model.mean(episode),
-        "covariance": model.covariance(episode),
+        **_report(model, episode),
+        "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
     }
 
 
@@ -92,7 +97,7 @@ def replay(
         measurements: of each, at most.
 
     Raises:
-        ValueError: for what cannot be exported.
+        ValueError: for what cannot be exported, or loses every episode.
     """
     kind = kind_of(maker)
     control = control_of(maker, kind, None, problem.task, name)
@@ -106,13 +111,20 @@ def replay(
     # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
     first = start_lanes(plain, seeds[:1]).state.measurement
     traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first))
-    for found, _ in islice(rollout(model, maker, seeds, _report, kind=kind, name=name), measurements):
+    report = _report_estimator if kind == "estimator" else _report
+    lost = numpy.zeros(episodes, dtype=bool)
+    for found, _ in islice(rollout(model, maker, seeds, report, kind=kind, name=name), measurements):
+        lost |= found.get("lost", numpy.zeros(episodes))[:episodes] > 0.0
         kept["measurement"].append(_rows(found["measurement"], episodes))
         kept["mean"].append(numpy.array(found["mean"][..., :episodes]))
         kept["covariance"].append(numpy.array(found["covariance"][..., :episodes]))
-    arrays = [numpy.stack(values) for values in kept.values()]
+    if lost.all():
+        raise ValueError(
+            f"{name!r} lost every episode that it was to be compared on: its answers are no estimates"
+        )
+    arrays = [numpy.stack(values)[..., ~lost] for values in kept.values()]
     components = [(component.name, component.unit) for component in plain.task.components]
-    return traced, Replay(_rows(started[0], episodes), *arrays, components)
+    return traced, Replay(_rows(started[0], episodes)[:, ~lost], *arrays, components)
 
 
 class _Network:

@@ -5,6 +5,7 @@ the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept o
 """
 
 import ast
+import copy
 import inspect
 import math
 import re
@@ -12,7 +13,7 @@ import textwrap
 from collections.abc import Sequence
 from itertools import count as count_from
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy
 
@@ -68,16 +69,6 @@ class TracedFilter(NamedTuple):
     """That answers between the two parts of ``update``; None where none is asked."""
 
 
-class Steps(Protocol):
-    """A filter, whatever it is made of."""
-
-    def start(self, initial: Any) -> Any:
-        """State at the start of the track."""
-
-    def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
-        """State after a measurement, and what is estimated: ``mean``, ``covariance``, and ``LIKELIHOODS``."""
-
-
 class EstimatorSteps:
     """An estimator alone: an answer that an evaluation would not accept is returned all the same.
 
@@ -126,6 +117,10 @@ class SteeredSteps:
         known = {name: told[name] for name in LIKELIHOODS if name in told}
         return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
 
+    def due_nodes(self, state: Steered, graph: Graph) -> list[int]:
+        """Expression of whether the policy is asked at a measurement."""
+        return nodes_of(self.steered.is_due(state)) if self.steered.interval > 1 else [graph.constant(True)]
+
 
 def clear_missing(task: Task, measurement: Any) -> Any:
     """Return a measurement with zero in place of what was not received, whatever stands there."""
@@ -171,34 +166,33 @@ class AskedNetwork(Policy):
         return Traced(numpy.array(nodes)[None], numpy.float64), ()
 
 
-def steps_of(
-    task: type[Task], control: str, maker: Any, name: str, plain: Model, graph: Graph
-) -> tuple[Any, AskedNetwork | None]:
-    """Make the steps of a competitor on traced arrays; within :func:`~.namespace.tracing`.
-
-    Args:
-        task: class of the environment.
-        control: of the competitor.
-        maker: of it.
-        name: of it, in errors.
-        plain: model of the same parameters on NumPy.
-        graph: that is open.
-
-    Raises:
-        ValueError: for what is neither estimator nor policy.
-    """
+def check_kind(name: str, maker: Any) -> None:
+    """Raise ValueError for what is neither estimator nor policy."""
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
             f"{name!r} is of kind {kind}: an estimator or a policy can be exported, which know nothing but what is "
             "measured, when it is measured"
         )
+
+
+def steps_of(
+    task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
+) -> tuple[EstimatorSteps | SteeredSteps, "AskedNetwork | None"]:
+    """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
+
+    Args:
+        task: class of the environment.
+        control: of the competitor.
+        maker: of it.
+        plain: model of the same parameters on NumPy.
+        graph: that is open.
+    """
     traced = task(plain.task.parameters, namespace)
     if isinstance(maker, EstimatorMaker):
-        model = Model(traced, maker.bank)
         policy, network = with_asked_network(maker(plain.task).network, graph)
-        return SteeredSteps(steer(model, policy, 1), masked=True), network
-    if kind == "estimator":
+        return SteeredSteps(steer(Model(traced, maker.bank), policy, 1), masked=True), network
+    if kind_of(maker) == "estimator":
         own = make_competitor(maker, traced)
         if not getattr(own, "traceable", False):
             raise NotTraceable("it does not say that it is traceable")
@@ -222,6 +216,7 @@ def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | N
     for outer, place in ((Gated, "policy"), (ResidualPolicy, "agent")):
         if isinstance(policy, outer):
             inner, asked_inside = with_asked_network(getattr(policy, place), graph)
+            policy = copy.copy(policy)
             setattr(policy, place, inner)
             return policy, asked_inside
     return policy, None
@@ -369,28 +364,23 @@ def trace_filter(
     Raises:
         ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
     """
+    check_kind(name, maker)
     graph = Graph()
     try:
         with namespace.tracing(graph):
-            return _trace(task, control, maker, name, plain, template, graph)
+            return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
     except NotTraceable as error:
-        if isinstance(error.__cause__, ValueError) and "can be exported" in str(error.__cause__):
-            raise error.__cause__ from None
         raise ValueError(
             f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
         ) from error
 
 
 def _trace(
-    task: type[Task],
-    control: str,
-    maker: Any,
-    name: str,
-    plain: Model,
+    steps: EstimatorSteps | SteeredSteps,
+    asked: "AskedNetwork | None",
     template: tuple[Any, Any],
     graph: Graph,
 ) -> TracedFilter:
-    steps, asked = steps_of(task, control, maker, name, plain, graph)
     initial, measurement = (one_lane(part) for part in template)
     rows = count_from()
     begin = fill(initial, [graph.input(INITIAL, next(rows)) for _ in nodes_of(initial)], graph)
@@ -408,10 +398,8 @@ def _trace(
         if not classes.split(after):
             break
     shown = []
-    if asked is not None and asked.shown:
-        steered = steps.steered
-        due = nodes_of(steered.is_due(before)) if steered.interval > 1 else [graph.constant(True)]
-        shown = [*due, *asked.shown]
+    if asked is not None and asked.shown and isinstance(steps, SteeredSteps):
+        shown = [*steps.due_nodes(before, graph), *asked.shown]
     results = nodes_of(estimate)
     live = _live_members(graph, classes.members, after, [*results, *shown])
     place = {member: row for row, member in enumerate(live)}
