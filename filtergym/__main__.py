@@ -5,51 +5,57 @@ import sys
 if __name__ == "__main__" and not sys.flags.safe_path:
     del sys.path[0]  # the working directory, where Python would look for every library that is still to come
 
+import ast
 import functools
+import importlib
+import inspect
 import os
 import warnings
 from collections.abc import Callable
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium
 import typer
+import typer.core
 from rich.console import Console
 
 from . import __version__
-from .commands import advise, export, improve, measure, report
 from .commands.terminal import close_output, open_output
 from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
 from .envs.failures import own_line
 
-Commands = dict[str, Callable[..., None]]
+Commands = dict[str, Callable[..., None] | str]
+"""Functions by the names of their commands; or ``module:function`` of what is imported when it is called."""
 GROUPS: dict[str, Commands] = {
     "Use an environment": {
-        "list": measure.list_environments,
-        "animate": measure.animate,
-        "record": measure.record_scenario,
+        "list": "measure:list_environments",
+        "animate": "measure:animate",
+        "record": "measure:record_scenario",
     },
     "Compare": {
-        "evaluate": measure.evaluate_policies,
-        "benchmark": measure.benchmark,
-        "reproduce": report.reproduce,
+        "evaluate": "measure:evaluate_policies",
+        "benchmark": "measure:benchmark",
+        "reproduce": "report:reproduce",
     },
     "Judge a log": {
-        "advise": advise.advise_on_log,
+        "advise": "advise:advise_on_log",
     },
     "Tune and train": {
-        "tune": improve.tune_policy,
-        "train": improve.train,
-        "search": improve.search,
+        "tune": "improve:tune_policy",
+        "train": "improve:train",
+        "search": "improve:search",
     },
     "Share": {
-        "report": report.make,
-        "export": export.export,
-        "offline": measure.write_offline,
+        "report": "report:make",
+        "export": "export:export",
+        "offline": "measure:write_offline",
     },
 }
-COMMANDS: Commands = {name: command for group in GROUPS.values() for name, command in group.items()}
+MARKUP: Any = "markdown"
+"""Of help: in rich's own, the extra in filtergym[fast] would be taken for a style."""
 REPORT = (
     "--debug shows where it happened: if that is not in code of your own, please report it with what it shows"
 )
@@ -75,18 +81,77 @@ def _general(
         os.environ[SWITCH] = "off"
 
 
+class Program(typer.core.TyperGroup):
+    """Commands in groups, each imported when it is called: whoever asks for help need not wait for all libraries."""
+
+    groups: dict[str, Commands]
+    listing = False
+    """Whether commands are only named, each with its first sentence."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names, in their order."""
+        return [name for commands in self.groups.values() for name in commands]
+
+    def get_command(self, ctx: Any, name: str) -> Any:
+        """Return a command; None where there is none of that name."""
+        for group, commands in self.groups.items():
+            if name in commands:
+                return (
+                    _listed(name, commands[name], group) if self.listing else _command(name, commands[name])
+                )
+        return None
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help of the program, which names its commands."""
+        self.listing = True
+        super().format_help(ctx, formatter)
+        self.listing = False
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete the name of a command."""
+        self.listing = True
+        found = super().shell_complete(ctx, incomplete)
+        self.listing = False
+        return found
+
+
+def import_command(command: Callable[..., None] | str) -> Callable[..., None]:
+    """Return the function of a command."""
+    if not isinstance(command, str):
+        return command
+    module, _, name = command.partition(":")
+    function: Callable[..., None] = getattr(importlib.import_module(f"{__package__}.commands.{module}"), name)
+    return function
+
+
+def _command(name: str, command: Callable[..., None] | str) -> Any:
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=MARKUP)
+    app.command(name)(import_command(command))
+    return typer.main.get_command(app)
+
+
+def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
+    """Return a command that has nothing but its help, read from the text of its module."""
+    if isinstance(command, str):
+        module, _, function = command.partition(":")
+        text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
+        [own] = [n for n in ast.parse(text).body if isinstance(n, ast.FunctionDef) and n.name == function]
+        words = ast.get_docstring(own)
+    else:
+        words = inspect.getdoc(command)
+    return typer.core.TyperCommand(name, help=words, rich_help_panel=group, rich_markup_mode=MARKUP)
+
+
 def program_of(groups: dict[str, Commands]) -> Any:
     """Return commands as one program, whose help shows them in groups; called with arguments, it ends in SystemExit."""
     app = typer.Typer(
+        cls=type("Program", (Program,), {"groups": groups}),
         callback=_general,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
-        rich_markup_mode="markdown",  # in rich's own, the extra in filtergym[fast] would be taken for a style
+        rich_markup_mode=MARKUP,
         result_callback=close_output,
     )
-    for group, commands in groups.items():
-        for name, command in commands.items():
-            app.command(name, rich_help_panel=group)(command)
     return typer.main.get_command(app)
 
 

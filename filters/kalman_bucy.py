@@ -25,8 +25,6 @@ Everything here is design, computed once for one model: plain NumPy and SciPy, n
 from typing import NamedTuple
 
 import numpy
-import scipy.integrate
-import scipy.linalg
 from numpy.typing import ArrayLike
 
 from .linear_systems import Matrix, intensity_matrix, square_matrix, van_loan
@@ -111,6 +109,8 @@ def riccati_hamiltonian(
     Raises:
         ValueError: an indefinite intensity, a singular ``Q``, instants not in ascending order.
     """
+    from scipy.linalg import expm
+
     A = square_matrix("A", A)
     n = len(A)
     information = _information(C, Q, n)
@@ -122,7 +122,7 @@ def riccati_hamiltonian(
     for duration in numpy.diff(_times(times), prepend=0.0):
         pieces = int(numpy.ceil(duration / restart))
         if pieces:
-            exponential = scipy.linalg.expm(hamiltonian * (duration / pieces))
+            exponential = expm(hamiltonian * (duration / pieces))
         for _ in range(pieces):
             P1 = exponential[:n, :n] + exponential[:n, n:] @ R
             P2 = exponential[n:, :n] + exponential[n:, n:] @ R
@@ -150,7 +150,9 @@ def riccati_ode(
 
     if instants[-1] == 0:
         return numpy.stack([R0] * len(instants))
-    solution = scipy.integrate.solve_ivp(
+    from scipy.integrate import solve_ivp
+
+    solution = solve_ivp(
         slope, (0.0, instants[-1]), R0.ravel(), method="DOP853", t_eval=instants, rtol=1e-11, atol=1e-13
     )
     if not solution.success:
@@ -183,6 +185,8 @@ def moments(
     Raises:
         ValueError: a wrong shape, an indefinite intensity, instants not in ascending order.
     """
+    from scipy.linalg import expm
+
     A = square_matrix("A", A)
     n = len(A)
     BGBt, covariance = intensity_matrix("BGBt", BGBt, n), intensity_matrix("Theta0", Theta0, n)
@@ -193,7 +197,7 @@ def moments(
     for duration in numpy.diff(_times(times), prepend=0.0):
         if duration > 0:
             Phi, Qd = van_loan(A, BGBt, duration)
-            mean = Phi @ mean + scipy.linalg.expm(duration * held)[:n, n]
+            mean = Phi @ mean + expm(duration * held)[:n, n]
             covariance = Phi @ covariance @ Phi.T + Qd
         means.append(mean)
         covariances.append(covariance)

@@ -14,7 +14,7 @@ import pytest
 from filtergym.baselines.problem import problem_of
 from made_results import results_of
 
-from filtergym.__main__ import COMMANDS, GROUPS, main
+from filtergym.__main__ import GROUPS, import_command, main
 from filtergym.commands import terminal
 from filtergym.commands.terminal import progress_bar
 from filtergym.names import is_learned
@@ -49,6 +49,9 @@ def test_version_is_that_of_the_installed_package(monkeypatch, capsys):
         main()
     assert end.value.code == 0
     assert capsys.readouterr().out == f"filtergym {importlib.metadata.version('filtergym')}\n"
+
+
+COMMANDS = {name: import_command(own) for group in GROUPS.values() for name, own in group.items()}
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -135,6 +138,15 @@ def test_help_shows_the_commands_in_groups(run):
     places = [shown.find(word) for word in words]
     assert -1 not in places
     assert places == sorted(places)
+
+
+def test_help_imports_none_of_the_commands():
+    code = "import sys; sys.argv = ['filtergym', '--help']; from filtergym.__main__ import main\n"
+    code += (
+        "try: main()\nexcept SystemExit: print(sys.modules.keys() & {'xarray', 'pandas', 'scipy', 'torch'})"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "set()"
 
 
 @pytest.mark.parametrize("name", commands.COMMANDS)

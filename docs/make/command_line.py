@@ -8,23 +8,28 @@ from typing import Any, get_args, get_origin
 
 from filtergym.papers.grid import markdown_table
 
-from filtergym.__main__ import COMMANDS, application
+from filtergym.__main__ import GROUPS, application, import_command
 
 MARKER = "commands"
 KINDS = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
+
+
+def command_functions() -> dict[str, Callable[..., None]]:
+    """Return the functions of all commands, by their names."""
+    return {name: import_command(own) for commands in GROUPS.values() for name, own in commands.items()}
 
 
 def command_line_markdown() -> str:
     """What ``--help`` says of every command, as sections of a page."""
     program = application()
     lines = [*_options(_general_options(program), program.callback)]
-    for name, function in COMMANDS.items():
+    for name, function in command_functions().items():
         what, *examples = inspect.cleandoc(function.__doc__ or "").split("\n\nExample: ")
         # Help that is folded is shown unfolded; of an example that is two commands each has its line.
         shown = [line for one in examples for line in " ".join(one.split()).split(", then ")]
         paragraphs = [" ".join(paragraph.split()) for paragraph in what.split("\n\n")]
         lines += ["", f"## {name}", "", "\n\n".join(paragraphs)]
-        lines += ["", "```sh", *shown, "```", "", *_options(program.commands[name].params, function)]
+        lines += ["", "```sh", *shown, "```", "", *_options(program.get_command(None, name).params, function)]
     return "\n".join(lines)
 
 
