@@ -62,6 +62,9 @@ class Figures(NamedTuple):
     """On the stack, beside the state."""
     difference: float
     """Largest one to the competitor itself, in its standard deviations, as NumPy runs the programs."""
+    sensitivity: float
+    """By how much the rounding in a network alone moves an estimate, likewise: largest difference to the competitor
+    with a network that computes in double; zero without one."""
     replaced: tuple[float, ...]
     """Constants that float does not have."""
     test: str = ""
@@ -132,6 +135,7 @@ class Writer:
 
     Attributes:
         about: paragraphs for the comment of the header.
+        limit: largest difference with which the test passes, standard deviations.
     """
 
     def __init__(
@@ -139,6 +143,7 @@ class Writer:
     ) -> None:
         self.traced, self.scalar, self.components = traced, scalar, components
         self.about: list[str] = []
+        self.limit = WORST[scalar.name]
         self.name = own = identifier(name)
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
         parts["estimate"] = traced.estimate
@@ -344,7 +349,7 @@ class Writer:
         """Text of a program that compares the filter with the vectors."""
         return _TEST.format(
             own=self.name,
-            limit=repr(WORST[self.scalar.name]),
+            limit=literal(self.limit),
             C=len(self.components),
             mean="" if len(self.components) == 1 else "[i]",
         )
@@ -552,9 +557,16 @@ def export_c(
             f"{WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
             + ("export it in double" if scalar is FLOAT else "please report it")
         )
+    sensitivity = 0.0
+    if traced.network is not None:
+        steady = run_filter(traced, replayed, network_dtype=numpy.float64)
+        sensitivity = replayed.largest_difference(steady[:, mean_rows(traced)])
     writer = Writer(name, traced, scalar, replayed.components)
+    writer.limit = max(WORST[precision], 3.0 * sensitivity)
     writer.about = _about(problem, name, maker, writer, precision, keywords, command)
-    figures = Figures(**writer.figures, difference=difference, replaced=writer.replaced)
+    figures = Figures(
+        **writer.figures, difference=difference, sensitivity=sensitivity, replaced=writer.replaced
+    )
     test = compile_and_test(writer, replayed)
     figures = figures._replace(test=test)
     folder.mkdir(parents=True, exist_ok=True)
@@ -613,6 +625,11 @@ def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
         f"Largest difference to the competitor in {E} episodes of {T} measurements, as NumPy computes in {precision}: "
         f"{figures.difference:.1e} of the standard deviations that it reports.",
     ]
+    if figures.sensitivity > 0.0:
+        notes.append(
+            f"Rounding in the network alone moves an estimate by up to {figures.sensitivity:.1e} of them: so much may "
+            "any other order of its sums."
+        )
     if figures.test:
         notes.append(f"Compiled where it was made: {figures.test}.")
     if figures.replaced:

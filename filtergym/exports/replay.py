@@ -128,10 +128,17 @@ def replay(
 
 
 class _Network:
-    """The network of a filter, asked as it is in an evaluation."""
+    """The network of a filter, asked as it is in an evaluation.
 
-    def __init__(self, network: LearnedPolicy) -> None:
+    Args:
+        network: of the filter.
+        dtype: in which it computes.
+    """
+
+    def __init__(self, network: LearnedPolicy, dtype: Any) -> None:
         self.network = copy.copy(network)
+        self.network.arrays = {name: values.astype(dtype) for name, values in network.arrays.items()}
+        self.network.layers = [tuple(values.astype(dtype) for values in layer) for layer in network.layers]
         self.network.columns = slice(None)  # what it is shown is what it takes
         self.memory: Any = None
         self.answer: Any = None
@@ -148,19 +155,22 @@ class _Network:
         self.answer = numpy.atleast_2d(numpy.asarray(answer).T)
 
 
-def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
+def run_filter(
+    traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64, network_dtype: Any = numpy.float32
+) -> numpy.ndarray:
     """Run the programs of a filter over episodes, step by step in NumPy.
 
     Args:
         traced: to run.
         replayed: what it is given.
         dtype: in which everything but a network is computed.
+        network_dtype: in which the network is; it was trained in float.
 
     Returns:
         Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
-    network = None if traced.network is None else _Network(traced.network)
+    network = None if traced.network is None else _Network(traced.network, network_dtype)
     state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
     answers = []
     for measured in replayed.measurements:
