@@ -10,7 +10,6 @@ Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --epis
 
 import argparse
 import csv
-import math
 import shutil
 import subprocess
 import sys
@@ -222,6 +221,52 @@ def lines(
         yield line
 
 
+HEADINGS = (
+    "environment",
+    "written",
+    "operations",
+    "state, bytes",
+    "difference in double",
+    "in float",
+    "ns an update",
+    "NumPy / C",
+    "C / LLVM",
+)
+
+
+def summary(found: list[dict[str, Any]]) -> str:
+    """Return a table of Markdown, a line for each environment: medians, and from least to most."""
+    rows = [f"| {' | '.join(HEADINGS)} |", f"|{'---|' * len(HEADINGS)}"]
+    for environment in dict.fromkeys(line["environment"] for line in found):
+        own = [line for line in found if line["environment"] == environment]
+        there = [line for line in own if line.get("double_ns")]
+        numbers = {
+            key: numpy.array([float(line[key] or "nan") for line in there])
+            for key in COLUMNS[2:-1]
+            if key != "float_ns"
+        }
+        ns, slower = numbers["double_ns"], numbers["numpy_ns"] / numbers["double_ns"]
+        # What LLVM makes of a program has no network in it.
+        faster = (ns / numbers["llvm_ns"])[numbers["weight_bytes"] == 0.0]
+        cells = [
+            environment.removesuffix("-v0"),
+            f"{len(there)} of {len(own)}",
+            *(
+                f"{numbers[key].min():,.0f} to {numbers[key].max():,.0f}"
+                for key in ("operations", "state_bytes")
+            ),
+            *(
+                f"{numpy.median(numbers[key]):.0e}, at most {numbers[key].max():.0e}"
+                for key in ("double_sigmas", "float_sigmas")
+            ),
+            f"{numpy.median(ns):,.0f} ({ns.min():,.0f} to {ns.max():,.0f})",
+            f"{numpy.median(slower):,.0f} ({slower.min():,.0f} to {slower.max():,.0f})",
+            f"{numpy.median(faster):.1f}" if len(faster) else "",
+        ]
+        rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -232,7 +277,11 @@ def main() -> None:
     parser.add_argument("--measurements", type=int, default=200)
     parser.add_argument("--compiler", default=shutil.which("cc"))
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--read", type=Path, help="summarise what --out has written, and run nothing")
     asked = parser.parse_args()
+    if asked.read is not None:
+        print(summary(list(csv.DictReader(asked.read.open(encoding="utf-8")))))
+        return
     if asked.compiler is None:
         sys.exit("no C compiler here")
     warnings.simplefilter("ignore")
@@ -249,15 +298,7 @@ def main() -> None:
             writer = csv.DictWriter(file, COLUMNS)
             writer.writeheader()
             writer.writerows({key: _short(value) for key, value in line.items()} for line in found)
-    written = [line for line in found if "double_ns" in line]
-    for key in ("double_sigmas", "float_sigmas"):
-        values = [line[key] for line in written]
-        print(f"{key}: median {numpy.median(values):.1e}, largest {max(values, default=math.nan):.1e}")
-    for key in ("llvm_ns", "numpy_ns"):
-        ratios = [line[key] / line["double_ns"] for line in written]
-        print(
-            f"{key} over double_ns: median {numpy.median(ratios):.3g}, {min(ratios):.2g} to {max(ratios):.2g}"
-        )
+    print(summary(found))
     try:
         print(
             f"filterpy's IMM of two filters of four states: {1e9 / imm_steps_per_second(2000):,.0f} ns an update"
