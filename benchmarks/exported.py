@@ -221,22 +221,13 @@ def lines(
         yield line
 
 
-HEADINGS = (
-    "environment",
-    "written",
-    "operations",
-    "state, bytes",
-    "difference in double",
-    "in float",
-    "ns an update",
-    "NumPy / C",
-    "C / LLVM",
-)
+ACCURACY = ("environment", "written", "double: median", "largest", "float: median", "largest")
+COST = ("environment", "operations", "state, bytes", "ns in C", "NumPy / C", "C / LLVM")
 
 
 def summary(found: list[dict[str, Any]]) -> str:
-    """Return a table of Markdown, a line for each environment: medians, and from least to most."""
-    rows = [f"| {' | '.join(HEADINGS)} |", f"|{'---|' * len(HEADINGS)}"]
+    """Return two tables of Markdown, a line for each environment: differences; and costs, median and range."""
+    accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
     for environment in dict.fromkeys(line["environment"] for line in found):
         own = [line for line in found if line["environment"] == environment]
         there = [line for line in own if line.get("double_ns")]
@@ -245,26 +236,22 @@ def summary(found: list[dict[str, Any]]) -> str:
             for key in COLUMNS[2:-1]
             if key != "float_ns"
         }
-        ns, slower = numbers["double_ns"], numbers["numpy_ns"] / numbers["double_ns"]
+        ns = numbers["double_ns"]
         # What LLVM makes of a program has no network in it.
         faster = (ns / numbers["llvm_ns"])[numbers["weight_bytes"] == 0.0]
-        cells = [
-            environment.removesuffix("-v0"),
-            f"{len(there)} of {len(own)}",
-            *(
-                f"{numbers[key].min():,.0f} to {numbers[key].max():,.0f}"
-                for key in ("operations", "state_bytes")
-            ),
-            *(
-                f"{numpy.median(numbers[key]):.0e}, at most {numbers[key].max():.0e}"
-                for key in ("double_sigmas", "float_sigmas")
-            ),
-            f"{numpy.median(ns):,.0f} ({ns.min():,.0f} to {ns.max():,.0f})",
-            f"{numpy.median(slower):,.0f} ({slower.min():,.0f} to {slower.max():,.0f})",
-            f"{numpy.median(faster):.1f}" if len(faster) else "",
-        ]
-        rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
+        name = environment.removesuffix("-v0")
+        cells = [name, f"{len(there)} of {len(own)}"]
+        for key in ("double_sigmas", "float_sigmas"):
+            cells += [f"{numpy.median(numbers[key]):.0e}", f"{numbers[key].max():.0e}"]
+        accuracy.append(f"| {' | '.join(cells)} |")
+        cells = [name, *(_range(numbers[key]) for key in ("operations", "state_bytes", "double_ns"))]
+        cells += [_range(numbers["numpy_ns"] / ns), f"{numpy.median(faster):.1f}" if len(faster) else ""]
+        cost.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*accuracy, "", *cost])
+
+
+def _range(values: numpy.ndarray) -> str:
+    return f"{numpy.median(values):,.0f} ({values.min():,.0f} to {values.max():,.0f})"
 
 
 def main() -> None:
