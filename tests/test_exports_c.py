@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from filtergym.agents.learned_policy import LearnedPolicy
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.filter import Initial
 from filtergym.filters import kalman
@@ -181,6 +182,46 @@ def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
     assert given.largest_difference(np.moveaxis(own, 0, -1)) < 1e-2
     sigma = estimates.filter(like="sigma_").to_numpy().reshape(3, 30, -1)
     np.testing.assert_allclose(np.moveaxis(sigma, 0, -1), given.sigma, rtol=1e-3)
+
+
+class OwnNetwork:
+    """Makes a network with random weights."""
+
+    kind = "policy"
+
+    def __init__(self, control, unit, output, activation, answers):
+        self.control, self.output, self.activation = control, output, activation
+        rng = np.random.default_rng(0)
+        fields, units = 14, 5
+        gates = {"gru": 3, "lstm": 4}.get(unit, 0) * units
+        shapes = {
+            "weight_0": (6, units if unit else fields),
+            "bias_0": (6,),
+            "weight_1": (answers, 6),
+            "bias_1": (answers,),
+        }
+        if unit:
+            shapes |= {f"{unit}_input_weight": (gates, fields), f"{unit}_input_bias": (gates,)}
+            shapes |= {f"{unit}_memory_weight": (gates, units), f"{unit}_memory_bias": (gates,)}
+        arrays = {name: 0.5 * rng.normal(size=shape) for name, shape in shapes.items()}
+        arrays |= {
+            "observation_mean": rng.normal(size=fields),
+            "observation_scale": rng.uniform(0.5, 2.0, fields),
+        }
+        self.arrays = {name: values.astype(np.float32) for name, values in arrays.items()}
+
+    def __call__(self, model):
+        fields = [field.name for field in model.fields][:14]
+        return LearnedPolicy(model, self.arrays, self.output, self.activation, fields)
+
+
+@pytest.mark.parametrize(
+    "own", [("gain", "lstm", "clip", "relu", 1), ("mode", "", "argmax", "tanh", 2)], ids=["lstm", "argmax"]
+)
+def test_networks_of_every_form_are_written(own):
+    writer, given = writer_of("ManeuveringTarget", OwnNetwork(*own))
+    assert given.largest_difference(run_filter(writer.traced, given)[:, mean_rows(writer.traced)]) < 1e-11
+    compile_and_test(writer, given, compiler(), (*FLAGS, *SANITIZERS))
 
 
 def test_a_table_of_another_form_is_refused(tmp_path):
