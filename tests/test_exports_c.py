@@ -335,6 +335,12 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     assert "double" not in (folder / "kalman_imm.c").read_text()
 
 
+def test_files_of_a_filter_are_not_those_of_the_programs_around_it():
+    for name in ("test", "main", "rows", "vectors", "time", "int"):
+        assert f"{c_source.file_stem(name)}.h" not in {"rows.h", "vectors.h", "time.h"}
+        assert f"{c_source.file_stem(name)}.c" not in {"test.c", "main.c", "int.c"}
+
+
 def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(c_source.WORST, "float", 1e-9)
     problem = problem_of("filtergym/ManeuveringTarget-v0")

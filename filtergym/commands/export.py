@@ -8,7 +8,6 @@ import typer
 from ..agents.export import export_run
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
-from ..compiler.c_source import identifier
 from ..envs.catalogue import check_names, nearest
 from ..names import find_competitor
 from .terminal import (
@@ -99,13 +98,13 @@ def export(
     check_names(problem.task, keywords)
     maker = find_competitor(problem, name, trust)
     words = _own_name(problem, name)
-    from ..exports.c_source import export_c
+    from ..exports.c_source import export_c, file_stem
 
-    folder = out or Path(identifier(words))
+    own = file_stem(words)
+    folder = out or Path(own)
     figures = export_c(
         problem, words, maker, folder, "float" if single else "double", scenario, keywords, command_line()
     )
-    own = identifier(words)
     console.print(f"saved in {folder}: {own}.h, {own}.c", soft_wrap=True)
     console.print(
         f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "

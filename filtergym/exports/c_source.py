@@ -44,10 +44,17 @@ FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", 
 """Under which the text compiles without a warning."""
 WORST = {"double": 1e-3, "float": 0.1}
 """Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
+TAKEN = ("rows", "vectors", "test", "math", "float", "stdio", "stdlib", "string", "time")
+"""Names that a filter's files must not have: those of the others."""
 EPISODES, MEASUREMENTS = 8, 200
 """That are compared before anything is written, at most."""
 VECTORS = 2, 50
 """Episodes and measurements among the test's vectors, at most."""
+
+
+def file_stem(name: str) -> str:
+    """Return what the files and functions of a filter are called."""
+    return identifier(name, TAKEN)
 
 
 class Figures(NamedTuple):
@@ -144,7 +151,7 @@ class Writer:
         self.traced, self.scalar, self.components = traced, scalar, components
         self.about: list[str] = []
         self.limit = WORST[scalar.name]
-        self.name = own = identifier(name)
+        self.name = own = file_stem(name)
         parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
         parts["estimate"] = traced.estimate
         self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
