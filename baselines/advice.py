@@ -2,8 +2,10 @@
 
 The recording is cut into blocks. Every family of filters is fitted to half of them by maximum likelihood. One is
 chosen by its likelihood on these and on a quarter more, less one nat for each fitted parameter (Akaike, IEEE Trans. AC
-19, 1974), and fitted to all three quarters. The last quarter judges it against what is shipped, which is not fitted.
-Intervals are of whole stretches of measurements, since neighbours are not independent.
+19, 1974), and fitted to all three quarters. So is its rival among what is shipped, which is not fitted: the paper's
+algorithm, unless another is likelier beyond chance. The fitted one is advised where its gain over the rival is beyond
+chance. The last quarter judges. Who is best there in hindsight is named beside: the best of many looks better than it
+is. Intervals are of whole stretches of measurements, since neighbours are not independent.
 """
 
 import dataclasses
@@ -13,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy
+import xarray
 
 from ..envs.catalogue import make_task
 from ..envs.recording import Recording
@@ -21,7 +24,15 @@ from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows
 from ..evaluation.predictions import UNKNOWN, Predictions, correlation, mean_of, relative_error
 from .fitted_filters import families_of
-from .fitting import Fit, Interval, fit, profile_intervals, with_noise_scale
+from .fitting import (
+    Fit,
+    Interval,
+    Profile,
+    fit,
+    profile_intervals,
+    profile_parameters,
+    with_noise_scale,
+)
 from .problem import Problem
 from .table import Tunable
 from .tuned_values import make_tuned_policy
@@ -30,6 +41,9 @@ LEAST = 5
 """Measurements after the start of the track that anything can be fitted to."""
 FEWEST = 40
 """Measurements of a recording from which on it is cut into blocks; of fewer everything is fitted to all of it."""
+LARGEST_LOSS = 0.5
+"""Nats per measurement by which a fit may be worse over the whole recording than in its windows, which begin anew:
+what loses more has lost the track."""
 BLOCK_MEASUREMENTS = 40
 MOST_BLOCKS = 24
 LONGEST_WARM_UP = 20
@@ -87,14 +101,16 @@ class Competitor(NamedTuple):
     log_likelihood: float
     """Mean of the measurements that chose, less one nat in all for each fitted parameter, nats; NaN where it says
     none."""
+    gain: Estimate
+    """The same less that of the rival, paired."""
     difference: Estimate
-    """Judged log-likelihood per measurement less that of the best shipped, nats."""
+    """Judged log-likelihood per measurement less that of the rival, nats."""
     prediction: float
     """Root mean square of the judged prediction errors; NaN where the log format has no prediction."""
     error: float
     """Root mean square of the judged errors of the main components; NaN without truth."""
     relative_error: Estimate
-    """Judged error over that of the best shipped, less one; without truth of the prediction errors."""
+    """Judged error over that of the rival, less one; without truth of the prediction errors."""
     nis: float
     """Mean normalised innovation squared of judged measurements over its dimension."""
     correlation: Estimate
@@ -109,13 +125,26 @@ class Advice(NamedTuple):
     competitors: list[Competitor]
     """The advised one first, then by their log-likelihood."""
     fitted: Competitor
-    """The one of the fitted ones that would be advised."""
+    """The likeliest of the fitted ones."""
+    rival: str
+    """Shipped filter that one would take without the judged measurements."""
     best_shipped: str
-    """Of smallest judged error, or prediction error where there is no truth."""
+    """Of smallest judged error, or prediction error where there is no truth: in hindsight."""
+    hindsight: Estimate
+    """Judged error of the advised one over that of ``best_shipped``, less one."""
+    diverging: tuple[str, ...]
+    """Fitted filters that lose the track in the whole recording: no competitors."""
+    replay: xarray.Dataset
+    """The whole recording as the fitted one, its rival and the best in hindsight estimate it, with tracks."""
     fits: dict[str, Fit]
     tunables: dict[str, Tunable]
-    intervals: dict[str, Interval]
-    """Of the parameters of ``fitted``."""
+    profiles: dict[str, dict[str, Profile]]
+    """Likelihood of the parameters of ``fitted``; of the other fitted ones where that was asked for."""
+
+    @property
+    def intervals(self) -> dict[str, Interval]:
+        """Of the parameters of ``fitted``."""
+        return {name: each.interval for name, each in self.profiles[self.fitted.name].items()}
 
     @property
     def advised(self) -> Competitor:
@@ -130,6 +159,7 @@ def advise(
     own: Mapping[str, Tunable] | None = None,
     noise: bool = True,
     seed: int = 0,
+    every_profile: bool = False,
     progress: Callable[[str, float], None] = lambda what, share: None,
     **keywords: Any,
 ) -> Advice:
@@ -142,6 +172,7 @@ def advise(
         own: further families, such as an estimator of a user's with limits of its parameters.
         noise: fit the scale of the measurement noise, too, where measurements state one.
         seed: of the starts of the fits.
+        every_profile: of all that are fitted, not only of the likeliest.
         progress: told what is done, and which share of all.
         **keywords: parameters of the task.
 
@@ -166,15 +197,18 @@ def advise(
             for name, found in fits.items()
         },
     }
+    counts = {name: len(found.values) for name, found in fits.items()}
 
-    def judge(makers: Mapping[str, Any]) -> tuple[list[Competitor], str]:
+    def judge(makers: Mapping[str, Any]) -> _Judgement:
         with numpy.errstate(all="ignore"):  # what diverges is judged by its numbers
             dataset = problem.evaluate(makers, recording, tracks=True, **keywords)
-        counts = {name: len(fits[name].values) for name in makers if name in fits}
-        return _Judgement(Predictions(dataset, task), share).competitors(counts)
+        return _Judgement(Predictions(dataset, task), share, counts, problem.baselines.score_paper)
 
     progress("replaying the recording", 0.6)
-    competitors, best = judge(makers)
+    judgement = judge(makers)
+    diverging = judgement.find_diverging(fits)
+    rival, best = judgement.rival(), judgement.best_shipped()
+    competitors = [judgement.competitor(name, rival) for name in makers if name not in diverging]
     progress("computing intervals", 0.9)
     chosen = _likeliest([c for c in competitors if c.fitted])
     name, tunable = chosen.name, tunables[chosen.name]
@@ -182,19 +216,37 @@ def advise(
         windows = cut_windows(recording, task, [*share.fitted, *share.chosen], share.warm_up)
         begin = dataclasses.replace(tunable, start=fits[name].values)
         likelihoods[name] = WindowLikelihood(task, windows, begin.start, begin.apply, begin.in_lanes)
-        fits[name] = fit(likelihoods[name], begin, seed, starts=1)
-        makers = {name: make_tuned_policy(f"fitted {name}", tunable, fits[name].values), best: shipped[best]}
-        refitted = next(c for c in judge(makers)[0] if c.name == name)
-        before, chosen = chosen, refitted._replace(log_likelihood=chosen.log_likelihood)
+        fits[name] = fit(likelihoods[name], begin, seed, starts=1)._replace(spread=fits[name].spread)
+        fitted = make_tuned_policy(f"fitted {name}", tunable, fits[name].values)
+        judgement = judge({name: fitted, rival: shipped[rival], best: shipped[best]})
+        before, refitted = chosen, judgement.competitor(name, rival)
+        chosen = refitted._replace(log_likelihood=before.log_likelihood, gain=before.gain)
         competitors = [chosen if c is before else c for c in competitors]
-    intervals = profile_intervals(likelihoods[name], tunable, fits[name])
+    profiles = {
+        each: profile_parameters(likelihoods[each], tunables[each], fits[each])
+        for each in (fits if every_profile else [name])
+        if each not in diverging
+    }
     progress("done", 1.0)
-    advised = _likeliest(competitors)
+    advised = chosen if chosen.gain.low > 0.0 else next(c for c in competitors if c.name == rival)
     others = sorted(
         (c for c in competitors if c is not advised),
         key=lambda c: (math.isnan(c.log_likelihood), -c.log_likelihood),
     )
-    return Advice(recording, share, [advised, *others], chosen, best, fits, tunables, intervals)
+    return Advice(
+        recording,
+        share,
+        [advised, *others],
+        chosen,
+        rival,
+        best,
+        judgement.relative_error(advised.name, best),
+        diverging,
+        judgement.predictions.dataset.sel(policy=list(dict.fromkeys([name, rival, best]))),
+        fits,
+        tunables,
+        profiles,
+    )
 
 
 def fit_all(
@@ -250,12 +302,22 @@ class _Judgement:
     Args:
         predictions: of all.
         share: which measurements they are.
+        parameters: how many were fitted, by the name of who was fitted; all others are shipped.
+        default: shipped filter that stands unless another is likelier beyond chance; empty: none.
     """
 
-    def __init__(self, predictions: Predictions, share: Share) -> None:
-        self.predictions = predictions
+    def __init__(
+        self, predictions: Predictions, share: Share, parameters: Mapping[str, int], default: str
+    ) -> None:
+        self.predictions, self.parameters, self.default = predictions, parameters, default
         choosing = [*share.fitted, *share.chosen] if share.apart else share.chosen
         self.chosen, self.judged = (self._mask(spans) for spans in (choosing, share.judged))
+        self.shipped = [name for name in predictions.names if name not in parameters]
+        errors = {name: predictions.prediction_error(name) for name in predictions.names}
+        self._errors = {name: each for name, each in errors.items() if each is not None}
+        self._predicted = {name: (each**2).sum(axis=0) for name, each in self._errors.items()}
+        names = predictions.names if predictions.has_truth else []
+        self._squares = {name: predictions.squared_error(name) for name in names}
 
     def _mask(self, spans: Sequence[Span]) -> numpy.ndarray:
         """Measurements, ``(episodes, time)``."""
@@ -264,41 +326,71 @@ class _Judgement:
             mask[span.episode, span.first : span.last] = True
         return mask
 
-    def competitors(self, fitted: Mapping[str, int]) -> tuple[list[Competitor], str]:
-        """Judge everybody; the second is the best of those that were not fitted.
+    def _least(self, squares: Mapping[str, numpy.ndarray], mask: numpy.ndarray) -> str:
+        """Shipped filter of smallest mean square; by log-likelihood where there are no squares."""
+        found = self.predictions
+        means = {
+            name: mean_of(squares[name] if squares else -found.log_likelihood(name), mask)
+            for name in self.shipped
+        }
+        return min(means, key=lambda name: (math.isnan(means[name]), means[name]))
+
+    def rival(self) -> str:
+        """Shipped filter that one would take by the measurements that chose."""
+        found, default = self.predictions, self.default
+        means = {name: mean_of(found.log_likelihood(name), self.chosen) for name in self.shipped}
+        known = [name for name, mean in means.items() if not math.isnan(mean)]
+        if not known:
+            return self._least(self._predicted, self.chosen)
+        likeliest = max(known, key=means.__getitem__)
+        if default in known and not found.difference(likeliest, default, self.chosen).low > 0.0:
+            return default
+        return likeliest
+
+    def best_shipped(self) -> str:
+        """Shipped filter that is best on the measurements that judge."""
+        return self._least(self._squares or self._predicted, self.judged)
+
+    def relative_error(self, name: str, other: str) -> Estimate:
+        """Judged error over that of another, less one; without truth of the prediction errors."""
+        squares = self._squares or self._predicted
+        return relative_error(squares[name], squares[other], self.judged) if squares else UNKNOWN
+
+    def find_diverging(self, fits: Mapping[str, Fit]) -> tuple[str, ...]:
+        """Return who loses the track in the whole recording; nobody where all do.
 
         Args:
-            fitted: how many parameters of whom.
+            fits: what their likelihood is in windows.
         """
+        found = self.predictions
+        values = {name: found.log_likelihood(name)[self.chosen | self.judged] for name in fits}
+        most = max(int(numpy.isfinite(each).sum()) for each in values.values())
+        diverging = [
+            name
+            for name, each in values.items()
+            if (there := numpy.isfinite(each)).sum() < 0.99 * most
+            or each[there].mean() < fits[name].log_likelihood / fits[name].measurements - LARGEST_LOSS
+        ]
+        return tuple(diverging) if len(diverging) < len(fits) else ()
+
+    def competitor(self, name: str, rival: str) -> Competitor:
+        """Judge somebody, paired with another."""
         found, judged = self.predictions, self.judged
-        errors = {name: found.prediction_error(name) for name in found.names}
-        predicted = {name: (each**2).sum(axis=0) for name, each in errors.items() if each is not None}
-        squares = {name: found.squared_error(name) for name in found.names} if found.has_truth else {}
-        judged_by = squares or predicted
-        shipped = {
-            name: -mean_of(found.log_likelihood(name), judged) for name in found.names if name not in fitted
-        }
-        if judged_by:
-            shipped = {name: mean_of(judged_by[name], judged) for name in shipped}
-        best = min(shipped, key=lambda name: (math.isnan(shipped[name]), shipped[name]))
-        rows = []
-        for name in found.names:
-            each, penalty = errors[name], fitted.get(name, 0) / self.chosen.sum()
-            rows.append(
-                Competitor(
-                    name,
-                    name in fitted,
-                    fitted.get(name, 0),
-                    mean_of(found.log_likelihood(name), self.chosen) - penalty,
-                    found.difference(name, best, judged),
-                    math.sqrt(mean_of(predicted[name], judged)) if predicted else math.nan,
-                    math.sqrt(mean_of(squares[name], judged)) if squares else math.nan,
-                    relative_error(judged_by[name], judged_by[best], judged) if judged_by else UNKNOWN,
-                    found.nis(name, judged),
-                    UNKNOWN if each is None else correlation(each, judged),
-                )
-            )
-        return rows, best
+        penalty = self.parameters.get(name, 0) / self.chosen.sum()
+        gain = found.difference(name, rival, self.chosen)
+        return Competitor(
+            name,
+            name in self.parameters,
+            self.parameters.get(name, 0),
+            mean_of(found.log_likelihood(name), self.chosen) - penalty,
+            Estimate(*(value - penalty for value in gain)),
+            found.difference(name, rival, judged),
+            math.sqrt(mean_of(self._predicted[name], judged)) if self._predicted else math.nan,
+            math.sqrt(mean_of(self._squares[name], judged)) if self._squares else math.nan,
+            self.relative_error(name, rival),
+            found.nis(name, judged),
+            correlation(self._errors[name], judged) if self._errors else UNKNOWN,
+        )
 
 
 def _likeliest(competitors: Sequence[Competitor]) -> Competitor:

@@ -40,6 +40,16 @@ class Interval(NamedTuple):
     open_high: bool
 
 
+class Profile(NamedTuple):
+    """Likelihood of one parameter, the others adapted to each of its values."""
+
+    values: numpy.ndarray
+    """As they are searched, in ascending order."""
+    drops: numpy.ndarray
+    """Nats below the maximum at each."""
+    interval: Interval
+
+
 class Fit(NamedTuple):
     """A filter fitted to a recording."""
 
@@ -170,7 +180,12 @@ class _Place(NamedTuple):
 
 
 def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Interval]:
-    """Profile-likelihood intervals of all parameters, side by side.
+    """Profile-likelihood intervals of all parameters; arguments as of :func:`profile_parameters`."""
+    return {name: each.interval for name, each in profile_parameters(likelihood, tunable, found).items()}
+
+
+def profile_parameters(likelihood: WindowLikelihood, tunable: Tunable, found: Fit) -> dict[str, Profile]:
+    """Profile likelihood of all parameters, side by side.
 
     Every parameter is moved away from its best value, in steps to either limit; the others follow by Newton's method
     with the curvature at the maximum, which only ever raises the likelihood: an interval may be too narrow where the
@@ -192,12 +207,17 @@ def profile_intervals(likelihood: WindowLikelihood, tunable: Tunable, found: Fit
         value = _climb(likelihood, points, value, held, information, limits)
     # The maximum may turn out to be none: then the drop is counted from the highest point.
     drops = max(found.log_likelihood, float(value.max())) - value
-    intervals = {}
+    at_best = max(found.log_likelihood, float(value.max())) - found.log_likelihood
+    profiles = {}
     for i, name in enumerate(names):
         ends = [_profile_end(places, drops, i, sign) for sign in (-1.0, 1.0)]
         (low, open_low), (high, open_high) = ends
-        intervals[name] = Interval(float(best[i] - low), float(best[i] + high), open_low, open_high)
-    return intervals
+        interval = Interval(float(best[i] - low), float(best[i] + high), open_low, open_high)
+        mine = [k for k, place in enumerate(places) if place.parameter == i]
+        values = numpy.append(points[i, mine], best[i])
+        order = numpy.argsort(values)
+        profiles[name] = Profile(values[order], numpy.append(drops[mine], at_best)[order], interval)
+    return profiles
 
 
 def _information(likelihood: WindowLikelihood, best: numpy.ndarray, limits: numpy.ndarray) -> numpy.ndarray:

@@ -38,6 +38,18 @@ class TrackLog(NamedTuple):
     """Of the measurements, likewise, ``(T,)``."""
     notes: tuple[str, ...] = ()
     """What was done to the table, a line each."""
+    typical: Mapping[str, float] = {}
+    """Parameters that are a typical size of what the table states of its errors, and may differ from track to track;
+    nobody has set them."""
+
+
+class Predicted(NamedTuple):
+    """A coordinate of a measurement that an estimate predicts."""
+
+    name: str
+    unit: str
+    group: str
+    """Of coordinates whose errors are one length, such as a position."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +67,11 @@ class LogFormat:
     """Whether what is observed never stands still, as aircraft: a recording that hardly moves is of another unit."""
     scale_noise: Callable[[Any, Any], Any] | None = None
     """Multiplies the deviations stated in a ``Measurement`` by a factor, a number or ``(N,)``; None where none are."""
-    predict: Callable[[Any, Any], tuple[Any, Any]] | None = None
+    predict: Callable[[Any, Any, Any], tuple[Any, Any]] | None = None
     """What an estimate before a measurement predicts of it, and what was measured, ``(m, N)`` each, NaN where nothing
-    was received: from the mean ``(C, N)`` after the measurement before, and the ``Measurement``."""
+    was received: from the mean ``(C, N)`` after the measurement before, the ``Measurement`` and the parameters."""
+    predicted: tuple[Predicted, ...] = ()
+    """What is predicted, at least m, the main ones first."""
     plane: tuple[str, ...] = ()
     """Two columns of metres, east and north, and two of them that are true, which latitude and longitude may stand for;
     empty where they may not."""

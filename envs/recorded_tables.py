@@ -367,6 +367,7 @@ def _side_by_side(
                 source=str(path),
                 log_time=_take_rows(own.log_time, found.rows)[None],
                 started=numpy.array([found.start - own.time[0]]),
+                typical={name: value for name, value in found.typical.items() if name not in keywords},
             )
         )
     return side_by_side(recordings, notes=tuple(limit_notes(notes)))

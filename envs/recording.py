@@ -67,6 +67,7 @@ class Recording:
         log_time: times of the measurements as they stand in the log, numbers or words, ``(E, T)``; NaN or empty where
             the log has no row. None: there is no other time than ``seconds``.
         started: from the first measurement of the log to the start of the track, s, ``(E,)``; default: zero.
+        typical: parameters that follow from what the log states of its errors, where nobody names them.
 
     Raises:
         ValueError: for arrays that do not fit each other, or are not finite where they must be.
@@ -86,6 +87,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     log_time: numpy.ndarray | None = None
     started: Any = None
+    typical: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         episodes, _ = self.seconds.shape
@@ -214,7 +216,7 @@ class Recording:
                 f"decision_interval must be at most {shortest}, the measurements of the shortest episode of recording "
                 f"{self.name!r}, got {interval}"
             )
-        parameters = {"horizon": longest - longest % interval, **self.parameters}
+        parameters = {"horizon": longest - longest % interval, **self.typical, **self.parameters}
         made = cls.Parameters(**{**parameters, **keywords})
         if made.horizon > longest:
             raise ValueError(
@@ -418,6 +420,10 @@ def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:
         truth=numpy.concatenate(truths) if len(truths) == len(recordings) else None,
         log_time=numpy.concatenate(times) if len(times) == len(recordings) else None,
         started=numpy.concatenate([one.started for one in recordings]),
+        typical={
+            key: float(numpy.median([one.typical.get(key, value) for one in recordings]))
+            for key, value in first.typical.items()
+        },
         **{"names": tuple(name for one in recordings for name in one.names), **fields},
     )
 

@@ -61,7 +61,7 @@ def dataset_of(recording: Recording) -> "xarray.Dataset":
         coords=coords,
         attrs={
             "environment": recording.environment,
-            "parameters": json.dumps(dict(recording.parameters)),
+            "parameters": json.dumps({**recording.typical, **recording.parameters}),
             **told,
         },
     )

@@ -25,6 +25,7 @@ from ..filters.gaussian import log_density
 from .bootstrap import block_of
 from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
+from .innovations import with_innovations
 from .parallel import Workers, check_workers
 from .rollout import Progress, Series, rollout
 from .seeds import episode_seeds
@@ -147,6 +148,10 @@ def _measurement_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
     }
 
 
+def _track_and_drawing(model: Model, episode: Episode) -> dict[str, Any]:
+    return {**_measurement_and_drawing(model, episode), **model.track(episode)}
+
+
 def _limits(model: Model, episode: Episode) -> dict[str, Any]:
     """What is kept of a bound."""
     return model.filter.records(episode.filter, episode.measurement)
@@ -155,7 +160,7 @@ def _limits(model: Model, episode: Episode) -> dict[str, Any]:
 def _report(model: Model, tracks: bool, drawn: bool) -> Report:
     """What is kept of every measurement of a task."""
     if drawn:
-        return _measurement_and_drawing
+        return _track_and_drawing if tracks else _measurement_and_drawing
     if model.task.has_truth:
         return _measurement_and_track if tracks else _measurement_report
     return _expectation_and_track if tracks else _expectation_report
@@ -191,7 +196,7 @@ class Experiment:
     """Keep what a track is drawn from, see :meth:`.Task.track`; it takes memory."""
     drawn_episodes: int = 0
     """Of how many of the first episodes to keep what :meth:`.Task.drawn` tells, as ``drawn_estimate`` and so on over
-    policy, drawn_episode and time; not beside ``tracks``."""
+    policy, drawn_episode and time."""
     paper: str = ""
     """Name of the paper's algorithm, whose score is 0; kept in the attributes of the evaluation."""
     reference: str = ""
@@ -422,6 +427,7 @@ class Plan(NamedTuple):
                 dataset = dataset.assign_coords(
                     _recording_coords(self.scenario.recording, self.flown, dataset)
                 )
+                dataset = with_innovations(dataset, next(iter(self.models.values())).task)
         return dataset.assign_attrs(
             paper=experiment.paper,
             reference=experiment.reference,
@@ -463,8 +469,6 @@ def plan_of(experiment: Experiment, competitors: Mapping[str, Any]) -> Plan:
         scenario=read_files(cls, experiment.scenario),
         drawn_episodes=check_integer("drawn_episodes", experiment.drawn_episodes, 0),
     )
-    if experiment.tracks and experiment.drawn_episodes:
-        raise ValueError("tracks keeps every episode: leave out drawn_episodes")
     chosen = find_scenario(cls, experiment.scenario, experiment.keywords)
     episodes, seed, split, control = (
         experiment.episodes, experiment.seed, experiment.split, experiment.control

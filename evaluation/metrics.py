@@ -16,6 +16,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
+from .predictions import correlation, stretch_interval
 from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
 from .threads import one_thread
 
@@ -308,6 +309,31 @@ class _Against:
             yield Measure(metric, "", "all", estimate, "1")
 
 
+def prediction_measures(run: xarray.Dataset) -> Iterator[Measure]:
+    """What the innovations of one competitor come to: their size and whether they are white.
+
+    ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
+    correlation of successive ones, zero where they are white; of every group of what is measured.
+
+    Args:
+        run: one competitor's part of an evaluation.
+    """
+    if "prediction_error" not in run:
+        return
+    groups = run["measured_group"].values
+    for group in dict.fromkeys(groups.tolist()):
+        chosen = numpy.flatnonzero(groups == group)
+        innovation = numpy.moveaxis(run["prediction_error"].values[..., chosen], -1, 0)
+        squares = (innovation**2).sum(axis=0)
+        there = numpy.isfinite(squares)
+        if not there.any():
+            continue
+        values = numpy.stack([squares, numpy.ones_like(squares)], axis=-1)
+        size = stretch_interval(there, values, lambda means: numpy.sqrt(ratio(means)))
+        yield Measure("prediction_error", group, "all", size, str(run["measured_unit"].values[chosen[0]]))
+        yield Measure("innovation_correlation", group, "all", correlation(innovation, there), "1")
+
+
 def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
     """One where an episode costs less than by the paper's algorithm, ``(episodes,)``."""
     # A draw is half a win, so that the paper's algorithm wins half against itself; rounding decides nothing.
@@ -347,7 +373,8 @@ def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -
     and ``nis_inside`` (share inside the 95 % chi-square interval), ``anis_band`` (where the mean lies with 95 % if all
     is consistent); ``log_likelihood`` (mean log-density of a measurement as it was predicted);
     ``mean_mode_probability``; ``cost`` (uncapped mean), ``return`` (sum of the ``cost`` rewards);
-    ``lost_episodes`` of estimators (share). Without truth what needs it is left out.
+    ``lost_episodes`` of estimators (share). Without truth what needs it is left out. Of a recording with tracks
+    ``prediction_error`` and ``innovation_correlation``, whose intervals are over stretches of measurements.
 
     Against the paper's algorithm ``cost_difference`` and ``relative_cost_difference`` (paired), ``median_cost_ratio``
     and ``win_rate`` over episodes, ``score`` = (C_paper - C) / (C_paper - C_reference). Against the best of what is
@@ -362,9 +389,10 @@ def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -
     own = None if dataset.attrs.get("recorded") else metrics
     declare = functools.partial(record_statistics, episodes=bootstrap.episodes, metrics=own)
     runs = (dataset.sel(policy=name) for name in dataset["policy"].values.tolist())
-    contenders = [
-        contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own) for run in runs
-    ]
+    contenders = []
+    for run in runs:
+        contender = contender_of(reduce_run(run, declare, bootstrap).results(), run, bootstrap, own)
+        contenders.append(contender._replace(measures=[*contender.measures, *prediction_measures(run)]))
     return records_of(contenders, dataset, bootstrap)
 
 

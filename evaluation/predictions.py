@@ -5,7 +5,6 @@ Neighbouring measurements are not independent: intervals come from resampling wh
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy
 import xarray
@@ -23,7 +22,7 @@ class Predictions:
     """Predictions and estimates of all competitors on a recording.
 
     Args:
-        dataset: of an evaluation; for predicted measurements with tracks.
+        dataset: of an evaluation; for predicted measurements with tracks, see :mod:`.innovations`.
         task: of the recording.
     """
 
@@ -49,15 +48,12 @@ class Predictions:
         return found
 
     def prediction_error(self, name: str) -> numpy.ndarray | None:
-        """Measured less predicted, ``(m, episodes, time)``; None where no log format says what is predicted."""
-        log_format = type(self.task).log_format
-        if log_format is None or log_format.predict is None or "estimate" not in self.dataset:
+        """Measured less predicted, ``(m, episodes, time)``, of the first group of what is measured; None without."""
+        if "prediction_error" not in self.dataset:
             return None
-        estimate = numpy.moveaxis(self.dataset["estimate"].sel(policy=name).values, -1, 0)
-        before = numpy.roll(estimate, 1, axis=2)
-        before[:, :, 0] = math.nan
-        predicted, measured = log_format.predict(before, _Measured(self.dataset, name))
-        found: numpy.ndarray = measured - predicted
+        groups = self.dataset["measured_group"].values
+        values = self.dataset["prediction_error"].sel(policy=name).values[..., groups == groups[0]]
+        found: numpy.ndarray = numpy.moveaxis(values, -1, 0)
         return found
 
     def nis(self, name: str, mask: numpy.ndarray) -> float:
@@ -79,23 +75,6 @@ class Predictions:
         values = self.log_likelihood(name) - self.log_likelihood(other)
         chosen = numpy.ones(self.shape, dtype=bool) if mask is None else mask
         return stretch_interval(chosen, numpy.stack([values, numpy.ones_like(values)], axis=-1), ratio)
-
-
-class _Measured:
-    """Measurements of a dataset by attribute, ``(..., episodes, time)``."""
-
-    def __init__(self, dataset: xarray.Dataset, name: str) -> None:
-        self._dataset, self._name = dataset, name
-
-    def __getattr__(self, name: str) -> Any:
-        key = f"measurement_{name}"
-        if name.startswith("_") or key not in self._dataset:
-            raise AttributeError(name)
-        values = self._dataset[key]
-        if "policy" in values.dims:
-            values = values.sel(policy=self._name)
-        array: numpy.ndarray = values.values
-        return numpy.moveaxis(array, -1, 0) if array.ndim > 2 else array
 
 
 def mean_of(values: numpy.ndarray, mask: numpy.ndarray) -> float:

@@ -93,6 +93,7 @@ NEEDS = {
         Need(f"{EVALUATE} --policy {name}:Kalman", ESTIMATORS)
         for name in ("filterpy_filters", "stone_soup_kalman")
     ],
+    "onnx": [Need(f"filtergym export {ID} bptt --to onnx --out agent.onnx")],
     "offline": [Need(f"filtergym offline {ID} --episodes 2 --out datasets")],
     "cluster": [Need(f"{EVALUATE} --policy imm --cluster {name}") for name in ("dask", "ray")],
 }

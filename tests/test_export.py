@@ -15,7 +15,8 @@ from rich.text import Text
 from filtergym import evaluate, record, tidy_records
 from filtergym.__main__ import main
 from filtergym.reports.export import latex_table, latex_text, records_as_csv
-from filtergym.reports.tables import flights_table, recording_table, results_tables
+from filtergym.reports.recording_tables import recording_tables
+from filtergym.reports.tables import flights_table, results_tables
 
 ENV = "filtergym/ManeuveringTarget-v0"
 NASTY = '50 % of $a_b$ & {c} ~ ^ # \\ < > | " ± 3 m², σ ≤ ∞, λ, 日, Müller'
@@ -38,7 +39,7 @@ def tables(dataset):
     nasty.add_row("", "")
     return {
         "results": results_tables(records, {}, 150)[0],
-        "recorded": recording_table(tidy_records(flights)),
+        "recorded": recording_tables(tidy_records(flights), {}, False, 150)[0],
         "flights": flights_table(flights, flight_records(flights), tidy_records(flights)),
         "grid": Grid("title", ["`a`", "b"], [["`x`", "1<br>[2, 3]"], ["`y`", "-"]]).__rich__(),
         "nasty": nasty,

@@ -7,6 +7,7 @@ import numpy as np
 import pandas
 import pymap3d
 import pytest
+from filtergym.envs.catalogue import make_task, task_class
 from filtergym.envs.flight_tables import seconds
 from filtergym.evaluation.estimates import write_estimates
 
@@ -398,3 +399,38 @@ def test_estimates_of_several_logs_have_their_own_times(tmp_path):
     assert rows[0] == ("a", PARIS[2].isoformat(), 10.0)
     assert rows[COUNT - 2] == ("b", "10.5", 10.0)
     write_estimates(tmp_path / "estimates.nc", evaluate(TARGET, ["imm"], scenario=recording, tracks=True))
+
+
+# --- agents are shown deviations over the log's own
+
+
+def scaled(tmp_path, factor, sigma=40.0):
+    """The aircraft's log with all lengths so many times as large."""
+    log = aircraft(sigma_x=np.full(COUNT, sigma), sigma_y=np.full(COUNT, sigma))
+    return log * {name: 1.0 if name == "time" else factor for name in log}
+
+
+@pytest.mark.parametrize("name", ["ppo", "bptt"])
+def test_the_unit_of_length_of_a_log_is_nothing_to_an_agent_of_alpha_beta_filters(tmp_path, name):
+    """To rounding of decimals and sixty updates. What knows accelerations in m/s^2, as kalman-net, is another."""
+    errors = []
+    for factor in (1.0, 1.0 / 32.0):
+        recording = read(scaled(tmp_path, factor), tmp_path)
+        assert recording.typical == {"range_sigma": 40.0 * factor}
+        errors.append(evaluate(TARGET, [name], recording)["error"].values / factor)
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-6, atol=1e-6)
+
+
+def test_a_deviation_that_is_named_wins_and_several_logs_take_their_median(tmp_path):
+    for name, sigma in (("a", 40.0), ("b", 60.0)):
+        scaled(tmp_path, 1.0, sigma).to_csv(tmp_path / f"{name}.csv", index=False)
+    both = read_recording(tmp_path, TARGET)
+    assert len(both.names) == 2
+    assert both.typical == {"range_sigma": 50.0}
+    task = task_class(TARGET)
+    assert make_task(task, both).parameters.range_sigma == 50.0
+    assert make_task(task, both, range_sigma=7.0).parameters.range_sigma == 7.0
+    assert read_recording(tmp_path, TARGET, range_sigma=7.0).typical == {}
+    both.write(tmp_path / "both.nc")
+    assert read_recording(tmp_path / "both.nc").parameters["range_sigma"] == 50.0
+    assert read(untold(sigma_x=None, sigma_y=None), tmp_path).typical == {}

@@ -13,6 +13,7 @@ import numpy as np
 import pandas
 import pytest
 import xarray
+from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.flight_tables import MOST_ROWS
@@ -31,6 +32,7 @@ from models import make_model
 
 from filtergym import evaluate, read_recording, record, tidy_records
 from filtergym.__main__ import main
+from filtergym.commands.evaluation import causal_names
 from filtergym.reports.tables import with_interval
 
 TARGET, LOOSE = "filtergym/ManeuveringTarget-v0", "filtergym/LooselyCoupledNavigation-v0"
@@ -815,12 +817,17 @@ def test_the_table_of_the_page_is_that_of_its_command(tmp_path):
     runpy.run_path(str(DOCS / "examples" / "plots.py"))["write_plots"](tmp_path / "plots.csv")
     read = read_recording(tmp_path / "plots.csv", TARGET)
     assert read.names == ("straight", "turning")
-    records = tidy_records(evaluate(TARGET, ["imm", "imm-tuned"], scenario=read))
+    records = tidy_records(evaluate(TARGET, ["imm", "imm-tuned"], scenario=read, tracks=True))
     found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    text = PAGE.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8").partition("--recording plots.csv")[2]
+    band = found["imm", "anis_band"]
+    assert f"lies in the band ({band.low:.3g} to {band.high:.3g} here)" in text
     for policy, shown in (("imm", "`imm` (paper)"), ("imm-tuned", "`imm-tuned`")):
-        cells = [with_interval(found[policy, metric]) for metric in ("log_likelihood", "anis")]
-        assert f"| {shown} | {' | '.join(cells)} | 0.849 to 1.16 |" in text
+        cells = next(line for line in text.splitlines() if line.startswith(f"| {shown} |")).split(" | ")
+        metrics = {1: "log_likelihood", 3: "anis", 5: "prediction_error"}
+        assert {i: cells[i] for i in metrics} == {
+            i: with_interval(found[policy, m]) for i, m in metrics.items()
+        }
 
 
 def test_every_column_is_on_the_page():
@@ -879,9 +886,10 @@ def test_tables_on_the_command_line(command, tmp_path):
         "evaluate", TARGET, "--recording", "plots.csv", "--policy", "imm", "--json", "records.json"
     )
     assert code == 0
-    assert "log-likelihood per measurement" in out
+    assert "log-likelihood: of what was measured" in out
     metrics = {record["metric"] for record in json.loads((tmp_path / "records.json").read_text())}
     assert {"log_likelihood", "anis", "anis_band", "nis_inside"} <= metrics
+    assert {"prediction_error", "innovation_correlation"} <= metrics
     assert not {"rmse", "cost", "anees"} & metrics
 
 
@@ -914,3 +922,13 @@ def test_mistakes_on_the_command_line_are_one_sentence(words, sentence, command,
     assert sentence in out
     assert out.startswith("Error: ")
     assert len(out.strip().splitlines()) == 1
+
+
+def test_agents_of_other_fields_are_left_out_where_nobody_names_them():
+    """Of a recording on two axes, which shows other fields than one axis, on which the agents were trained."""
+    id = "filtergym/LooselyCoupledNavigation-v0"
+    problem = problem_of(id)
+    for axes, has_agents in ((1, True), (2, False)):
+        names = causal_names(problem, record(id, None, 1, horizon=10, axes=axes))
+        assert ("bptt" in names) == has_agents
+        assert "augmented" in names

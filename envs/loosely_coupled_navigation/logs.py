@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy
 
-from ..log_format import LogFormat, TrackLog, TrackStart
+from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..plausibility import check_extents
 from ..recorded_tables import Columns
 from .parameters import AXES, LooselyCoupledNavigationParameters
@@ -76,4 +76,16 @@ def read_log(columns: Columns) -> TrackLog:
     )
 
 
-LOG_FORMAT = LogFormat(COLUMNS, read_log, start_track, longest_interval=5.0)
+def predict_fix(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
+    """Fix that an estimate predicts by the increment of the INS, and the fix, m, ``(axes, N)`` each."""
+    return mean + measurement.increment, numpy.where(measurement.available > 0.0, measurement.fix, numpy.nan)
+
+
+LOG_FORMAT = LogFormat(
+    COLUMNS,
+    read_log,
+    start_track,
+    predict=predict_fix,
+    predicted=tuple(Predicted(axis, "m", "position") for axis in AXES),
+    longest_interval=5.0,
+)

@@ -13,7 +13,7 @@ import numpy
 
 from ...filters import polar
 from ..live_input import Feed
-from ..log_format import LogFormat, TrackLog, TrackStart
+from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..plausibility import check_bearings
 from ..recorded_tables import Columns
 from ..recording import Recording
@@ -94,7 +94,20 @@ def read_log(columns: Columns) -> TrackLog:
         float(columns.time[first]),
         time,
         (*_stale_notes(stale), *_gap_notes(rows)),
+        _typical_sigma(columns, there),
     )
+
+
+def _typical_sigma(columns: Columns, there: numpy.ndarray) -> dict[str, float]:
+    """Median of the deviations that a table states, in place of the radar's; empty where it is that, or none is stated.
+
+    Agents are shown deviations over this one, and errors cost in its square.
+    """
+    names = ["sigma_x", "sigma_y"] if columns.has("sigma_x", "sigma_y") else ["range_sigma"]
+    if not columns.has(*names):
+        return {}
+    median = float(f"{numpy.nanmedian([columns[name][there] for name in names]):.6g}")
+    return {} if median == ManeuveringTargetParameters.range_sigma else {"range_sigma": median}
 
 
 def _find_stale(columns: Columns, position: numpy.ndarray, sigma: numpy.ndarray) -> numpy.ndarray:
@@ -283,7 +296,7 @@ def scale_noise(measurement: Any, factor: Any) -> Any:
     return measurement._replace(variance=measurement.variance * factor**2)
 
 
-def predict_position(mean: Any, measurement: Any) -> tuple[Any, Any]:
+def predict_position(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
     """Position that an estimate predicts over the time to a measurement, and what was measured, m, ``(2, N)`` each."""
     predicted = mean[:2] + measurement.interval * mean[2:4]
     return predicted, numpy.where(measurement.available > 0.0, measurement.position, numpy.nan)
@@ -296,6 +309,7 @@ LOG_FORMAT = LogFormat(
     targets_move=True,
     scale_noise=scale_noise,
     predict=predict_position,
+    predicted=(Predicted("x", "m", "position"), Predicted("y", "m", "position")),
     plane=("x", "y", "truth_position_x", "truth_position_y"),
     longest_interval=60.0,
 )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy
 
 from ...filters.class_fusion import bearing_difference
-from ..log_format import LogFormat, TrackLog, TrackStart
+from ..log_format import LogFormat, Predicted, TrackLog, TrackStart
 from ..recorded_tables import Columns
 from .parameters import RadarEsmTrackingParameters
 
@@ -113,4 +113,19 @@ def _differences(columns: Columns, decided: numpy.ndarray) -> numpy.ndarray:
     return numpy.where(decided, found, 0.0)
 
 
-LOG_FORMAT = LogFormat(COLUMNS, read_log, start_track, longest_interval=60.0)
+def predict_radar(mean: Any, measurement: Any, parameters: Any) -> tuple[Any, Any]:
+    """Range and range rate that an estimate predicts by its acceleration, and those of the radar, ``(2, N)`` each."""
+    T = parameters.sampling_interval
+    distance, rate, acceleration = mean
+    predicted = numpy.stack([distance + T * rate + 0.5 * T**2 * acceleration, rate + T * acceleration])
+    return predicted, measurement.radar
+
+
+LOG_FORMAT = LogFormat(
+    COLUMNS,
+    read_log,
+    start_track,
+    predict=predict_radar,
+    predicted=(Predicted("range", "m", "range"), Predicted("range_rate", "m/s", "range rate")),
+    longest_interval=60.0,
+)

@@ -9,11 +9,13 @@ from ..agents.named_policies import pretrained_agents
 from ..baselines.advice import advise, fit_all
 from ..baselines.fitted_filters import SUFFIX, families_of, own_family, write_fitted
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import check_names, nearest, read_recording, short_name
-from ..evaluation.files import writable_file
+from ..envs.catalogue import check_names, make_task, nearest, read_recording, short_name
+from ..evaluation.files import writable_file, write_text
 from ..names import find_competitor
-from ..reports.advice import advice_lines, advice_table, parameter_lines
-from .evaluation import causal_names, say_departures
+from ..reports.advice import advice_lines, advice_table, further_sentences, parameter_lines
+from ..reports.results import settings_of
+from .evaluation import causal_names, departure_lines
+from .shown import advice_maker
 from .terminal import command_line, console, pair, parse_settings, progress_bar
 
 OWN = "The class is your own: put these values into it. A file that names a module would run its code."
@@ -71,6 +73,12 @@ def advise_on_log(
             help=f"File for the fitted filter, *{SUFFIX}; filtergym evaluate --policy FILE runs it."
         ),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="HTML file for a page of it: sentences, tables, the track, innovations and NIS over time."
+        ),
+    ] = None,
     policy: Annotated[
         list[str] | None,
         typer.Option(
@@ -95,11 +103,14 @@ def advise_on_log(
         if not out.name.endswith(SUFFIX):
             raise ValueError(f"the name of a fitted filter ends in {SUFFIX}, got {str(out)!r}")
         writable_file(out)
+    make_page = None if report is None else advice_maker()  # what it lacks is said before anything else
+    if report is not None:
+        writable_file(report)
     found = read_recording(recording, environment, speeds=pair("--speeds", speeds), **keywords)
     problem = problem_of(found.environment)
     check_names(problem.task, keywords)
-    learned = list(pretrained_agents(problem.id))
-    shipped = {name: find_competitor(problem, name) for name in causal_names(problem)}
+    shipped = {name: find_competitor(problem, name) for name in causal_names(problem, found)}
+    learned = [name for name in pretrained_agents(problem.id) if name in shipped]
     own = {name: own_family(name, find_competitor(problem, name)) for name in policy or []}
     with progress_bar() as bar:
         line = bar.add_task("advising", total=1.0)
@@ -110,15 +121,16 @@ def advise_on_log(
             own,
             noise=noise,
             seed=seed,
+            every_profile=report is not None,
             progress=lambda what, share: bar.update(line, description=what, completed=share),
             **keywords,
         )
     for note in found.notes:
         console.print(note, highlight=False, soft_wrap=True)
     console.print(advice_table(advice, learned))
-    for sentence in advice_lines(advice, learned):
+    departures = list(departure_lines(problem, found, learned, keywords))
+    for sentence in [*advice_lines(advice, learned), *departures]:
         console.print(sentence, highlight=False, soft_wrap=True)
-    say_departures(problem, found, learned, keywords)
     if out is not None and advice.fitted.name in own:
         console.print(OWN)
     elif out is not None:
@@ -126,4 +138,11 @@ def advise_on_log(
         write_fitted(out, problem, name, advice.fits[name], advice.intervals, command_line())
         console.print(
             f"{name} is saved: filtergym evaluate {problem.id} --policy {out} runs it", soft_wrap=True
+        )
+    if report is not None and make_page is not None:
+        task = make_task(problem.task, found, **keywords)
+        further = [*further_sentences(advice, learned), *departures]
+        write_text(report, make_page(advice, task, further, learned, settings_of(command_line())))
+        console.print(
+            f"report: {report} ({report.stat().st_size / 1e6:.1f} MB), opens in a browser", soft_wrap=True
         )

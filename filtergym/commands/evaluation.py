@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from rich.table import Table
 from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
+from ..envs.backend import make_model
 from ..envs.catalogue import make_task, read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
@@ -34,15 +35,20 @@ from ..evaluation.summary import combine_summaries, summaries
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.benchmark import result_of
 from ..reports.export import latex_table, records_as_csv
+from ..reports.recording_tables import recording_tables
 from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, settings_of, write_results
-from ..reports.tables import flights_table, recording_table, results_tables
+from ..reports.tables import flights_table, results_tables
 from ..reports.work import work_of
 from .shown import REPORT, make_report
 from .terminal import command_line, console, pair, progress_bar
 
 LARGE = 200_000_000
 """Bytes of a file that nobody expects without having asked for it."""
+MOST_PREDICTIONS = 2_000_000
+"""Measurements of all competitors whose estimates are kept, some 200 bytes each."""
+TRACKS = ("truth", "estimate", "covariance")
+"""What is kept of measurements for predictions, and not written unless estimates are asked for."""
 MOST_RECORDINGS = 40
 """Of which a table tells one by one."""
 
@@ -138,15 +144,45 @@ def find_names(problem: Problem, data: Any, policies: Sequence[str] | None) -> l
     known = problem.baselines
     if policies or not isinstance(data, Recording):
         return list(policies or known.benchmark or known.names)
-    return [*causal_names(problem), *known.smoothers]
+    return [*causal_names(problem, data), *known.smoothers]
 
 
-def causal_names(problem: Problem) -> list[str]:
+def causal_names(problem: Problem, recording: Recording) -> list[str]:
     """Return the names of all that can run on a recording as it comes: classical, tuned and learned."""
     # What is drawn by lot says nothing of anybody's sensors.
     known = problem.baselines
     classical = [name for name in known.policies if problem.competitor(name) is not RandomPolicy]
-    return [*classical, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
+    return [
+        *classical,
+        *known.estimators,
+        *problem.tuned_policies,
+        *(name for name in pretrained_agents(problem.id) if _knows_fields(problem, name, recording)),
+    ]
+
+
+def _knows_fields(problem: Problem, name: str, recording: Recording) -> bool:
+    """Whether an agent was trained on fields that are shown of a recording: one of other axes shows others."""
+    maker = find_competitor(problem, name)
+    stored = getattr(maker, "policy", maker)
+    header, control = getattr(stored, "header", None), getattr(stored, "control", None)
+    if header is None or control is None:
+        return True
+    model = make_model(problem.task, control, recording, backend="numpy")
+    return {*header["fields"]} <= {field.name for field in model.fields}
+
+
+def keeps_predictions(problem: Problem, data: Any, names: Sequence[str]) -> bool:
+    """Whether estimates are kept to say what they predicted: of recordings that are not huge.
+
+    Args:
+        problem: that is evaluated.
+        data: of :func:`find_data`.
+        names: of competitors.
+    """
+    log_format = problem.task.log_format
+    if not isinstance(data, Recording) or log_format is None or log_format.predict is None:
+        return False
+    return data.seconds.size * len(set(names)) <= MOST_PREDICTIONS
 
 
 class Outcome(NamedTuple):
@@ -186,9 +222,11 @@ class Outcome(NamedTuple):
     def tables(self, problem: Problem, flights: list[Any]) -> list[Table]:
         """Return what is printed, widest first."""
         tables = [flights_table(self.dataset, flights, self.records, console.width)] if flights else []
-        if not self.has_truth:
-            return [*tables, recording_table(self.records, self.differences(problem))]
-        return [*tables, *results_tables(self.records, problem.knows, console.width)]
+        if self.has_truth:
+            tables += results_tables(self.records, problem.knows, console.width)
+        if self.dataset.attrs["recorded"]:
+            tables += recording_tables(self.records, self.differences(problem), self.has_truth, console.width)
+        return tables
 
 
 def run(
@@ -225,8 +263,12 @@ def run(
 
         if task.flights or outputs.estimates is not None or whole:
             dataset = run_experiment(experiment, competitors_of(problem, names, trust), tick, workers)
+            records = tidy_records(dataset)
+            if outputs.estimates is None:
+                tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]
+                dataset = dataset.drop_vars(tracks)
             curves = None if outputs.folder is None else curves_of(dataset)
-            return Outcome(dataset, tidy_records(dataset), curves, refusal, store)
+            return Outcome(dataset, records, curves, refusal, store)
         requests = evaluation_requests(problem, experiment, names, trust)
         work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))
@@ -291,7 +333,15 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
 def say_departures(
     problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
 ) -> None:
-    """Say of every agent, in a line, how what it is shown departs from what it was trained on.
+    """Say what :func:`departure_lines` says."""
+    for line in departure_lines(problem, data, learned, keywords, trust):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def departure_lines(
+    problem: Problem, data: Any, learned: Sequence[str], keywords: Mapping[str, Any], trust: bool = False
+) -> Iterator[str]:
+    """Say what agents are shown follows from a log, and how it departs from what each was trained on, in a line.
 
     Args:
         problem: whose agents they are.
@@ -300,13 +350,19 @@ def say_departures(
         keywords: parameters of the task.
         trust: load models that can execute code.
     """
+    typical = data.typical if learned and isinstance(data, Recording) else {}
+    for name in typical.keys() - keywords.keys():
+        yield (
+            f"{name} is {typical[name]:g}, the median of what the log states: agents are shown deviations over it, and "
+            f"costs count in its square; --set {name}=VALUE names another"
+        )
     for name in learned:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # it was loaded before, and has warned
             maker = find_competitor(problem, name, trust)
         found = departure(problem.task, maker, data, keywords)
         if found is not None:
-            console.print(f"{name}: {found}", highlight=False, soft_wrap=True)
+            yield f"{name}: {found}"
 
 
 def _size_warning(size: int, largest: int, asked: bool | None) -> str:

@@ -24,7 +24,16 @@ from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
-from .evaluation import FlightOptions, Outputs, find_data, find_names, run, say_departures, write
+from .evaluation import (
+    FlightOptions,
+    Outputs,
+    find_data,
+    find_names,
+    keeps_predictions,
+    run,
+    say_departures,
+    write,
+)
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -174,8 +183,8 @@ def evaluate_policies(
         seed,
         split,
         control,
-        tracks=estimates is not None,
-        drawn_episodes=int(out is not None and estimates is None),
+        tracks=estimates is not None or keeps_predictions(problem, data, names),
+        drawn_episodes=int(out is not None),
         backend=backend,
         threads=threads,
         strict=strict,

@@ -1,1 +1,1 @@
-"""Filters that leave the package: as C, as Python, their networks in other forms."""
+"""Filters written out for other programs: what runs without this package."""

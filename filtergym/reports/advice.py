@@ -3,11 +3,12 @@
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from rich.table import Table
 
 from ..baselines.advice import Advice, Competitor
-from ..baselines.fitting import IDENTIFIABLE, NOISE_SCALE, Fit, Interval
+from ..baselines.fitting import DROP, IDENTIFIABLE, NOISE_SCALE, STARTS, Fit, Interval
 from ..baselines.table import Tunable
 from ..evaluation.bootstrap import Estimate
 
@@ -22,12 +23,14 @@ NAME_WIDTH = 16
 """Columns of a name; longer ones go on below."""
 COLUMNS = {"nats": 6, "less": 8, "RMSE": 6, "against, %": 8, "NIS": 4, "correl-\nation": 8}
 """Of the table, and how wide they are at least, so that no number is cut."""
+NEGLIGIBLE = 5e-4
+"""Difference of errors that is none in the digits of a sentence."""
 FEW = 80
 """Measurements below which an advice warns."""
 
 
 def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
-    """Compare the advised filter with the other fitted ones, the best shipped and whoever follows.
+    """Compare the advised filter with the other fitted ones, its rival, the best in hindsight and whoever follows.
 
     Args:
         advice: of :func:`~..baselines.advice.advise`.
@@ -42,14 +45,39 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
     table.add_column("filter", no_wrap=True)
     for title, width in COLUMNS.items():
         table.add_column(title, justify="right", min_width=width)
-    keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name == advice.best_shipped)]
+    for row in advice_rows(advice, learned):
+        table.add_row("\n".join(textwrap.wrap(row.label, NAME_WIDTH)), *row.cells)
+    what = "estimates" if has_truth else "predictions"
+    table.caption = (
+        "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
+        f"\nless, against: paired with {advice.rival}, the rival: what one would take of the shipped ones by the "
+        f"measurements that chose, on those that judge; RMSE: of {what}.\nNIS: mean, 1 where innovations are as large "
+        "as predicted; correlation: of successive prediction errors, 0 where they are white."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+class Row(NamedTuple):
+    """A row of the table of an advice."""
+
+    competitor: Competitor
+    label: str
+    cells: tuple[str, ...]
+    """In the order of ``COLUMNS``."""
+
+
+def advice_rows(advice: Advice, learned: Sequence[str]) -> Iterator[Row]:
+    """Return what stands in the table: the advised filter first; arguments as of :func:`advice_table`."""
+    has_truth = advice.recording.truth is not None
+    known = advice.rival, advice.best_shipped
+    keep = [advice.advised, *(c for c in advice.competitors[1:] if c.fitted or c.name in known)]
     room = MOST_ROWS - len(keep)
     rest = [c for c in advice.competitors if c not in keep]
     agents = [c for c in rest if c.name in learned]
     keep += [*agents, *[c for c in rest if c not in agents][: max(room - len(agents), 0)]]
     for one in [c for c in advice.competitors if c in keep]:
-        table.add_row(
-            "\n".join(textwrap.wrap(_label(advice, one), NAME_WIDTH)),
+        cells = (
             _number(one.log_likelihood),
             _interval(one.difference, "+.3f"),
             _number(one.error if has_truth else one.prediction),
@@ -57,20 +85,13 @@ def advice_table(advice: Advice, learned: Sequence[str]) -> Table:
             _number(one.nis, ".2f"),
             _interval(one.correlation, "+.2f"),
         )
-    what = "estimates" if has_truth else "predictions"
-    table.caption = (
-        "nats: log-likelihood per measurement where filters were chosen, less one nat in all for each fitted parameter."
-        f"\nless, against: paired with {advice.best_shipped}, the best shipped, on the measurements that judge; "
-        f"RMSE: of {what}.\nNIS: mean, 1 where innovations are as large as predicted; correlation: of successive "
-        "prediction errors, 0 where they are white."
-    )
-    table.caption_justify = "left"
-    return table
+        yield Row(one, _label(advice, one), cells)
 
 
 def _label(advice: Advice, one: Competitor) -> str:
     """Name of a filter, and what it is here."""
-    role = "advised" if one is advice.advised else "fitted" if one.fitted else ""
+    role = "fitted" if one.fitted else "rival" if one.name == advice.rival else ""
+    role = "advised" if one is advice.advised else role
     return f"{one.name} ({role})" if role else one.name
 
 
@@ -98,12 +119,18 @@ def advice_lines(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
         learned: names of shipped agents.
     """
     one = advice.fitted
-    yield _verdict(advice)
+    yield verdict(advice)
     if one is not advice.advised:
-        lag = advice.advised.log_likelihood - one.log_likelihood
-        yield f"Of what was fitted {one.name} comes closest, {lag:.3f} nats per measurement behind, with"
+        yield f"Of what was fitted {one.name} comes closest, with"
     for line in parameter_lines(advice.tunables[one.name], advice.fits[one.name], advice.intervals):
         yield f"  {line}"
+    yield from further_sentences(advice, learned)
+
+
+def further_sentences(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
+    """Say how sure the advice is and what cannot be known; arguments as of :func:`advice_lines`."""
+    yield from _hindsight(advice)
+    yield from _fits(advice)
     yield from _noise(advice)
     yield from _warnings(advice)
     yield from _agents(advice, learned)
@@ -118,59 +145,141 @@ def parameter_lines(tunable: Tunable, found: Fit, intervals: Mapping[str, Interv
         intervals: of the parameters.
     """
     for name, value in found.values.items():
-        yield _parameter(name, value, intervals.get(name), tunable.units)
+        text = parameter_text(name, value, intervals.get(name), tunable, name in found.at_limit)
+        said = " ".join(part for part in (parameter_name(name), *text[:3]) if part)
+        yield said + (f": {text.remark}" if text.remark else "")
 
 
-def _verdict(advice: Advice) -> str:
+def verdict(advice: Advice) -> str:
     """First sentence."""
-    one, judged = advice.advised, sum(span.last - span.first for span in advice.share.judged)
-    name = f"{one.name}, with the parameters below" if one.fitted else f"{one.name}, as it is shipped"
+    one, rival = advice.fitted, advice.rival
+    judged = sum(span.last - span.first for span in advice.share.judged)
     where = (
-        f"on {judged:,} measurements that it was not fitted to"
+        f"on {judged:,} measurements that neither was chosen by"
         if advice.share.apart
-        else (f"on the same {judged:,} measurements that it was fitted to, which flatters it")
+        else f"on the same {judged:,} measurements that it was fitted to, which flatters it"
     )
-    best = advice.best_shipped
-    if one.name == best:
-        return f"Take {name}: nothing that was fitted predicts better, and no shipped filter does better {where}."
-    relative = _percent(one.relative_error)
-    if math.isnan(relative.value):
-        return f"Take {name}: {one.difference.value:+.3f} nats per measurement against {best}, {where}."
-    kind = "error" if advice.recording.truth is not None else "error of prediction"
-    amount = f"{abs(relative.value):.1f} % {'less' if relative.value <= 0.0 else 'more'} {kind}"
-    sure = ""
-    if not math.isnan(relative.low):
-        low, high = (
-            sorted((-relative.low, -relative.high))
-            if relative.value <= 0.0
-            else (relative.low, relative.high)
+    if one is not advice.advised:
+        what = _interval(one.gain, "+.3f")
+        text = (
+            f"Take {rival}, as it is shipped: nothing that was fitted predicts better beyond chance "
+            f"({one.name}: {what} nats per measurement, its parameters paid for)."
         )
-        sure = f" [{low:.1f}, {high:.1f}]"
-    text = f"Take {name}: {amount}{sure} than the best shipped filter there, {best}, {where}."
-    if not math.isnan(relative.low) and relative.low <= 0.0 <= relative.high:
-        text += f" The difference may be chance: {best} is good enough."
+        if not math.isnan(one.relative_error.value):
+            text += f" {one.name} has {_amount(advice, one.relative_error)} than it, {where}."
+            if one.relative_error.high < 0.0:
+                text += " That is beyond chance: a longer log may turn the choice."
+        return text
+    name = f"Take {one.name}, with the parameters below"
+    if math.isnan(one.relative_error.value):
+        return f"{name}: {one.difference.value:+.3f} nats per measurement against {rival}, {where}."
+    text = (
+        f"{name}: {_amount(advice, one.relative_error)} than {rival}, the shipped filter that one would take by the "
+        f"same measurements, {where}."
+    )
+    if one.relative_error.low > 0.0:
+        text += f" It predicts more likely and errs more, beyond chance: the likelihood misleads here, keep {rival}."
+    elif one.relative_error.low <= 0.0 <= one.relative_error.high:
+        text += f" The difference may be chance: {rival} is good enough."
     return text
 
 
-def _size(name: str, value: float) -> float:
-    return 10.0**value if name.startswith("log10_") else value
+def _amount(advice: Advice, relative: Estimate) -> str:
+    """How much less or more error, with its interval."""
+    value, low, high = _percent(relative)
+    kind = "error" if advice.recording.truth is not None else "error of prediction"
+    less = value <= 0.0
+    text = f"{abs(value):.1f} % {'less' if less else 'more'} {kind}"
+    if math.isnan(low):
+        return text
+    low, high = (-high, -low) if less else (low, high)
+    return f"{text} [{low:.1f}, {high:.1f}]"
 
 
-def _parameter(name: str, value: float, interval: Interval | None, units: Mapping[str, str]) -> str:
-    """A fitted parameter with its interval, and whether it can be known."""
-    plain = name.removeprefix("log10_")
-    unit = f" {units[plain]}" if plain in units else ""
-    text = f"{plain.replace('_', ' ')} {_size(name, value):.3g}"
+def _hindsight(advice: Advice) -> Iterator[str]:
+    """Who of the shipped filters was best on the judged measurements, which nobody could know."""
+    best, relative = advice.best_shipped, advice.hindsight
+    if best in (advice.advised.name, advice.rival) or not abs(relative.value) >= NEGLIGIBLE:
+        return
+    count = sum(not c.fitted for c in advice.competitors)
+    yield (
+        f"In hindsight {best} is the best of the {count} shipped ones there: {advice.advised.name} has "
+        f"{_amount(advice, relative)}. The best of many is so partly by luck."
+    )
+
+
+def parameter_name(key: str) -> str:
+    """Name of a parameter in words, of the name under which it is searched."""
+    return key.removeprefix("log10_").replace("_", " ")
+
+
+def parameter_size(key: str, value: float) -> float:
+    """Value of a parameter, of that which is searched."""
+    return float(10.0**value) if key.startswith("log10_") else float(value)
+
+
+class ParameterText(NamedTuple):
+    """A fitted parameter in words."""
+
+    value: str
+    interval: str
+    unit: str
+    remark: str
+    """What its interval means where it is none."""
+
+
+def parameter_text(
+    key: str, value: float, interval: Interval | None, tunable: Tunable, is_at_limit: bool
+) -> ParameterText:
+    """Say a fitted parameter with its interval, and whether it can be known.
+
+    Args:
+        key: as it is searched.
+        value: likewise.
+        interval: of it, if it was computed.
+        tunable: whose it is.
+        is_at_limit: whether it ended at a limit of the search.
+    """
+    unit = tunable.units.get(key.removeprefix("log10_"), "")
+    text = ParameterText(f"{parameter_size(key, value):.3g}", "", unit, "")
     if interval is None:
-        return text + unit
-    low, high = _size(name, interval.low), _size(name, interval.high)
+        return text
+    low, high = parameter_size(key, interval.low), parameter_size(key, interval.high)
+    after = f" {unit}" if unit else ""
     flat = (interval.open_low and interval.open_high) or (
-        name.startswith("log10_") and high > IDENTIFIABLE * low
+        key.startswith("log10_") and high > IDENTIFIABLE * low
     )
     if flat:
-        return f"{text}{unit}: not identifiable, the likelihood is flat over {low:.2g} to {high:.2g}{unit}"
+        return text._replace(
+            remark=f"not identifiable, the likelihood is flat over {low:.2g} to {high:.2g}{after}"
+        )
+    if is_at_limit:
+        first, last = tunable.limits[key]
+        if value - first < last - value:
+            return text._replace(
+                remark=f"at the lower limit of the search, the log says at most {high:.3g}{after}"
+            )
+        return text._replace(
+            remark=f"at the upper limit of the search, the log says at least {low:.3g}{after}"
+        )
     ends = [f"{'<' * interval.open_low}{low:.3g}", f"{'>' * interval.open_high}{high:.3g}"]
-    return f"{text} [{', '.join(ends)}]{unit}"
+    return text._replace(interval=f"[{', '.join(ends)}]")
+
+
+def _fits(advice: Advice) -> Iterator[str]:
+    """What is to be told of the fits themselves."""
+    one = advice.fitted
+    spread = advice.fits[one.name].spread
+    if spread > DROP:
+        yield (
+            f"The likelihood of {one.name} has several maxima: the worst of its {STARTS} starts ended {spread:,.1f} "
+            "nats below the best, whose values these are."
+        )
+    if advice.diverging:
+        lose, diverge = ("loses", "it diverges") if len(advice.diverging) == 1 else ("lose", "they diverge")
+        yield (
+            f"Left out: {', '.join(advice.diverging)}, fitted, {lose} the track in the whole recording: {diverge}."
+        )
 
 
 def _noise(advice: Advice) -> Iterator[str]:
@@ -212,7 +321,7 @@ def _warnings(advice: Advice) -> Iterator[str]:
             "not white, or the motion is none of the models'. The likelihood then misleads."
         )
     wide = [
-        name.removeprefix("log10_").replace("_", " ")
+        parameter_name(name)
         for name, interval in advice.intervals.items()
         if interval.open_low and interval.open_high
     ]
@@ -228,4 +337,4 @@ def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
     worse = [c for c in found if c.relative_error.low > 0.0]
     if worse:
         each = ", ".join(f"{c.name} {100.0 * c.relative_error.value:+.0f} %" for c in worse)
-        yield f"The learned agents were never trained on such data: {each} error against {advice.best_shipped}."
+        yield f"The learned agents were never trained on such data: {each} error against {advice.rival}."

@@ -1,25 +1,12 @@
-"""One self-contained page from a file of results: it opens offline, and executes nothing of what the file says.
+"""One self-contained page from a file of results: it opens offline, and executes nothing of what the file says."""
 
-Whatever stands in the file is text: the template escapes it, the figures' data are packed, and the page's content
-security policy runs two scripts only, the page's own and Plotly's, by their hashes.
-"""
-
-import base64
-import gzip
-import hashlib
-import json
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
-
-import jinja2
-import markupsafe
-from plotly.offline import get_plotlyjs
 
 from ..evaluation.competitors import NOT_CAUSAL, RANKED
 from ..evaluation.metrics import Record
 from .headline import headline
+from .html_page import pack, render_page
 from .ranking import origin, ranking_sentence, verdict
 from .results import Result, Settings, serialise_datasets
 from .tables import (
@@ -30,9 +17,6 @@ from .tables import (
     score_text,
     with_interval,
 )
-
-HTML = Path(__file__).parent / "html"
-
 
 WORDS = ("competitor", "covariance", "origin", "control")
 """Columns that hold no numbers."""
@@ -58,11 +42,6 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
     """
     if not results:
         raise ValueError("there are no results to report")
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(HTML), autoescape=True, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters["marked"] = _mark_code
-    script, plotly = (HTML / "report.js").read_text(encoding="utf-8"), get_plotlyjs()
     groups: dict[str, list[Result]] = {}
     for result in results:
         groups.setdefault(result.environment, []).append(result)
@@ -70,13 +49,15 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         {
             "id": id,
             "anchor": f"e{number}",
-            "dots": _pack(_dots(group)) if len(group) > 1 else None,
+            "dots": pack(_dots(group)) if len(group) > 1 else None,
             "paper": group[0].paper,
             "cells": [_cell(result, f"e{number}s{i}", group) for i, result in enumerate(group)],
         }
         for number, (id, group) in enumerate(groups.items())
     ]
-    return environment.get_template("report.html.jinja").render(
+    return render_page(
+        "report.html.jinja",
+        "report.js",
         verdict=verdict(results),
         headline=headline(results),
         environments=environments,
@@ -84,34 +65,7 @@ def report_html(results: Sequence[Result], settings: Settings) -> str:
         words=WORDS,
         not_causal=NOT_CAUSAL,
         first=results[0].records[0],
-        style=markupsafe.Markup((HTML / "report.css").read_text(encoding="utf-8")),
-        script=markupsafe.Markup(script),
-        plotly=_pack_text(plotly),
-        hashes=[_hash(plotly), _hash(script)],
     )
-
-
-def _hash(script: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
-def _pack(values: Any) -> str:
-    """JSON, compressed, in characters that mean nothing in HTML; the same bytes every time."""
-    return _pack_text(json.dumps(values, allow_nan=False, separators=(",", ":")))
-
-
-def _pack_text(text: str) -> str:
-    return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
-
-
-def _mark_code(text: str) -> markupsafe.Markup:
-    """Words between backticks as code, everything escaped."""
-    parts = re.split(r"`([^`]*)`", text)
-    pieces = [
-        markupsafe.Markup("<code>{}</code>").format(part) if i % 2 else markupsafe.escape(part)
-        for i, part in enumerate(parts)
-    ]
-    return markupsafe.Markup("").join(pieces)
 
 
 def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any]:
@@ -129,7 +83,7 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "rows": rows,
         "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
         "figures": _figures(result),
-        "data": _pack(
+        "data": pack(
             {
                 "lines": _lines(result, group),
                 "paper": result.paper,
@@ -154,7 +108,11 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
 
     against = f"cost against {result.paper or 'paper'}, %"
     header = ["competitor", against, "median, %", "wins, %", "ANEES", "covariance", "score"]
-    header += [*(f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown), "origin", "control"]
+    header += [f"RMSE {c.replace('_', ' ')}, {units[c]}" for c in shown]
+    predicted = {r.component: r.unit for r in records if r.metric == "prediction_error"}
+    for group, unit in predicted.items():
+        header += [f"error of predicted {group}, {unit}", f"correlation of successive ones, {group}"]
+    header += ["origin", "control"]
     rows = []
     for name, kind, control in rank_competitors(records):
         median, wins = against_paper(found, name)
@@ -171,6 +129,11 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(consistency_word(value), consistency_word(value)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
                 *(number(name, "rmse", component) for component in shown),
+                *(
+                    number(name, metric, group)
+                    for group in predicted
+                    for metric in ("prediction_error", "innovation_correlation")
+                ),
                 Entry(origin(result, name, kind), origin(result, name, kind)),
                 Entry(control if kind == "policy" else "", control if kind == "policy" else ""),
             ]

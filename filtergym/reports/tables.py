@@ -151,14 +151,14 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
         f"({first.episodes} episodes, {first.split} split, seed {first.seed}; 95 % intervals)"
     )
     # As many columns beside each other as fit.
-    tables = [_of_competitors(names, {**costs, **errors}, True)]
+    tables = [competitors_table(names, {**costs, **errors}, True)]
     if _widest(tables[0]) > width:
-        narrow = [_of_competitors(names, costs, True), _of_competitors(names, costs, False)]
-        tables = [_fitting(narrow, width) or _of_competitors(names, costs, False, compact=True)]
-        beside = _fitting(
-            [_of_competitors(names, errors, False, compact) for compact in (False, True)], width
+        narrow = [competitors_table(names, costs, True), competitors_table(names, costs, False)]
+        tables = [first_fitting(narrow, width) or competitors_table(names, costs, False, compact=True)]
+        beside = first_fitting(
+            [competitors_table(names, errors, False, compact) for compact in (False, True)], width
         )
-        each = [_of_competitors(names, {title: error}, False) for title, error in errors.items()]
+        each = [competitors_table(names, {title: error}, False) for title, error in errors.items()]
         tables += each if beside is None else [beside]
     tables[0].title = title
     notes = [
@@ -178,12 +178,12 @@ def results_tables(records: Sequence[Any], knows: Mapping[str, str], width: int)
     return tables
 
 
-def _fitting(tables: Iterable[Table], width: int) -> Table | None:
+def first_fitting(tables: Iterable[Table], width: int) -> Table | None:
     """Return the first table that needs no more columns than there are."""
     return next((table for table in tables if _widest(table) <= width), None)
 
 
-def _of_competitors(
+def competitors_table(
     names: Sequence[tuple[str, str, str]],
     columns: Mapping[str, Callable[[str], str]],
     control: bool,
@@ -219,62 +219,6 @@ def _widest(table: Table) -> int:
 _MEASURING = Console(width=10_000, file=io.StringIO(), markup=False, emoji=False)
 
 
-def recording_table(records: Sequence[Any], differences: Mapping[str, Any] | None = None) -> Table:
-    """Compare competitors on measurements whose truth nobody knows: what they expected of each.
-
-    Args:
-        records: tidy records of one recording.
-        differences: of the log-likelihood per measurement to that of the best, by name, with intervals over stretches
-            of measurements.
-    """
-    first = records[0]
-    found = {(r.policy, r.metric): r for r in records if r.window == "all"}
-    table = Table(
-        title=f"{first.environment}, recording {first.scenario} ({first.episodes} "
-        f"episode{'s' if first.episodes > 1 else ''}; 95 % intervals)",
-        title_justify="left",
-    )
-    table.add_column("policy", no_wrap=True)
-    table.add_column("control")
-    titles = ["log-likelihood per measurement", "mean NIS", "95 % band", "inside 95 %, %"]
-    if differences is not None:
-        titles.insert(1, "less the best's")
-    for title in titles:
-        table.add_column(title, justify="right")
-
-    def place(entry: tuple[str, str, str]) -> float:
-        record = found.get((entry[0], "log_likelihood"))
-        return math.inf if record is None or record.value is None else -record.value
-
-    for name, kind, control in sorted(
-        dict.fromkeys((r.policy, r.kind, r.control) for r in records), key=place
-    ):
-        band, inside = found.get((name, "anis_band")), found.get((name, "nis_inside"))
-        row = [name, control if kind == "policy" else f"({kind})"]
-        row.append(with_interval(found.get((name, "log_likelihood"))))
-        if differences is not None:
-            least = differences.get(name)
-            row.append(
-                "-" if least is None or math.isnan(least.value) else with_interval(least, negligible=5e-4)
-            )
-        row.append(with_interval(found.get((name, "anis"))))
-        row.append("-" if band is None or band.low is None else f"{band.low:.3g} to {band.high:.3g}")
-        row.append(with_interval(inside, 100.0))
-        table.add_row(*row)
-    table.caption = (
-        "There is no truth, so there are no errors and no costs. log-likelihood: of what was measured, as it was "
-        "predicted, nats; the higher the better, if errors are white; less the best's: paired, "
-        "95 % intervals over stretches of measurements.\nmean NIS: normalised innovation squared over "
-        "its dimension; in the band if the innovations are as large as predicted; - : it reports none."
-    )
-    if any(record.kind == "smoother" for record in records):
-        table.caption += (
-            "\nA smoother predicts nothing: --estimates writes what it has found, with its deviation."
-        )
-    table.caption_justify = "left"
-    return table
-
-
 HEAD = 10
 """Columns of a title over a column of short numbers."""
 SHOWN_OF_FLIGHTS = 8
@@ -294,7 +238,7 @@ def flights_table(
     """
     everything = _flights(dataset, records, over_all, SHOWN_OF_FLIGHTS, False)
     tables = (_flights(dataset, records, over_all, shown, True) for shown in range(SHOWN_OF_FLIGHTS, 0, -1))
-    return _fitting([everything], width) or _fitting(tables, width) or everything
+    return first_fitting([everything], width) or first_fitting(tables, width) or everything
 
 
 def _flights(

@@ -1,22 +1,4 @@
-"use strict";
-// Figures are drawn when they are opened, from data packed in the page. Whatever the data name is text: `plain` keeps
-// Plotly from reading marks in it.
-(() => {
-  const COLOURS = ["#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]; // Okabe and Ito
-  const plain = (text) => String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
-  const words = (text) => plain(text).replace(/_/g, " ");
-  const root = document.documentElement;
-  const css = (name) => getComputedStyle(root).getPropertyValue(name).trim();
-
-  function unpacked(script) {
-    const bytes = Uint8Array.from(atob(script.textContent.trim()), (c) => c.charCodeAt(0));
-    return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip")));
-  }
-  // Plotly stands in the page once, packed; the page's policy lets it run by its hash.
-  const library = unpacked(document.getElementById("plotly")).text().then((text) => {
-    document.head.append(Object.assign(document.createElement("script"), { textContent: text }));
-  });
-
+// Figures of results, drawn when they are opened. It runs inside one function with page.js before it.
   // --- a dataset: variables with names of their dimensions, numbers in row-major order
 
   class Data {
@@ -55,22 +37,6 @@
     const [r, g, b] = [1, 3, 5].map((i) => parseInt(colour.slice(i, i + 2), 16));
     return `rgba(${r},${g},${b},0.16)`;
   };
-
-  function layout(changes) {
-    const axis = { gridcolor: css("--line"), zerolinecolor: css("--soft"), linecolor: css("--line"), automargin: true };
-    const narrow = window.innerWidth < 640;
-    const { xaxis, yaxis, ...others } = changes;
-    return {
-      paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
-      font: { family: "system-ui, sans-serif", size: narrow ? 11 : 12, color: css("--fg") },
-      margin: { l: narrow ? 45 : 60, r: 10, t: 30, b: 45 }, height: narrow ? 430 : 440,
-      hoverlabel: { namelength: -1 },
-      modebar: { bgcolor: "rgba(0,0,0,0)", color: css("--soft"), activecolor: css("--fg") },
-      legend: { orientation: "h", y: -0.22, yanchor: "top", itemclick: "toggleothers", itemdoubleclick: "toggle", groupclick: "togglegroup" },
-      xaxis: { ...axis, ...xaxis }, yaxis: { ...axis, ...yaxis }, ...others,
-    };
-  }
-  const config = { displayModeBar: window.innerWidth < 640 ? false : "hover", responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], toImageButtonOptions: { format: "svg" } };
 
   // --- lines with bands; those that nobody can tell apart are drawn once, with all their names
 
@@ -332,7 +298,6 @@
     box.append(select);
   }
 
-  const redraw = [];
   function drawFigure(figure, cell) {
     const kind = figure.dataset.kind, box = figure.querySelector(".plot");
     if (kind === "track") return redraw.push(drawTrack(figure, cell));
@@ -370,15 +335,6 @@
   const linked = location.hash && document.getElementById(location.hash.slice(1));
   if (linked && linked.matches("details.cell")) linked.open = true;
 
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  const again = () => redraw.forEach((draw) => draw());
-  dark.addEventListener("change", again);
-  document.getElementById("theme").addEventListener("click", () => {
-    const now = root.dataset.theme || (dark.matches ? "dark" : "light");
-    root.dataset.theme = now === "dark" ? "light" : "dark";
-    again();
-  });
-
   for (const table of document.querySelectorAll("table.sortable")) {
     table.tHead.addEventListener("click", (event) => {
       const head = event.target.closest("th");
@@ -397,4 +353,3 @@
       table.tBodies[0].append(...[...table.tBodies[0].rows].sort(order));
     });
   }
-})();

@@ -1,0 +1,145 @@
+"""A ranked competitor as the objects that it runs with, and what it is given."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..agents.learned_estimator import EstimatorMaker
+from ..baselines.problem import Problem
+from ..baselines.table import ConstantMode
+from ..envs.catalogue import make_task
+from ..envs.model import Model
+from ..envs.task import Task
+from ..envs.world import World
+from ..evaluation.competitors import (
+    RANKED,
+    ConstantPolicy,
+    RandomPolicy,
+    check_competitor,
+    kind_of,
+    make_competitor,
+)
+from ..evaluation.evaluate import control_of
+from ..filters.array_namespace import Array
+from ..names import find_competitor
+from .constants import ReadModel
+from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
+
+OF_AN_ESTIMATOR = ("start", "update")
+OF_A_BANK = ("start", "predict", "act", "mean", "covariance", "records")
+OF_AN_OBSERVATION = ("observe", "fields")
+
+
+class Parts(NamedTuple):
+    """Objects that a filter runs with."""
+
+    track: type[Track]
+    """What puts them together."""
+    arguments: dict[str, Any]
+    """Objects that it is made with, by the names of its arguments."""
+    called: tuple[str, ...]
+    """Names of the methods of these objects that it calls."""
+
+
+class Exported(NamedTuple):
+    """What is written out."""
+
+    task: Task
+    parts: Parts
+    measurement: Any
+    """One, for the shapes."""
+    initial: Any
+    """Likewise an initial estimate."""
+    model: Model
+    """In which it runs."""
+    maker: Any
+    """Of the competitor."""
+
+
+def find_exported(
+    problem: Problem, name: str | Path, scenario: Any, trust: bool, keywords: Mapping[str, Any]
+) -> Exported:
+    """Make a competitor for a task, and take it apart.
+
+    Args:
+        problem: of the competitor.
+        name: as of :func:`~filtergym.names.competitor`.
+        scenario: of the task.
+        trust: import what can execute code.
+        keywords: parameters of the task.
+
+    Raises:
+        ValueError: for what is not ranked, or draws its actions.
+    """
+    maker = find_competitor(problem, name, trust)
+    kind = kind_of(maker)
+    if kind not in RANKED:
+        raise ValueError(
+            f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone"
+        )
+    task = make_task(problem.task, scenario, **{**getattr(maker, "task_keywords", {}), **keywords})
+    if isinstance(maker, EstimatorMaker):  # a bank with a network, whatever it is from outside
+        model = ReadModel(task, maker.bank)
+        parts = _steered_parts(model, maker.policy(model))
+    elif kind == "estimator":
+        model = ReadModel(task, control_of(maker, kind, None, problem.task, str(name)))
+        own = check_competitor(str(name), make_competitor(maker, task), kind)
+        parts = Parts(EstimatorTrack, {"filter": own, "mask": _mask_of(task.world)}, OF_AN_ESTIMATOR)
+    else:
+        model = ReadModel(task, control_of(maker, kind, None, problem.task, str(name)))
+        policy = check_competitor(str(name), make_competitor(maker, model), kind)
+        if isinstance(policy, RandomPolicy):
+            raise ValueError(f"{str(name)!r} draws its actions: there is nothing to write out")
+        parts = _steered_parts(model, policy)
+    initial, measurement = _first_measurement(model)
+    return Exported(task, parts, measurement, initial, model, maker)
+
+
+def _mask_of(world: World) -> Any:
+    """What puts NaN in place of what was not received."""
+    if type(world).mask_missing is World.mask_missing:
+        return NotReceived(world.received_field)
+    return world.mask_missing
+
+
+def _steered_parts(model: ReadModel, policy: Any) -> Parts:
+    """Parts of a bank under a policy; an action that never changes needs no observation."""
+    if isinstance(policy, ConstantPolicy):
+        action: Array = numpy.array(policy.action, dtype=float)
+        return Parts(ConstantTrack, {"filter": model.filter, "action": action}, OF_A_BANK)
+    if isinstance(policy, ConstantMode):
+        return Parts(ConstantTrack, {"filter": model.filter, "action": policy.mode}, OF_A_BANK)
+    arguments = {
+        "filter": model.filter,
+        "observation": model.observation,
+        "policy": policy,
+        "decision_interval": model.task.decision_interval,
+    }
+    return Parts(SteeredTrack, arguments, OF_A_BANK + OF_AN_OBSERVATION)
+
+
+def _first_measurement(model: ReadModel) -> tuple[Any, Any]:
+    """Return an initial estimate and a measurement of an average episode, for their shapes."""
+    noise = model.task.noise
+    episode = model.begin(numpy.full((noise.uniforms, 8), 0.5), numpy.zeros((noise.initial_normals, 8)))
+    after = model.measure(episode, numpy.full((noise.normals + noise.row_uniforms, 8), 0.5))
+    return episode.measurement, after.measurement
+
+
+def lane_of(given: Any, lane: int = 0, prefix: str = "") -> dict[str, Any]:
+    """Return what one of N filters is given, by the names of the arguments of the written one.
+
+    Args:
+        given: a measurement or an initial estimate, arrays ``(..., N)``.
+        lane: which of the N.
+        prefix: of the names.
+    """
+    found: dict[str, Any] = {}
+    for field, value in given._asdict().items():
+        if isinstance(value, tuple):
+            found |= lane_of(value, lane, f"{prefix}{field}_")
+        elif value is not None:
+            found[prefix + field] = value[..., lane]
+    return found
