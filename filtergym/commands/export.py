@@ -1,7 +1,7 @@
 """The command that writes what leaves the package: agents as arrays, filters as programs."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -9,6 +9,7 @@ from ..agents.export import export_run
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import check_names, nearest
+from ..evaluation.files import whole_file, writable_file
 from ..names import find_competitor
 from .terminal import (
     Parameters,
@@ -23,7 +24,7 @@ from .terminal import (
     parse_settings,
 )
 
-FORMS = ("safetensors", "c")
+FORMS = ("safetensors", "c", "python", "onnx")
 """What can be written."""
 
 
@@ -48,15 +49,16 @@ def export(
     to: Annotated[
         str,
         typer.Option(
-            help="What is written: safetensors, an agent's arrays; or c, a whole filter as C99.",
+            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; python, a filter as one "
+            "file that needs NumPy only; onnx, the network of an agent.",
             autocompletion=one_of(*FORMS),
         ),
     ] = "safetensors",
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Of arrays the file, default: agent.safetensors in the run; of C the folder, default: the filter's "
-            "name."
+            help="File, default: agent.safetensors in the run, or the filter's name with the ending of its form; of C "
+            "the folder, default: the filter's name."
         ),
     ] = None,
     single: Annotated[
@@ -66,29 +68,34 @@ def export(
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
-    """Write a filter as C99, or a run's best agent as plain arrays.
+    """Write a filter as C99 or as one file of Python, an agent's network as ONNX, or a run's agent as plain arrays.
 
     Arrays evaluate without torch and cannot execute anything. Nothing is executed either: training has left them beside
     the model. A folder with the model only takes --trust.
 
-    C needs nothing but math.h. What is written was run beside the filter itself, measurement by measurement, over
-    episodes of the scenario, which may be a recording.
+    C needs nothing but math.h, Python nothing but NumPy. What is written was run beside the filter itself, measurement
+    by measurement, over episodes of the scenario, which may be a recording.
 
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
 
     Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to c --out imm
+
+    Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to python --out imm.py
     """
     if to not in FORMS:
         raise nearest("form of an export", to, FORMS)
+    options = {"a filter's name": name, "--float": single, "--scenario": scenario, "--set": settings}
+    allowed = {
+        "safetensors": (),
+        "onnx": ("a filter's name",),
+        "python": tuple(o for o in options if o != "--float"),
+    }
+    for option, given in options.items():
+        if given and option not in allowed.get(to, options):
+            raise ValueError(
+                f"{option} is not for --to {to}" + " of a run: add --to c" * (to == "safetensors")
+            )
     if to == "safetensors":
-        for given, option in (
-            (name, "a filter's name"),
-            (single, "--float"),
-            (scenario, "--scenario"),
-            (settings, "--set"),
-        ):
-            if given:
-                raise ValueError(f"{option} is of a filter as a program: add --to c")
         _export_arrays(Path(environment), out, trust)
         return
     if name is None:
@@ -96,30 +103,51 @@ def export(
     problem = problem_of(environment)
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
-    maker = find_competitor(problem, name, trust)
-    words = _own_name(problem, name)
+    own = _own_name(problem, name)
+    if to == "c":
+        _export_c(problem, name, own, out, single, scenario, keywords, trust)
+        return
+    ending = ".py" if to == "python" else ".onnx"
+    path = writable_file(out or Path(own.replace(":", "_") + ending))
+    if to == "onnx":
+        from ..exports.onnx_network import export_onnx
+
+        export_onnx(problem, name, path, trust=trust)
+    else:
+        from ..exports.python_source import export_python
+
+        text = export_python(problem, name, scenario, trust=trust, **keywords)
+        with whole_file(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    console.print(f"saved in {path}", soft_wrap=True)
+
+
+def _export_c(
+    problem: Problem,
+    name: str,
+    own: str,
+    out: Path | None,
+    single: bool,
+    scenario: str | None,
+    keywords: dict[str, Any],
+    trust: bool,
+) -> None:
+    """Write a filter as C99, and say what it costs."""
     from ..exports.c_source import export_c, file_stem
 
-    own = file_stem(words)
-    folder = out or Path(own)
-    figures = export_c(
-        problem, words, maker, folder, "float" if single else "double", scenario, keywords, command_line()
-    )
-    console.print(f"saved in {folder}: {own}.h, {own}.c", soft_wrap=True)
-    console.print(
+    maker = find_competitor(problem, name, trust)
+    stem = file_stem(own)
+    folder = out or Path(stem)
+    precision = "float" if single else "double"
+    figures = export_c(problem, own, maker, folder, precision, scenario, keywords, command_line())
+    for line in (
+        f"saved in {folder}: {stem}.h, {stem}.c",
         f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "
-        f"{words} {figures.difference:.1e} standard deviations",
-        highlight=False,
-        soft_wrap=True,
-    )
-    console.print(
+        f"{own} {figures.difference:.1e} standard deviations",
         f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
-        highlight=False,
-        soft_wrap=True,
-    )
-    console.print(
-        f"try it: cd {folder} && cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test", soft_wrap=True
-    )
+        f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _own_name(problem: Problem, name: str) -> str:
