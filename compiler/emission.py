@@ -6,10 +6,10 @@ than the length of a function. What crosses a cut lies in a scratch array on the
 of the constants, then two integers for each argument, address and stride.
 """
 
-import heapq
 from collections.abc import Iterator, Mapping, Sequence
 
 from .library import BINARY, Library
+from .parts import FREE, cut_parts, scratch_slots
 from .program import FUNCTIONS, OPERATIONS, Program
 
 LANES = 8
@@ -21,8 +21,6 @@ _COMPARE = {"less": "olt", "less_equal": "ole", "greater": "ogt", "greater_equal
 _COMPARE |= {"equal": "oeq", "not_equal": "une"}
 _INTRINSIC = {name: name for name in ("sqrt", "floor", "ceil", "trunc", "rint", "maximum", "minimum")}
 _INTRINSIC["absolute"] = "fabs"
-FREE = ("input", "constant")
-"""Steps that every part makes again instead of fetching them from the scratch array."""
 
 
 def _splat(value: str, kind: str = "double") -> str:
@@ -213,34 +211,6 @@ class _Part:
         self.lines.append(f"store {kind} {self.value(step)}, ptr {self.scratch(step)}, align 64")
 
 
-def _parts(program: Program) -> list[list[int]]:
-    """Steps of each part; those that are free stand only where they are results themselves."""
-    results = {result.node for result in program.results}
-    listed = [i for i, step in enumerate(program.steps) if step.operation not in FREE or i in results]
-    return [listed[i : i + PART] for i in range(0, len(listed), PART)] or [[]]
-
-
-def _slots(program: Program, part_of: dict[int, int]) -> dict[int, int]:
-    """Place in the scratch array of every step that crosses a cut; places are used again."""
-    last_user: dict[int, int] = {}
-    for index, part in part_of.items():
-        operation, arguments, _ = program.steps[index]
-        if operation in FREE:
-            continue
-        for argument in arguments[2:] if operation == "take" else arguments:
-            if part_of.get(argument, part) < part and program.steps[argument].operation not in FREE:
-                last_user[argument] = part
-    free: list[int] = []
-    busy: list[tuple[int, int]] = []
-    found: dict[int, int] = {}
-    for step in sorted(last_user):
-        while busy and busy[0][0] < part_of[step]:
-            free.append(heapq.heappop(busy)[1])
-        found[step] = free.pop() if free else len(busy)
-        heapq.heappush(busy, (last_user[step], found[step]))
-    return found
-
-
 def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
     """Text of a program.
 
@@ -252,8 +222,8 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
     Raises:
         KeyError: for a function that the library lacks.
     """
-    parts = _parts(program)
-    slots = _slots(program, {step: i for i, part in enumerate(parts) for step in part})
+    parts, _ = cut_parts(program, PART)
+    slots = scratch_slots(program, parts)
     results: dict[int, list[tuple[int, int]]] = {}
     for argument, row, step in program.results:
         results.setdefault(step, []).append((argument, row))

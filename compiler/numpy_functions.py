@@ -171,6 +171,7 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.argmax: arg_max,
     numpy.mean: mean,
     numpy.copy: copy_array,
+    numpy.ndim: lambda x: x.ndim,
     numpy.nan_to_num: replace_not_finite,
 }
 """Functions of arrays, likewise."""

@@ -23,7 +23,8 @@ class Steered(NamedTuple):
     memory: Any
     """What the policy remembers, every array as ``(entries, N)``; before its first decision zeros."""
     count: Array
-    """Measurements taken in, ``(N,)``."""
+    """Measurements taken in since the last decision, that of the decision among them; zero before the first one,
+    ``(N,)``."""
     action: Array
     """In force, ``(A, N)``."""
     total: Array
@@ -42,15 +43,17 @@ class SteeredFilter(Filter[Any, Any, Steered]):
         model: with the bank.
         act: asks the policy.
         memory: that the policy returns, arrays of one track; their values do not matter.
+        interval: measurements for which an action holds; default: the task's decision interval.
     """
 
-    def __init__(self, model: Model, act: Act, memory: Any) -> None:
+    def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
         super().__init__(model.task)
         self.model, self.bank, self.ask = model, model.filter, act
         self._shapes = shapes_of(memory)
         self._template = memory
-        interval = self.task.decision_interval
-        self.averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean" and interval > 1]
+        self.interval = self.task.decision_interval if interval is None else interval
+        averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
+        self.averaged = averaged if self.interval > 1 else []
 
     def start(self, initial: Any) -> Steered:
         """Start the bank; the policy begins at its first decision."""
@@ -71,14 +74,17 @@ class SteeredFilter(Filter[Any, Any, Steered]):
         """Predict in the bank."""
         return state._replace(bank=self.bank.predict(state.bank, measurement))
 
+    def is_due(self, state: Steered) -> Array:
+        """Whether the policy is asked at the next measurement, ``(N,)``."""
+        first = state.count == 0.0
+        return first | (state.count >= float(self.interval))
+
     def update(self, state: Steered, given: Input) -> Steered:
         """Ask the policy where a decision is due, and apply its action."""
-        xp, K = self.xp, self.task.decision_interval
+        xp, K = self.xp, self.interval
         observation = self.model.observe(Episode(None, given.measurement, state.bank))
         first = state.count == 0.0
-        due, total = first, state.total
-        if K > 1:
-            due = xp.remainder(state.count, float(K)) == 0.0
+        due, total = self.is_due(state), state.total
         if self.averaged:
             total = xp.where(first, 0.0, total + xp.stack([observation[i] for i in self.averaged]))
             means = xp.where(first, xp.stack([observation[i] for i in self.averaged]), total / K)
@@ -94,7 +100,9 @@ class SteeredFilter(Filter[Any, Any, Steered]):
             memory = map_arrays(lambda array: xp.where(due, array, next(kept)), memory)
         action = answer if self.bank.action_space.shape else xp.astype(answer[0], xp.int64)
         bank = self.bank.act(state.bank, given.measurement, action)
-        return Steered(bank, memory, state.count + 1.0, answer, total)
+        # Never more than the interval: float has no whole numbers beyond 2^24 for a filter that runs for days.
+        count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
+        return Steered(bank, memory, count, answer, total)
 
     def _decide(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
         """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
@@ -134,12 +142,13 @@ def shapes_of(memory: Any) -> list[tuple[tuple[int, ...], str]]:
     return [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
 
 
-def steer(model: Model, policy: Policy) -> SteeredFilter:
+def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
     """Close the bank of a model by a policy, made for the same task on NumPy arrays.
 
     Args:
         model: on NumPy or traced arrays.
         policy: whose ``act`` is arithmetic of NumPy.
+        interval: measurements for which an action holds; default: the task's decision interval.
 
     Raises:
         NotTraceable: on traced arrays, where it is not.
@@ -147,4 +156,4 @@ def steer(model: Model, policy: Policy) -> SteeredFilter:
     blank = numpy.zeros((1, len(model.fields)))
     with numpy.errstate(all="ignore"):
         _, memory = policy.act(blank, None, numpy.ones(1, dtype=bool))
-    return SteeredFilter(model, policy.act, memory)
+    return SteeredFilter(model, policy.act, memory, interval)

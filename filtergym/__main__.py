@@ -50,7 +50,7 @@ GROUPS: dict[str, Commands] = {
     },
     "Share": {
         "report": "report:make",
-        "export": "improve:export",
+        "export": "export:export",
         "offline": "measure:write_offline",
     },
 }

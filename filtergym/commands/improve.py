@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from ..agents import training_run
-from ..agents.export import export_run
 from ..agents.settings import parse_settings
 from ..agents.training_run import RunOptions, Session
 from ..baselines.problem import problem_of
@@ -255,20 +254,3 @@ def search(
     best = out / "best.yml"
     if best.exists():
         console.print(f"best settings: filtergym train {environment} --algo {algo} --config {best} --out RUN")
-
-
-def export(
-    folder: Annotated[Path, typer.Argument(help="Folder of a training run.")],
-    out: Annotated[Path | None, typer.Option(help="File; default: agent.safetensors in the folder.")] = None,
-    trust: Trust = False,
-) -> None:
-    """Write a run's best agent as plain arrays, which evaluate without torch and cannot execute anything.
-
-    Nothing is executed either: training has left the arrays beside the model. A folder with the model only takes
-    --trust.
-
-    Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
-    """
-    path = out or folder / "agent.safetensors"
-    run = export_run(folder, path, trust)
-    console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")

@@ -1,0 +1,302 @@
+"""Every ranked competitor as C99: compiled, run over recorded episodes, and compared with what it estimated itself.
+
+A line for each: operations and bytes of state in double; the largest difference to the replay in double and in float,
+in the standard deviations that the competitor reports; nanoseconds an update in C (double and float), in the code that
+LLVM makes of the same program (a lane of 512, without a network), and in NumPy for one track. What is not written
+says why. Times are of processor time, the least of several runs.
+
+Example: python benchmarks/exported.py --environment ManeuveringTarget-v0 --episodes 100 --out exported.csv
+"""
+
+import argparse
+import csv
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy
+from filtergym.agents.named_policies import pretrained_agents
+from filtergym.baselines.problem import Problem, problem_of
+from filtergym.compiler.c_source import DOUBLE, FLOAT, Scalar
+from filtergym.compiler.functions import empty_lanes
+from filtergym.compiler.native import native
+from filtergym.envs.backend import make_model
+from filtergym.envs.catalogue import catalogue
+from filtergym.envs.filter import Input
+from filtergym.evaluation.competitors import kind_of, make_competitor
+from filtergym.evaluation.evaluate import control_of
+from filtergym.evaluation.rollout import rollout, start_lanes
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.evaluation.steered_filter import steer
+from peer_imm import imm_steps_per_second
+
+from filtergym.exports.c_source import FLAGS, Writer, files_of
+from filtergym.exports.replay import Replay, mean_rows, replay, run_filter
+from filtergym.exports.traced_filter import (
+    ANSWER,
+    ESTIMATE,
+    MEASUREMENT,
+    SHOWN,
+    STATE,
+    TracedFilter,
+    one_lane,
+)
+from filtergym.names import find_competitor
+
+COLUMNS = (
+    "environment", "competitor", "operations", "state_bytes", "weight_bytes", "double_sigmas", "float_sigmas",
+    "double_ns", "float_ns", "llvm_ns", "numpy_ns", "refusal",
+)  # fmt: skip
+LANES = 512
+BATCH = """#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <time.h>
+#include "rows.h"
+int main(int argc, char **argv) {{
+    FILE *in = fopen(argv[1], "rb"), *out = fopen(argv[2], "wb");
+    const long E = atol(argv[3]), T = atol(argv[4]), I = {initial}, M = {measurement}, C = {components};
+    double *initials = malloc((size_t)(E * I) * sizeof *initials), *rows = malloc((size_t)(E * T * M) * sizeof *rows);
+    double *means = malloc((size_t)(E * T * C) * sizeof *means);
+    double best = 1e300;
+    long e, k, i, again;
+    if (argc < 5 || fread(initials, sizeof *initials, (size_t)(E * I), in) != (size_t)(E * I)) return 2;
+    if (fread(rows, sizeof *rows, (size_t)(E * T * M), in) != (size_t)(E * T * M)) return 2;
+    for (again = 0; again < 3; ++again) {{
+        const clock_t begin = clock();
+        for (e = 0; e < E; ++e) {{
+            {own}_state state;
+            {own}_initial initial;
+            set_initial(&initial, initials + e * I);
+            {own}_start(&state, &initial);
+            for (k = 0; k < T; ++k) {{
+                {own}_measurement measurement;
+                {own}_estimate estimate;
+                set_measurement(&measurement, rows + (e * T + k) * M);
+                {own}_update(&state, &measurement, &estimate);
+                for (i = 0; i < C; ++i) means[(e * T + k) * C + i] = (double)estimate.mean{mean};
+            }}
+        }}
+        best = fmin(best, (double)(clock() - begin) / CLOCKS_PER_SEC / (double)(E * T));
+    }}
+    fwrite(means, sizeof *means, (size_t)(E * T * C), out);
+    fclose(out);
+    printf("%.3f", 1e9 * best);
+    return 0;
+}}
+"""
+
+
+def run_in_c(
+    name: str, traced: TracedFilter, given: Replay, scalar: Scalar, compiler: str
+) -> tuple[float, float, Writer]:
+    """Largest difference, in standard deviations, nanoseconds an update, and what wrote the files."""
+    writer = Writer(name, traced, scalar, given.components)
+    T, E = len(given.measurements), given.initial.shape[1]
+    batch = BATCH.format(
+        own=writer.name,
+        initial=len(given.initial),
+        measurement=given.measurements.shape[1],
+        components=len(given.components),
+        mean="" if len(given.components) == 1 else "[i]",
+    )
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for file, text in {**files_of(writer, given), "batch.c": batch}.items():
+            (folder / file).write_text(text, encoding="ascii")
+        (folder / "in").write_bytes(
+            given.initial.T.tobytes() + numpy.moveaxis(given.measurements, -1, 0).astype(float).tobytes()
+        )
+        subprocess.run(
+            [compiler, *FLAGS, "batch.c", f"{writer.name}.c", "-lm", "-o", "batch"], cwd=folder, check=True
+        )
+        done = subprocess.run(
+            [folder / "batch", "in", "out", str(E), str(T)],
+            cwd=folder,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        means = numpy.frombuffer((folder / "out").read_bytes()).reshape(E, T, -1)
+    return given.largest_difference(numpy.moveaxis(means, 0, -1)), float(done.stdout), writer
+
+
+def llvm_nanoseconds(traced: TracedFilter, given: Replay) -> float:
+    """Of the same program, one of many lanes."""
+    program = traced.update
+    # What is written must not be what is read: the state after an update goes elsewhere.
+    after = max(STATE, MEASUREMENT, ANSWER, ESTIMATE, SHOWN, 3) + 1
+    results = [r._replace(argument=after) if r.argument == STATE else r for r in program.results]
+    program = program._replace(results=results)
+    rows = dict.fromkeys(range(after + 1), 64)
+    rows |= {STATE: len(traced.state), after: len(traced.state), MEASUREMENT: given.measurements.shape[1]}
+    rows |= {ESTIMATE: len(traced.estimate), SHOWN: max(traced.shown, 1)}
+    arrays = [empty_lanes((max(rows[i], 1),), LANES) for i in range(after + 1)]
+    for array in arrays:
+        array[...] = 0.5
+    arrays[MEASUREMENT][...] = given.measurements[0][:, numpy.arange(LANES) % given.initial.shape[1]]
+    table = [program.constants.__array_interface__["data"][0]]
+    for array in arrays:
+        table += [array.__array_interface__["data"][0], array.strides[0] // 8]
+    addresses = numpy.array(table, dtype=numpy.int64)
+    code = native(program, [False] * len(arrays))
+    return least_time(lambda: code(addresses.ctypes.data, 0, LANES), 5) / LANES
+
+
+def numpy_nanoseconds(problem: Problem, name: str, maker: Any) -> float:
+    """Of the competitor itself on NumPy's arrays, one track."""
+    kind = kind_of(maker)
+    keywords = getattr(maker, "task_keywords", {})
+    plain = make_model(problem.task, control_of(maker, kind, None, problem.task, name), **keywords)
+    seeds = episode_seeds("test", 0, 1)
+    started: list[Any] = []
+    start_lanes(plain, seeds, lambda episode: started.append(one_lane(episode.measurement)))
+    measurement = one_lane(next(rollout(plain, maker, seeds, kind=kind, name=name))[0].measurement)
+    if kind == "estimator":
+        own = make_competitor(maker, plain.task)
+        memory = own.start(started[0], 1)
+        received = plain.task.world.mask_missing(measurement)
+        return least_time(lambda: own.update(received, memory), 3)
+    steered = steer(plain, make_competitor(maker, plain))
+    state = steered.start(started[0])
+    return least_time(lambda: steered.update(steered.predict(state, measurement), Input(measurement)), 3)
+
+
+def least_time(call: Any, count: int) -> float:
+    """Least nanoseconds of a call, over runs of some calls."""
+    call()
+    times = []
+    for _ in range(7):
+        begin = time.process_time_ns()
+        for _ in range(count):
+            call()
+        times.append((time.process_time_ns() - begin) / count)
+    return min(times)
+
+
+def ranked(problem: Problem) -> list[str]:
+    """Names of what is ranked."""
+    known = problem.baselines
+    return [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(problem.id)]
+
+
+def lines(
+    problem: Problem, names: list[str], episodes: int, measurements: int, compiler: str
+) -> Iterator[dict[str, Any]]:
+    """A line for each competitor."""
+    for name in names:
+        maker = find_competitor(problem, name)
+        line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
+        try:
+            traced, given = replay(problem, name, maker, episodes=episodes, measurements=measurements)
+        except ValueError as error:
+            yield {**line, "refusal": str(error)}
+            continue
+        double, double_ns, writer = run_in_c(name, traced, given, DOUBLE, compiler)
+        line |= {"double_sigmas": double, "double_ns": double_ns}
+        found = writer.figures
+        line |= {
+            "operations": found["operations"],
+            "state_bytes": found["state_bytes"],
+            "weight_bytes": found["constant_bytes"],
+        }
+        if found["operations"] > 10_000:
+            # What takes a compiler minutes is run in float by NumPy.
+            line["float_sigmas"] = given.largest_difference(
+                run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]
+            )
+        else:
+            line["float_sigmas"], line["float_ns"], _ = run_in_c(name, traced, given, FLOAT, compiler)
+        with numpy.errstate(all="ignore"):
+            line |= {
+                "llvm_ns": llvm_nanoseconds(traced, given),
+                "numpy_ns": numpy_nanoseconds(problem, name, maker),
+            }
+        yield line
+
+
+ACCURACY = ("environment", "written", "double: median", "largest", "float: median", "largest")
+COST = ("environment", "operations", "state, bytes", "ns in C", "NumPy / C", "C / LLVM")
+
+
+def summary(found: list[dict[str, Any]]) -> str:
+    """Return two tables of Markdown, a line for each environment: differences; and costs, median and range."""
+    accuracy, cost = ([f"| {' | '.join(names)} |", f"|{'---|' * len(names)}"] for names in (ACCURACY, COST))
+    for environment in dict.fromkeys(line["environment"] for line in found):
+        own = [line for line in found if line["environment"] == environment]
+        there = [line for line in own if line.get("double_ns")]
+        numbers = {
+            key: numpy.array([float(line[key] or "nan") for line in there])
+            for key in COLUMNS[2:-1]
+            if key != "float_ns"
+        }
+        ns = numbers["double_ns"]
+        # What LLVM makes of a program has no network in it.
+        faster = (ns / numbers["llvm_ns"])[numbers["weight_bytes"] == 0.0]
+        name = environment.removesuffix("-v0")
+        cells = [name, f"{len(there)} of {len(own)}"]
+        for key in ("double_sigmas", "float_sigmas"):
+            cells += [f"{numpy.median(numbers[key]):.0e}", f"{numbers[key].max():.0e}"]
+        accuracy.append(f"| {' | '.join(cells)} |")
+        cells = [name, *(_range(numbers[key]) for key in ("operations", "state_bytes", "double_ns"))]
+        cells += [_range(numbers["numpy_ns"] / ns), f"{numpy.median(faster):.1f}" if len(faster) else ""]
+        cost.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*accuracy, "", *cost])
+
+
+def _range(values: numpy.ndarray) -> str:
+    return f"{numpy.median(values):,.0f} ({values.min():,.0f} to {values.max():,.0f})"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--environment", action="append")
+    parser.add_argument("--policy", action="append")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--measurements", type=int, default=200)
+    parser.add_argument("--compiler", default=shutil.which("cc"))
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--read", type=Path, help="summarise what --out has written, and run nothing")
+    asked = parser.parse_args()
+    if asked.read is not None:
+        print(summary(list(csv.DictReader(asked.read.open(encoding="utf-8")))))
+        return
+    if asked.compiler is None:
+        sys.exit("no C compiler here")
+    warnings.simplefilter("ignore")
+    found: list[dict[str, Any]] = []
+    for id in asked.environment or list(catalogue()):
+        problem = problem_of(id)
+        for line in lines(
+            problem, asked.policy or ranked(problem), asked.episodes, asked.measurements, asked.compiler
+        ):
+            found.append(line)
+            print(", ".join(f"{key} {_short(value)}" for key, value in line.items()), flush=True)
+    if asked.out is not None:
+        with asked.out.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows({key: _short(value) for key, value in line.items()} for line in found)
+    print(summary(found))
+    try:
+        print(
+            f"filterpy's IMM of two filters of four states: {1e9 / imm_steps_per_second(2000):,.0f} ns an update"
+        )
+    except ImportError:
+        print("filterpy is not installed")
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.3g}" if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    main()

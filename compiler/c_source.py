@@ -1,0 +1,430 @@
+"""A program as text of C99, of one lane in double or float; the same statements are the body of a kernel of CUDA.
+
+Every step is one statement; numbers that cross from one static function to the next lie in a scratch array ``w``.
+Comparisons with what is no number, and what ``maximum``, ``minimum``, ``sign``, ``remainder`` and ``take`` make of it,
+are those of the code of :mod:`.emission`; of the two zeros a ``maximum`` may return either.
+
+No name and no sentence gets into the text but through :func:`identifier` and :func:`comment`.
+"""
+
+import math
+import re
+import textwrap
+import unicodedata
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy
+
+from .interpretation import first_steps
+from .parts import FREE, cut_parts, scratch_slots
+from .program import Program
+
+PART = 200
+"""Statements of a function."""
+WIDTH = 100
+"""Characters of a line of a comment."""
+_INFIX = {
+    "add": "+",
+    "subtract": "-",
+    "multiply": "*",
+    "divide": "/",
+    "logical_and": "&&",
+    "logical_or": "||",
+}
+_INFIX |= {
+    "less": "<",
+    "less_equal": "<=",
+    "greater": ">",
+    "greater_equal": ">=",
+    "equal": "==",
+    "not_equal": "!=",
+}
+_RESERVED = frozenset(
+    re.findall(
+        r"\w+",
+        "auto break case char const continue default do double else enum extern float for goto if inline int long "
+        "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+        "asm typeof bool true false class new delete this private public template namespace operator main "
+        "NAN INFINITY FLT_MAX FLT_MIN DBL_MAX sign_of remainder_of place_of",
+    )
+)
+"""Words that mean something to C, to its neighbours, or to the text made here."""
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A kind of number in C."""
+
+    name: str
+    suffix: str
+    """Of its functions and literals."""
+    dtype: type
+    largest: str
+    """Macro of ``float.h``."""
+    smallest: str
+
+
+DOUBLE = Scalar("double", "", numpy.float64, "DBL_MAX", "DBL_MIN")
+FLOAT = Scalar("float", "f", numpy.float32, "FLT_MAX", "FLT_MIN")
+
+
+class Parameter(NamedTuple):
+    """A parameter of a function."""
+
+    type: str
+    """Whatever stands before the name."""
+    name: str
+
+
+class Source(NamedTuple):
+    """A program as text."""
+
+    functions: str
+    """Tables and static functions that stand before."""
+    body: list[str]
+    """Statements of the function itself."""
+    operations: int
+    """Steps that compute something."""
+    scratch: int
+    """Numbers in the scratch array."""
+    replaced: tuple[float, ...]
+    """Constants beyond the range of the kind of number, in whose place its nearest ones stand."""
+
+
+def identifier(words: str, taken: Collection[str] = ()) -> str:
+    """Return a name of C for some words: letters, digits and single underscores, and none that means something already.
+
+    Args:
+        words: anything.
+        taken: names that it must not be.
+    """
+    plain = unicodedata.normalize("NFKD", words).encode("ascii", "ignore").decode()
+    name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60] or "x"
+    if not name[0].isalpha():
+        name = f"n{name}"
+    # Temporaries are called v and r with a number, the scratch array w.
+    if name in _RESERVED or re.fullmatch(r"[vrw]\d*", name):
+        name += "_"
+    unique, number = name, 2
+    while unique in taken:
+        unique, number = f"{name}_{number}", number + 1
+    return unique
+
+
+def plain_words(text: str) -> str:
+    """Return text that is safe within a comment of C: printable ASCII in one line that neither ends nor begins one."""
+    ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "replace").decode()
+    line = " ".join("".join(c if c.isprintable() else " " for c in ascii_text).split()).replace("\\", "|")
+    # No end, no beginning, and no trigraph.
+    return re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)", " ", line)
+
+
+def comment(*paragraphs: str, indent: str = "") -> str:
+    """Return a comment of C, a paragraph for each text; one that begins with blanks keeps them.
+
+    Args:
+        *paragraphs: of anything.
+        indent: blanks before every line.
+    """
+    lines: list[str] = []
+    for text in paragraphs:
+        before = " " * (len(text) - len(text.lstrip(" ")))
+        wide = WIDTH - len(indent)
+        lines += textwrap.wrap(
+            plain_words(text), wide, initial_indent=before, subsequent_indent=before, break_on_hyphens=False
+        ) or [""]
+    return f"{indent}/* " + "\n".join(f"{indent}   {line}".rstrip() for line in lines).lstrip() + " */"
+
+
+def literal(value: float, scalar: Scalar = DOUBLE) -> str:
+    """Return a number as C reads it again to the last bit, of ``float`` its nearest one.
+
+    What is beyond the range of ``float`` is the largest or the smallest normal number that it has.
+    """
+    if value != value:
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0.0 else "(-INFINITY)"
+    if is_beyond(value, scalar):
+        text = scalar.largest if abs(value) > 1.0 else scalar.smallest
+    else:
+        text = f"{scalar.dtype(abs(value))!s}{scalar.suffix}"
+    return text if math.copysign(1.0, value) > 0.0 else f"(-{text})"
+
+
+def is_beyond(value: float, scalar: Scalar) -> bool:
+    """Whether a finite number is beyond the range of normal numbers of ``float``; of ``double`` none is."""
+    limits = numpy.finfo(scalar.dtype)
+    size = abs(value)
+    return scalar.dtype is not numpy.float64 and (
+        bool(size > float(limits.max)) or 0.0 < size < float(limits.tiny)
+    )
+
+
+def array_text(
+    name: str, values: numpy.ndarray, scalar: Scalar = DOUBLE, qualifier: str = "static const"
+) -> str:
+    """Return the definition of a constant array; rows of a matrix stand in lines."""
+
+    def braces(part: numpy.ndarray) -> str:
+        if part.ndim == 1:
+            inside = textwrap.fill(", ".join(literal(float(v), scalar) for v in part), WIDTH)
+        else:
+            inside = ",\n".join(braces(row) for row in part)
+        return "{\n" + inside + "\n}"
+
+    shape = "".join(f"[{size}]" for size in values.shape)
+    return f"{qualifier} {scalar.name} {name}{shape} = {braces(values)};\n"
+
+
+_HELPERS = {
+    "sign": """{real} sign_of({real} x) {{ /* of what is no number: itself */
+    return x > {zero} ? {one} : x < {zero} ? -{one} : x + {zero};
+}}
+""",
+    "remainder": """{real} remainder_of({real} a, {real} b) {{ /* with the sign of b */
+    const {real} rest = fmod{f}(a, b);
+    return rest != {zero} && (rest < {zero}) != (b < {zero}) ? rest + b : rest;
+}}
+""",
+    "take": """int place_of({real} index, int length) {{ /* in a table; from the end where negative */
+    if (index < {zero}) index += ({real})length;
+    if (!(index > {zero})) return 0;
+    return index < ({real})(length - 1) ? (int)index : length - 1;
+}}
+""",
+}
+
+
+def helper_functions(programs: Sequence[Program], scalar: Scalar = DOUBLE, qualifier: str = "static ") -> str:
+    """Return the functions that statements of these programs call beside those of ``math.h``."""
+    used = {step.operation for program in programs for step in program.steps}
+    words = {
+        "real": scalar.name,
+        "f": scalar.suffix,
+        "zero": literal(0.0, scalar),
+        "one": literal(1.0, scalar),
+    }
+    return "\n".join(qualifier + text.format(**words) for name, text in _HELPERS.items() if name in used)
+
+
+class _Text:
+    """Statements of a program; values are named by the steps that they come from."""
+
+    def __init__(
+        self, program: Program, read: Callable[[int, int], str], scalar: Scalar, tables: Mapping[int, str]
+    ) -> None:
+        self.program, self.read, self.scalar, self.tables = program, read, scalar, tables
+
+    def literal(self, value: float) -> str:
+        return literal(value, self.scalar)
+
+    def value(self, step: int) -> str:
+        """Return an expression for a step's value where it is used."""
+        operation, arguments, logical = self.program.steps[step]
+        if operation == "input":
+            return self.read(*arguments)
+        if operation == "constant":
+            value = float(self.program.constants[arguments[0]])
+            return str(int(value != 0.0)) if logical else self.literal(value)
+        return f"v{step}"
+
+    def as_number(self, step: int) -> str:
+        """Return an expression for a step's value that is a number, one for true and zero for false."""
+        value = self.value(step)
+        if not self.program.steps[step].logical:
+            return value
+        return f"({value} ? {self.literal(1.0)} : {self.literal(0.0)})"
+
+    def declaration(self, step: int, expression: str) -> str:
+        kind = "int" if self.program.steps[step].logical else self.scalar.name
+        return f"const {kind} v{step} = {expression};"
+
+    def expression(self, index: int) -> str:
+        """Return what computes a step."""
+        operation, arguments, _ = self.program.steps[index]
+        if operation == "take":
+            start, length, place = arguments
+            return f"{self.tables[start]}[place_of({self.value(place)}, {length})]"
+        values = [self.value(argument) for argument in arguments]
+        if operation in _INFIX:
+            return f"{values[0]} {_INFIX[operation]} {values[1]}"
+        if operation == "logical_not":
+            return f"!{values[0]}"
+        if operation == "negative":
+            return f"-{values[0]}"
+        if operation == "where":
+            return f"{values[0]} ? {values[1]} : {values[2]}"
+        if operation == "number":
+            return f"{values[0]} ? {self.literal(1.0)} : {self.literal(0.0)}"
+        if operation in ("maximum", "minimum"):
+            return self._extreme(arguments, ">" if operation == "maximum" else "<")
+        name = {"absolute": "fabs", "sign": "sign_of", "remainder": "remainder_of"}.get(operation, operation)
+        suffix = "" if name.endswith("_of") else self.scalar.suffix
+        return f"{name}{suffix}({', '.join(values)})"
+
+    def _extreme(self, arguments: tuple[int, ...], sign: str) -> str:
+        """The larger or smaller of two; what is no number stays that."""
+        known = [self.program.steps[argument].operation == "constant" for argument in arguments]
+        first, second = arguments if known[0] or not known[1] else arguments[::-1]
+        one, other = self.value(first), self.value(second)
+        # A constant is a number: see Graph.
+        unordered = "" if any(known) else f" || {one} != {one}"
+        return f"{one} {sign} {other}{unordered} ? {one} : {other}"
+
+
+def write_program(
+    program: Program,
+    name: str,
+    parameters: Sequence[Parameter],
+    read: Callable[[int, int], str],
+    write: Callable[[int, int], str],
+    scalar: Scalar = DOUBLE,
+    qualifier: str = "static ",
+    between: Sequence[str] = (),
+    results: int = 0,
+) -> Source:
+    """Write a program as statements.
+
+    A result is written as soon as it is computed: what is written must not be what is read.
+
+    Args:
+        program: to write.
+        name: of the function that the statements are for, which those before it begin with.
+        parameters: of that function; static functions are handed all of them.
+        read: from argument and row to the expression of an input.
+        write: from argument and row to where a result goes; ``""``: nowhere.
+        scalar: kind of numbers.
+        qualifier: of static functions.
+        between: statements that stand where the first results are known, before any other input is read.
+        results: how many these are.
+    """
+    starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
+    tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
+    text = _Text(program, read, scalar, tables)
+    stores: dict[int, list[str]] = {}
+    for argument, row, step in program.results:
+        if place := write(argument, row):
+            stores.setdefault(step, []).append(place)
+    pause = first_steps(program, results) if between else 0
+    parts, before = cut_parts(program, PART, pause)
+    count_operations = sum(step.operation not in FREE for step in program.steps)
+    together = count_operations <= PART
+    slots = {} if together else scratch_slots(program, parts)
+    everything = set(range(len(program.steps)))
+    blocks = [
+        _statements(text, steps, everything if together else set(steps), stores, slots) for steps in parts
+    ]
+    defined = [
+        array_text(tables[start], program.constants[start : start + length], scalar, f"{qualifier}const")
+        for start, length in starts
+    ]
+    count = max(slots.values(), default=-1) + 1
+    lines = blocks
+    if not together:
+        listed = [*parameters, Parameter(f"{scalar.name} *", "w")]
+        defined += [_function(f"{name}_part_{i}", listed, block, qualifier) for i, block in enumerate(blocks)]
+        names = ", ".join(parameter.name for parameter in listed)
+        lines = [[f"{name}_part_{i}({names});"] for i in range(len(blocks))]
+    body = [line for block in lines[:before] for line in block]
+    body += [*between, *(line for block in lines[before:] for line in block)]
+    if not together:
+        body.insert(0, f"{scalar.name} w[{max(count, 1)}];")
+    constants = [
+        float(program.constants[step.arguments[0]])
+        for step in program.steps
+        if step.operation == "constant" and not step.logical
+    ]
+    replaced = tuple(sorted({value for value in constants if is_beyond(value, scalar)}))
+    return Source("\n".join(defined), body, count_operations, count, replaced)
+
+
+def _statements(
+    text: _Text, steps: list[int], own: set[int], stores: Mapping[int, list[str]], slots: Mapping[int, int]
+) -> list[str]:
+    """Statements of a part."""
+    lines: list[str] = []
+    fetched: set[int] = set()
+    for step in steps:
+        operation, arguments, _logical = text.program.steps[step]
+        if operation not in FREE:
+            for argument in arguments[2:] if operation == "take" else arguments:
+                crosses = argument not in own and text.program.steps[argument].operation not in FREE
+                if crosses and argument not in fetched:
+                    fetched.add(argument)
+                    truth = f" != {text.literal(0.0)}" if text.program.steps[argument].logical else ""
+                    lines.append(text.declaration(argument, f"w[{slots[argument]}]{truth}"))
+            lines.append(text.declaration(step, text.expression(step)))
+        lines += [f"{place} = {text.as_number(step)};" for place in stores.get(step, ())]
+        if step in slots:
+            lines.append(f"w[{slots[step]}] = {text.as_number(step)};")
+    return lines
+
+
+def _function(name: str, parameters: Sequence[Parameter], body: Sequence[str], qualifier: str) -> str:
+    return function_text(f"{qualifier}void", name, parameters, body)
+
+
+def function_text(returns: str, name: str, parameters: Sequence[Parameter], body: Sequence[str]) -> str:
+    """Return the definition of a function; parameters that it does not use are marked as such."""
+    listed = ", ".join(_declare(parameter) for parameter in parameters)
+    words = set(re.findall(r"\w+", "\n".join(body)))
+    unused = [f"(void){parameter.name};" for parameter in parameters if parameter.name not in words]
+    inside = "\n".join(f"    {line}" for line in [*unused, *body])
+    return f"{returns} {name}({listed or 'void'}) {{\n{inside}\n}}\n"
+
+
+def _declare(parameter: Parameter) -> str:
+    blank = "" if parameter.type.endswith("*") else " "
+    return f"{parameter.type}{blank}{parameter.name}"
+
+
+def write_lanes(program: Program, name: str, lane_first: Sequence[bool], cuda: bool = False) -> str:
+    """Write a program as a function that goes through lanes, in double; of CUDA as a kernel, a thread for each lane.
+
+    The function takes ``a``, the arrays one after another, ``stride``, numbers from one row of each to the next, and
+    the lanes ``first`` to ``last``; the kernel ``a``, ``stride`` and the number of lanes.
+
+    Args:
+        program: to write.
+        name: of the function.
+        lane_first: of every argument whether it is written lane by lane, ``(N, rows)``, instead of ``(rows, N)``.
+        cuda: as CUDA in place of C.
+    """
+
+    def place(argument: int, row: int) -> str:
+        if lane_first[argument]:
+            return f"a[{argument}][lane * stride[{argument}] + {row}]"
+        return f"a[{argument}][{row} * stride[{argument}] + lane]"
+
+    arrays = [Parameter("double *const *", "a"), Parameter("const long long *", "stride")]
+    qualifier = "static __device__ " if cuda else "static "
+    source = write_program(
+        program, name, [*arrays, Parameter("long long", "lane")], place, place, qualifier=qualifier
+    )
+    before = [helper_functions([program], qualifier=qualifier), source.functions]
+    if cuda:
+        head = [
+            "const long long lane = blockIdx.x * (long long)blockDim.x + threadIdx.x;",
+            "if (lane >= lanes) return;",
+        ]
+        kernel = function_text(
+            'extern "C" __global__ void',
+            name,
+            [*arrays, Parameter("long long", "lanes")],
+            [*head, *source.body],
+        )
+        return "\n".join([_CUDA_HEAD, *before, kernel])
+    loop = ["for (lane = first; lane < last; ++lane) {", *(f"    {line}" for line in source.body), "}"]
+    bounds = [Parameter("long long", "first"), Parameter("long long", "last")]
+    whole = function_text("void", name, [*arrays, *bounds], ["long long lane;", *loop])
+    return "\n".join(["#include <math.h>\n", *before, whole])
+
+
+_CUDA_HEAD = """#ifndef NAN
+#define NAN __longlong_as_double(0x7ff8000000000000LL)
+#define INFINITY __longlong_as_double(0x7ff0000000000000LL)
+#endif
+"""

@@ -1,0 +1,73 @@
+"""A program run step by step in NumPy, in any precision: slow, and what other languages are compared with."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy
+
+from .program import FUNCTIONS, OPERATIONS, Program
+
+_COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": numpy.where}
+
+
+def first_steps(program: Program, results: int) -> int:
+    """Number of steps after which the first results are known."""
+    return 1 + max((result.node for result in program.results[:results]), default=-1)
+
+
+def interpret(
+    program: Program,
+    read: Callable[[int, int], Any],
+    dtype: Any = numpy.float64,
+    between: Callable[[Sequence[numpy.ndarray]], None] | None = None,
+    results: int = 0,
+) -> list[numpy.ndarray]:
+    """Compute the results of a program for N lanes.
+
+    Args:
+        program: to run.
+        read: from argument and row to an input, ``(N,)`` or a number; read where it is needed.
+        dtype: in which everything is computed; a constant beyond its range becomes the nearest normal number.
+        between: called with the first results as soon as they are known, before any other input is read.
+        results: how many these are.
+    """
+    constants = _in_range(program.constants, dtype)
+    values: list[Any] = []
+    pause = first_steps(program, results) if between is not None else -1
+    with numpy.errstate(all="ignore"):
+        for place, (operation, arguments, logical) in enumerate(program.steps):
+            if place == pause and between is not None:
+                between([values[result.node] for result in program.results[:results]])
+            if operation == "input":
+                value: Any = numpy.asarray(read(*arguments), dtype=dtype)
+            elif operation == "constant":
+                value = constants[arguments[0]]
+                value = value != 0.0 if logical else value
+            elif operation == "take":
+                start, length, index = arguments
+                value = constants[start : start + length][_places(values[index], length)]
+            elif operation == "number":
+                value = numpy.asarray(values[arguments[0]]).astype(dtype)
+            else:
+                value = _COMPUTE[operation](*(values[argument] for argument in arguments))
+            values.append(value)
+        if pause == len(program.steps) and between is not None:
+            between([values[result.node] for result in program.results[:results]])
+    return [numpy.asarray(values[result.node]) for result in program.results]
+
+
+def _in_range(constants: numpy.ndarray, dtype: Any) -> numpy.ndarray:
+    limits = numpy.finfo(dtype)
+    size = numpy.clip(numpy.abs(constants), float(limits.tiny), float(limits.max))
+    changed = numpy.isfinite(constants) & (constants != 0.0) & (limits.dtype != numpy.float64)
+    with numpy.errstate(over="ignore"):
+        found: numpy.ndarray = numpy.where(changed, numpy.copysign(size, constants), constants).astype(dtype)
+    return found
+
+
+def _places(index: Any, length: int) -> numpy.ndarray:
+    """Places in a table: negative ones from its end, those outside at the nearest one, what is no number at zero."""
+    index = numpy.asarray(index, dtype=float)
+    index = numpy.where(index < 0.0, index + length, index)
+    inside = numpy.where(index > 0.0, numpy.minimum(index, length - 1.0), 0.0)
+    return inside.astype(numpy.int64)

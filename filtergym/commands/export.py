@@ -1,0 +1,165 @@
+"""The command that writes what leaves the package: agents as arrays, filters as programs."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from ..agents.export import export_run
+from ..baselines.fitted_filters import SUFFIX
+from ..baselines.problem import Problem, problem_of
+from ..envs.catalogue import check_names, nearest
+from ..evaluation.files import whole_file, writable_file
+from ..names import find_competitor
+from .terminal import (
+    Parameters,
+    ScenarioName,
+    Trust,
+    command_line,
+    complete_environment,
+    complete_policy,
+    console,
+    import_environments,
+    one_of,
+    parse_settings,
+)
+
+FORMS = ("safetensors", "c", "python", "onnx")
+"""What can be written."""
+
+
+def export(
+    environment: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENVIRONMENT | RUN",
+            help="Environment id, of a filter; or the folder of a training run, of an agent's arrays.",
+            autocompletion=complete_environment,
+            callback=import_environments,
+        ),
+    ],
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="Filter of the environment: a policy, an estimator, an agent; or a file of one, as advise, tune and "
+            "train write them.",
+            autocompletion=complete_policy,
+        ),
+    ] = None,
+    to: Annotated[
+        str,
+        typer.Option(
+            help="What is written: safetensors, an agent's arrays; c, a whole filter as C99; python, a filter as one "
+            "file that needs NumPy only; onnx, the network of an agent.",
+            autocompletion=one_of(*FORMS),
+        ),
+    ] = "safetensors",
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="File, default: agent.safetensors in the run, or the filter's name with the ending of its form; of C "
+            "the folder, default: the filter's name."
+        ),
+    ] = None,
+    single: Annotated[
+        bool, typer.Option("--float", help="Of C: float in place of double; refused where it is wrong.")
+    ] = False,
+    scenario: ScenarioName = None,
+    settings: Parameters = None,
+    trust: Trust = False,
+) -> None:
+    """Write a filter as C99 or as one file of Python, an agent's network as ONNX, or a run's agent as plain arrays.
+
+    Arrays evaluate without torch and cannot execute anything. Nothing is executed either: training has left them beside
+    the model. A folder with the model only takes --trust.
+
+    C needs nothing but math.h, Python nothing but NumPy. What is written was run beside the filter itself, measurement
+    by measurement, over episodes of the scenario, which may be a recording.
+
+    Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
+
+    Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to c --out imm
+
+    Example: filtergym export filtergym/ManeuveringTarget-v0 imm --to python --out imm.py
+    """
+    if to not in FORMS:
+        raise nearest("form of an export", to, FORMS)
+    options = {"a filter's name": name, "--float": single, "--scenario": scenario, "--set": settings}
+    allowed = {
+        "safetensors": (),
+        "onnx": ("a filter's name",),
+        "python": tuple(o for o in options if o != "--float"),
+    }
+    for option, given in options.items():
+        if given and option not in allowed.get(to, options):
+            raise ValueError(
+                f"{option} is not for --to {to}" + " of a run: add --to c" * (to == "safetensors")
+            )
+    if to == "safetensors":
+        _export_arrays(Path(environment), out, trust)
+        return
+    if name is None:
+        raise ValueError(f"name the filter: filtergym export {environment} NAME --to {to}")
+    problem = problem_of(environment)
+    keywords = parse_settings(settings or [])
+    check_names(problem.task, keywords)
+    own = _own_name(problem, name)
+    if to == "c":
+        _export_c(problem, name, own, out, single, scenario, keywords, trust)
+        return
+    ending = ".py" if to == "python" else ".onnx"
+    path = writable_file(out or Path(own.replace(":", "_") + ending))
+    if to == "onnx":
+        from ..exports.onnx_network import export_onnx
+
+        export_onnx(problem, name, path, trust=trust)
+    else:
+        from ..exports.python_source import export_python
+
+        text = export_python(problem, name, scenario, trust=trust, **keywords)
+        with whole_file(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    console.print(f"saved in {path}", soft_wrap=True)
+
+
+def _export_c(
+    problem: Problem,
+    name: str,
+    own: str,
+    out: Path | None,
+    single: bool,
+    scenario: str | None,
+    keywords: dict[str, Any],
+    trust: bool,
+) -> None:
+    """Write a filter as C99, and say what it costs."""
+    from ..exports.c_source import export_c, file_stem
+
+    maker = find_competitor(problem, name, trust)
+    stem = file_stem(own)
+    folder = out or Path(stem)
+    precision = "float" if single else "double"
+    figures = export_c(problem, own, maker, folder, precision, scenario, keywords, command_line())
+    for line in (
+        f"saved in {folder}: {stem}.h, {stem}.c",
+        f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "
+        f"{own} {figures.difference:.1e} standard deviations",
+        f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
+        f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
+    ):
+        console.print(line, highlight=False, soft_wrap=True)
+
+
+def _own_name(problem: Problem, name: str) -> str:
+    """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
+    for ending in (SUFFIX, ".safetensors", ".zip"):
+        if name.endswith(ending):
+            return Path(name).name.removesuffix(ending).removeprefix(f"{problem.short_name}.")
+    return Path(name).name if Path(name).is_dir() else name
+
+
+def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:
+    """Write a run's best agent as arrays."""
+    path = out or folder / "agent.safetensors"
+    run = export_run(folder, path, trust)
+    console.print(f"{run.algorithm} for {run.environment}, control {run.control}: {path}")

@@ -1,0 +1,679 @@
+"""A whole filter as C99: one header and one source, a program that reads a table, and a test with its vectors.
+
+No allocation, and nothing but ``math.h``; parameters and weights are constants. Whatever a stranger's file calls its
+parts gets into the text as identifiers and comments only, see :mod:`..compiler.c_source`.
+"""
+
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..baselines.problem import Problem
+from ..compiler.c_source import (
+    DOUBLE,
+    FLOAT,
+    Parameter,
+    Scalar,
+    comment,
+    function_text,
+    helper_functions,
+    identifier,
+    literal,
+    write_program,
+)
+from ..evaluation.files import whole_files
+from .c_network import memory_size, network_text
+from .replay import Replay, mean_rows, replay, run_filter
+from .traced_filter import (
+    ANSWER,
+    LIKELIHOODS,
+    SHOWN,
+    STATE,
+    Member,
+    TracedFilter,
+    count_answers,
+)
+
+FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-pedantic")
+"""Under which the text compiles without a warning."""
+WORST = {"double": 1e-3, "float": 0.1}
+"""Largest difference to the competitor itself, in its standard deviations, with which a filter leaves."""
+TAKEN = ("rows", "vectors", "test", "math", "float", "stdio", "stdlib", "string", "time")
+"""Names that a filter's files must not have: those of the others."""
+EPISODES, MEASUREMENTS = 8, 200
+"""That are compared before anything is written, at most."""
+VECTORS = 2, 50
+"""Episodes and measurements among the test's vectors, at most."""
+
+
+def file_stem(name: str) -> str:
+    """Return what the files and functions of a filter are called."""
+    return identifier(name, TAKEN)
+
+
+class Figures(NamedTuple):
+    """What is known of an exported filter."""
+
+    operations: int
+    """Of an update, without those of a network."""
+    state_bytes: int
+    constant_bytes: int
+    """Of a network's weights."""
+    scratch_bytes: int
+    """On the stack, beside the state."""
+    difference: float
+    """Largest one to the competitor itself, in its standard deviations, as NumPy runs the programs."""
+    sensitivity: float
+    """By how much the rounding in a network alone moves an estimate, likewise: largest difference to the competitor
+    with a network that computes in double; zero without one."""
+    replaced: tuple[float, ...]
+    """Constants that float does not have."""
+    test: str = ""
+    """What the compiled test has said; empty without a compiler."""
+
+
+class Structure(NamedTuple):
+    """A struct of C."""
+
+    name: str
+    arrays: list[tuple[str, tuple[int, ...], str, list[int]]]
+    """Of every array its name, its shape, what it is, and the rows of the argument in its order."""
+    places: dict[int, str]
+    """Row of the argument to the expression that follows the variable."""
+    columns: dict[int, str]
+    """Row of the argument to a name in a table."""
+
+
+def structure(name: str, members: Sequence[Member]) -> Structure:
+    """Give numbers their places in a struct: an array of which every entry is there stays one, of others the entries
+    that are there get names of their own.
+    """
+    groups: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    for row, member in enumerate(members):
+        groups.setdefault((member.name, member.shape), []).append(row)
+    arrays: list[tuple[str, tuple[int, ...], str, list[int]]] = []
+    places, columns = {}, {}
+    taken: set[str] = set()
+    for (words, shape), rows in groups.items():
+        whole = len(rows) == int(numpy.prod(shape, dtype=int))
+        if whole:
+            own = identifier(words, taken)
+            taken.add(own)
+            arrays.append((own, shape, members[rows[0]].words, rows))
+        for row in rows:
+            index = [int(i) for i in numpy.unravel_index(members[row].place, shape)] if shape else []
+            if not whole:
+                own = identifier("_".join([words, *map(str, index)]), taken)
+                taken.add(own)
+                arrays.append((own, (), members[row].words, [row]))
+            places[row] = own + ("".join(f"[{i}]" for i in index) if whole else "")
+            columns[row] = "_".join([own, *map(str, index)]) if whole else own
+    return Structure(name, arrays, places, columns)
+
+
+def _struct_text(struct: Structure, scalar: Scalar, title: str, extra: Sequence[str] = ()) -> str:
+    lines = [comment(title), "typedef struct {"]
+    words = ""
+    for name, shape, text, _ in struct.arrays:
+        if text and text != words:
+            lines.append(comment(text, indent="    "))
+        words = text
+        lines.append(f"    {scalar.name} {name}{''.join(f'[{size}]' for size in shape)};")
+    lines += [f"    {line}" for line in extra]
+    if not struct.arrays and not extra:
+        lines.append("    char nothing; /* C has no empty struct */")
+    return "\n".join([*lines, f"}} {struct.name};\n"])
+
+
+class Writer:
+    """The files of a filter.
+
+    Args:
+        name: of the competitor.
+        traced: its programs.
+        scalar: kind of numbers.
+        components: what is estimated, name and unit.
+
+    Attributes:
+        about: paragraphs for the comment of the header.
+        limit: largest difference with which the test passes, standard deviations.
+    """
+
+    def __init__(
+        self, name: str, traced: TracedFilter, scalar: Scalar, components: Sequence[tuple[str, str]]
+    ) -> None:
+        self.traced, self.scalar, self.components = traced, scalar, components
+        self.about: list[str] = []
+        self.limit = WORST[scalar.name]
+        self.name = own = file_stem(name)
+        parts = {"state": traced.state, "initial": traced.initial, "measurement": traced.measurement}
+        parts["estimate"] = traced.estimate
+        self.structs = {key: structure(f"{own}_{key}", members) for key, members in parts.items()}
+        self.memory = memory_size(traced.network) if traced.network is not None else 0
+        self.has_state = bool(traced.state or self.memory)
+        self.start, self.start_source = self._start()
+        self.update, self.update_source = self._update()
+
+    def _parameters(self, *parts: str) -> list[Parameter]:
+        """Parameters that point to structs; ``const`` is what is only read."""
+        return [
+            Parameter(f"{'const ' * (part in ('initial', 'measurement'))}{self.structs[part].name} *", part)
+            for part in parts
+        ]
+
+    def _start(self) -> tuple[str, Any]:
+        to, given = self.structs["state"].places, self.structs["initial"].places
+        parameters = self._parameters("state", "initial")
+        source = write_program(
+            self.traced.start,
+            f"{self.name}_start",
+            parameters,
+            lambda _, row: f"initial->{given[row]}",
+            lambda _, row: f"state->{to[row]}",
+            self.scalar,
+        )
+        body = list(source.body)
+        if self.memory:
+            body += [f"for (i = 0; i < {self.memory}; ++i) state->network[i] = 0.0f;"]
+            body.insert(0, "int i;")
+        return f"{source.functions}\n{function_text('void', f'{self.name}_start', parameters, body)}", source
+
+    def _update(self) -> tuple[str, Any]:
+        traced, real, own = self.traced, self.scalar.name, self.name
+        state, places = self.structs["state"], self.structs["state"].places
+        given, told = self.structs["measurement"].places, self.structs["estimate"].places
+        inner = [Parameter(f"const {state.name} *", "state"), *self._parameters("measurement")]
+        inner += [Parameter(f"{state.name} *", "next"), *self._parameters("estimate")]
+        between = []
+        if traced.network is not None:
+            inner += [Parameter(f"{real} *", "shown"), Parameter(f"const {real} *", "answer")]
+            memory = "next->network" if self.memory else "0"
+            between = [
+                f"if (shown[0] != {literal(0.0, self.scalar)}) {own}_network(shown + 1, {memory}, answer);"
+            ]
+
+        def read(argument: int, row: int) -> str:
+            if argument == ANSWER:
+                return f"answer[{row}]"
+            return f"state->{places[row]}" if argument == STATE else f"measurement->{given[row]}"
+
+        def write(argument: int, row: int) -> str:
+            if argument == SHOWN:
+                return f"shown[{row}]"
+            return f"next->{places[row]}" if argument == STATE else f"estimate->{told[row]}"
+
+        source = write_program(
+            traced.update,
+            f"{own}_update",
+            inner,
+            read,
+            write,
+            self.scalar,
+            between=between,
+            results=traced.shown,
+        )
+        body = list(source.body)
+        if self.has_state:
+            # What is written is not what is read.
+            start = " = *state" if self.memory else ""
+            body = [
+                f"{state.name} after{start};",
+                f"{state.name} *const next = &after;",
+                *body,
+                "*state = after;",
+            ]
+        elif "next" in " ".join(body):
+            body = [f"{state.name} *const next = state;", *body]
+        if traced.network is not None:
+            zero = literal(0.0, self.scalar)
+            answers = f"{real} answer[{count_answers(traced.network)}] = {{{zero}}};"
+            body = [f"{real} shown[{traced.shown}];", answers, *body]
+        parameters = self._parameters("state", "measurement", "estimate")
+        return f"{source.functions}\n{function_text('void', f'{own}_update', parameters, body)}", source
+
+    @property
+    def figures(self) -> dict[str, int]:
+        """Operations and bytes."""
+        size = numpy.dtype(self.scalar.dtype).itemsize
+        network = self.traced.network
+        weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
+        after = len(self.traced.state) * size + 4 * self.memory
+        return {
+            "operations": self.update_source.operations,
+            "state_bytes": after,
+            "constant_bytes": weights,
+            "scratch_bytes": (self.update_source.scratch + self.traced.shown) * size + after,
+        }
+
+    @property
+    def replaced(self) -> tuple[float, ...]:
+        """Constants that the kind of number does not have."""
+        return tuple(sorted({*self.start_source.replaced, *self.update_source.replaced}))
+
+    # --- files
+
+    def header(self, notes: Sequence[str] = ()) -> str:
+        """Text of the header."""
+        own, scalar, structs = self.name, self.scalar, self.structs
+        guard = f"{own.upper()}_H"
+        listed = ", ".join(f"{i} {name} [{unit}]" for i, (name, unit) in enumerate(self.components))
+        memory = [f"float network[{self.memory}]; /* what the network remembers */"] if self.memory else []
+        functions = {
+            "start": ("Begins a track; the initial estimate is all that it takes.", ("state", "initial")),
+            "update": (
+                "Takes in a measurement: predicts to its time, and updates. What was not received is said by the "
+                "measurement itself, as in the environment.",
+                ("state", "measurement", "estimate"),
+            ),
+        }
+        text = [
+            comment(*self.about, *notes),
+            f"#ifndef {guard}\n#define {guard}\n",
+            '#ifdef __cplusplus\nextern "C" {\n#endif\n',
+            _struct_text(structs["initial"], scalar, "The estimate at the start of a track."),
+            _struct_text(structs["measurement"], scalar, "What the sensors say at one time."),
+            _struct_text(structs["estimate"], scalar, f"What is estimated of it. Components: {listed}."),
+            _struct_text(
+                structs["state"],
+                scalar,
+                "What is kept from one measurement to the next, one struct for each track; members are named by what "
+                "leads to them in the filter. Copy it to save it.",
+                memory,
+            ),
+        ]
+        for name, (words, parts) in functions.items():
+            arguments = ", ".join(f"{p.type}{p.name}" for p in self._parameters(*parts))
+            text.append(f"{comment(words)}\nvoid {own}_{name}({arguments});\n")
+        text.append(f"#ifdef __cplusplus\n}}\n#endif\n\n#endif /* {guard} */\n")
+        return "\n".join(text)
+
+    def source(self) -> str:
+        """Text of the source."""
+        parts = [
+            comment("See the header. Temporaries are numbered in the order in which they are computed."),
+            f'#include "{self.name}.h"\n\n#include <float.h>\n#include <math.h>\n',
+            helper_functions([self.traced.start, self.traced.update], self.scalar),
+        ]
+        if self.traced.network is not None:
+            parts.append(network_text(self.traced.network, self.name, self.scalar)[0])
+        return _without_blank_runs("\n".join([*parts, self.start, self.update]))
+
+    def rows(self) -> str:
+        """Text of a header that fills structs from rows of numbers, for main.c and the test."""
+        own, real = self.name, self.scalar.name
+        text = [
+            comment("Structs from rows of a table."),
+            f"#ifndef {own.upper()}_ROWS_H\n#define {own.upper()}_ROWS_H\n",
+        ]
+        text.append(f'#include "{own}.h"\n')
+        for part in ("initial", "measurement"):
+            struct = self.structs[part]
+            body = [f"{part}->{place} = ({real})row[{row}];" for row, place in sorted(struct.places.items())]
+            listed = [Parameter(f"{struct.name} *", part), Parameter("const double *", "row")]
+            text.append(function_text("static void", f"set_{part}", listed, body))
+        text.append(f"#endif /* {own.upper()}_ROWS_H */\n")
+        return "\n".join(text)
+
+    def columns(self, part: str) -> list[str]:
+        """Names of the columns of a table, in the order of the rows of an argument."""
+        names = self.structs[part].columns
+        begin = "initial_" if part == "initial" else ""
+        return [f"{begin}{names[row]}" for row in sorted(names)]
+
+    def main(self) -> str:
+        """Text of a program that reads a table of measurements and writes one of estimates."""
+        C, digits = len(self.components), 17 if self.scalar is DOUBLE else 9
+        given = [*self.columns("initial"), *self.columns("measurement")]
+        names = [identifier(name) for name, _ in self.components]
+        told = [member.name for member in self.traced.estimate if member.name in LIKELIHOODS]
+        header = [
+            "track",
+            "measurement",
+            *told,
+            *(f"estimate_{n}" for n in names),
+            *(f"sigma_{n}" for n in names),
+        ]
+        return _MAIN.format(
+            own=self.name,
+            columns=_string(",".join(given)),
+            header=_string(",".join(header)),
+            initial=len(self.columns("initial")),
+            count=len(given),
+            C=C,
+            digits=digits,
+            mean="" if C == 1 else "[i]",
+            covariance="" if C == 1 else "[i][i]",
+            told="".join(f'\n        printf(",%.{digits}g", (double)estimate.{name});' for name in told),
+        )
+
+    def test(self) -> str:
+        """Text of a program that compares the filter with the vectors."""
+        return _TEST.format(
+            own=self.name,
+            limit=literal(self.limit),
+            C=len(self.components),
+            mean="" if len(self.components) == 1 else "[i]",
+        )
+
+    def vectors(self, replayed: Replay) -> str:
+        """Text of the vectors of the test."""
+        E, T = min(VECTORS[0], replayed.initial.shape[1]), min(VECTORS[1], len(replayed.measurements))
+        arrays = {
+            "initials": replayed.initial[:, :E].T,
+            "measurements": numpy.moveaxis(replayed.measurements[:T, :, :E], -1, 0).reshape(E * T, -1),
+            "means": numpy.moveaxis(replayed.mean[:T, :, :E], -1, 0).reshape(E * T, -1),
+            "sigmas": numpy.moveaxis(replayed.sigma[:T, :, :E], -1, 0).reshape(E * T, -1),
+        }
+        text = [
+            comment("Measurements of simulated episodes, and what the competitor itself estimated in double.")
+        ]
+        text.append(f"#define TRACKS {E}\n#define MEASUREMENTS {T}\n")
+        for name, values in arrays.items():
+            rows = ",\n".join("{" + ", ".join(literal(float(x)) for x in row) + "}" for row in values)
+            text.append(f"static const double {name}[{len(values)}][{values.shape[1]}] = {{\n{rows}\n}};\n")
+        return "\n".join(text)
+
+    def table(self, replayed: Replay) -> str:
+        """Text of a table of measurements, as main.c reads it."""
+        first = len(self.columns("initial"))
+        lines = [",".join([*self.columns("initial"), *self.columns("measurement")])]
+        for episode in range(replayed.initial.shape[1]):
+            for k, measured in enumerate(replayed.measurements[:, :, episode]):
+                initial = replayed.initial[:, episode] if k == 0 else [""] * first
+                lines.append(
+                    ",".join(str(x) if isinstance(x, str) else repr(float(x)) for x in [*initial, *measured])
+                )
+        return "\n".join([*lines, ""])
+
+
+def _string(text: str) -> str:
+    """A literal of C of words that are identifiers already."""
+    assert re.fullmatch(r"[A-Za-z0-9_,]*", text)
+    pieces = [text[i : i + 80] for i in range(0, len(text), 80)] or [""]
+    return "\n    ".join(f'"{piece}"' for piece in pieces)
+
+
+def _without_blank_runs(text: str) -> str:
+    return re.sub(r"\n{3,}", "\n\n", text)
+
+
+_MAIN = """/* Reads a table of measurements (CSV, a file or standard input) and writes the estimates.
+   A row whose initial columns are filled begins a new track. */
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "rows.h"
+
+#define COLUMNS {count}
+static const char columns[] =
+    {columns};
+
+static char line[32 * COLUMNS + sizeof columns];
+
+/* The numbers of a line; an empty one is NaN. Returns how many there are. */
+static int numbers(const char *text, double *row) {{
+    int count = 0;
+    for (;;) {{
+        char *end;
+        double value = strtod(text, &end);
+        if (end == text) value = NAN;
+        if (count < COLUMNS) row[count] = value;
+        ++count;
+        while (*end != ',' && *end != '\\0' && *end != '\\n' && *end != '\\r') ++end;
+        if (*end != ',') return count;
+        text = end + 1;
+    }}
+}}
+
+int main(int argc, char **argv) {{
+    static {own}_state state;
+    static double row[COLUMNS];
+    long track = 0, measurement = 0, number = 1;
+    FILE *file = argc > 1 ? fopen(argv[1], "r") : stdin;
+    if (file == NULL) {{
+        fprintf(stderr, "cannot read %s\\n", argv[1]);
+        return 2;
+    }}
+    if (fgets(line, (int)sizeof line, file) == NULL || strncmp(line, columns, strlen(columns)) != 0 ||
+        strcspn(line, "\\r\\n") != strlen(columns)) {{
+        fprintf(stderr, "the first line must be %s\\n", columns);
+        return 2;
+    }}
+    puts({header});
+    while (fgets(line, (int)sizeof line, file) != NULL) {{
+        {own}_measurement measurement_now;
+        {own}_estimate estimate;
+        int i;
+        ++number;
+        if (line[strspn(line, "\\r\\n")] == '\\0') continue;
+        if (numbers(line, row) != COLUMNS) {{
+            fprintf(stderr, "line %ld must have %d numbers\\n", number, COLUMNS);
+            return 2;
+        }}
+        if (row[0] == row[0]) {{
+            {own}_initial initial;
+            set_initial(&initial, row);
+            {own}_start(&state, &initial);
+            ++track;
+            measurement = 0;
+        }}
+        if (track == 0) {{
+            fprintf(stderr, "line 2 must begin a track\\n");
+            return 2;
+        }}
+        set_measurement(&measurement_now, row + {initial});
+        {own}_update(&state, &measurement_now, &estimate);
+        printf("%ld,%ld", track, ++measurement);{told}
+        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", (double)estimate.mean{mean});
+        for (i = 0; i < {C}; ++i) printf(",%.{digits}g", sqrt((double)estimate.covariance{covariance}));
+        putchar('\\n');
+    }}
+    if (file != stdin) fclose(file);
+    return 0;
+}}
+"""
+_TEST = """/* Compares the filter with what the competitor itself estimated, and says how long an update takes. */
+#include <math.h>
+#include <stdio.h>
+#include <time.h>
+
+#include "rows.h"
+#include "vectors.h"
+
+#define LIMIT {limit} /* standard deviations */
+
+static double run(double worst) {{
+    int track, k, i;
+    for (track = 0; track < TRACKS; ++track) {{
+        {own}_state state;
+        {own}_initial initial;
+        set_initial(&initial, initials[track]);
+        {own}_start(&state, &initial);
+        for (k = track * MEASUREMENTS; k < (track + 1) * MEASUREMENTS; ++k) {{
+            {own}_measurement measurement;
+            {own}_estimate estimate;
+            set_measurement(&measurement, measurements[k]);
+            {own}_update(&state, &measurement, &estimate);
+            for (i = 0; i < {C}; ++i) {{
+                const double off = fabs((double)estimate.mean{mean} - means[k][i]);
+                const double difference = off == 0.0 ? 0.0 : off / sigmas[k][i];
+                if (!(difference <= worst)) worst = difference;
+            }}
+        }}
+    }}
+    return worst;
+}}
+
+int main(void) {{
+    const double worst = run(0.0);
+    const clock_t begin = clock();
+    long updates = 0;
+    double seconds;
+    volatile double kept;
+    do {{
+        kept = run(0.0);
+        updates += TRACKS * MEASUREMENTS;
+        seconds = (double)(clock() - begin) / CLOCKS_PER_SEC;
+    }} while (seconds < 0.2);
+    (void)kept;
+    printf("largest difference %.1e standard deviations, %.0f ns an update\\n", worst, 1e9 * seconds / (double)updates);
+    return worst <= LIMIT ? 0 : 1;
+}}
+"""
+
+
+def export_c(
+    problem: Problem,
+    name: str,
+    maker: Any,
+    folder: Path,
+    precision: str = "double",
+    scenario: Any = None,
+    keywords: Mapping[str, Any] | None = None,
+    command: str = "",
+) -> Figures:
+    """Write a competitor as C99 into a folder, after its programs were compared with the competitor itself.
+
+    Args:
+        problem: whose competitor it is.
+        name: of it.
+        maker: of it.
+        folder: for the files.
+        precision: "double" or "float".
+        scenario: whose parameters it has, and whose episodes it is compared on; a recording, too.
+        keywords: parameters of the task.
+        command: that made it, for the comment of the header.
+
+    Raises:
+        ValueError: for what cannot be exported, or answers something else in this precision.
+    """
+    scalar = {"double": DOUBLE, "float": FLOAT}[precision]
+    traced, replayed = replay(problem, name, maker, scenario, keywords, EPISODES, MEASUREMENTS)
+    difference = replayed.largest_difference(run_filter(traced, replayed, scalar.dtype)[:, mean_rows(traced)])
+    if not difference <= WORST[precision]:
+        raise ValueError(
+            f"{name!r} in {precision} is off by {difference:.1e} of the standard deviations that it reports, more than "
+            f"{WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
+            + ("export it in double" if scalar is FLOAT else "please report it")
+        )
+    sensitivity = 0.0
+    if traced.network is not None:
+        steady = run_filter(traced, replayed, network_dtype=numpy.float64)
+        sensitivity = replayed.largest_difference(steady[:, mean_rows(traced)])
+    writer = Writer(name, traced, scalar, replayed.components)
+    writer.limit = max(WORST[precision], 3.0 * sensitivity)
+    writer.about = _about(problem, name, maker, writer, precision, keywords, command)
+    figures = Figures(
+        **writer.figures, difference=difference, sensitivity=sensitivity, replaced=writer.replaced
+    )
+    test = compile_and_test(writer, replayed)
+    figures = figures._replace(test=test)
+    folder.mkdir(parents=True, exist_ok=True)
+    with whole_files(folder) as waiting:
+        for file, text in files_of(writer, replayed, _notes(figures, replayed, precision)).items():
+            (waiting / file).write_text(text, encoding="ascii")
+    return figures
+
+
+def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dict[str, str]:
+    """Return the text of every file by its name."""
+    return {
+        f"{writer.name}.h": writer.header(notes),
+        f"{writer.name}.c": writer.source(),
+        "rows.h": writer.rows(),
+        "main.c": writer.main(),
+        "vectors.h": writer.vectors(replayed),
+        "test.c": writer.test(),
+        "measurements.csv": writer.table(replayed),
+    }
+
+
+def _about(
+    problem: Problem,
+    name: str,
+    maker: Any,
+    writer: Writer,
+    precision: str,
+    keywords: Mapping[str, Any] | None,
+    command: str,
+) -> list[str]:
+    """Paragraphs that say what the filter is."""
+    own = writer.name
+    described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
+    first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")
+    parameters = ", ".join(f"{key} = {value!r}" for key, value in (keywords or {}).items())
+    return [
+        f"{name} of {problem.id}, in {precision}, for one track. {first}".strip(),
+        *([f"With parameters of the task: {parameters}."] if parameters else []),
+        f"Made by: {command}" if command else "Made by filtergym.",
+        "",
+        "No allocation, nothing but math.h. Compare it with the filter that was judged:",
+        f"    cc -std=c99 -O2 test.c {own}.c -lm -o test && ./test",
+        "Estimates from a table of measurements:",
+        f"    cc -std=c99 -O2 main.c {own}.c -lm -o run && ./run measurements.csv",
+        "",
+    ]
+
+
+def _notes(figures: Figures, replayed: Replay, precision: str) -> list[str]:
+    T, E = len(replayed.measurements), replayed.initial.shape[1]
+    notes = [
+        f"{figures.operations:,} operations an update; bytes: {figures.state_bytes:,} of state"
+        + (f", {figures.constant_bytes:,} of weights" if figures.constant_bytes else "")
+        + f", about {figures.scratch_bytes:,} of stack.",
+        f"Largest difference to the competitor in {E} episodes of {T} measurements, as NumPy computes in {precision}: "
+        f"{figures.difference:.1e} of the standard deviations that it reports.",
+    ]
+    if figures.sensitivity > 0.0:
+        notes.append(
+            f"Rounding in the network alone moves an estimate by up to {figures.sensitivity:.1e} of them: so much may "
+            "any other order of its sums."
+        )
+    if figures.test:
+        notes.append(f"Compiled where it was made: {figures.test}.")
+    if figures.replaced:
+        listed = ", ".join(f"{value:g}" for value in figures.replaced)
+        notes.append(f"Constants that float does not have, replaced by the nearest that it has: {listed}.")
+    return notes
+
+
+def compile_and_test(
+    writer: Writer, replayed: Replay, compiler: str | None = None, flags: Sequence[str] = FLAGS
+) -> str:
+    """Compile the test and run it.
+
+    Args:
+        writer: of the filter.
+        replayed: the vectors.
+        compiler: default: cc, where there is one.
+        flags: of the compiler.
+
+    Returns:
+        What the test says; nothing without a compiler.
+
+    Raises:
+        ValueError: if it does not compile, or the test fails.
+    """
+    compiler = compiler or shutil.which("cc")
+    if compiler is None:
+        return ""
+    with tempfile.TemporaryDirectory() as place:
+        for file, text in files_of(writer, replayed).items():
+            (Path(place) / file).write_text(text, encoding="ascii")
+        program = [compiler, *flags, "test.c", f"{writer.name}.c", "-lm", "-o", "test"]
+        for words in (program, [str(Path(place) / "test")]):
+            done = subprocess.run(words, cwd=place, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                said = (done.stderr or done.stdout).strip()[-500:]
+                raise ValueError(
+                    f"{words[0]} failed on the exported {writer.name!r}, please report it: {said}"
+                )
+    return done.stdout.strip()

@@ -1,0 +1,194 @@
+"""What an exported filter must answer: measurements of episodes, and what the competitor itself estimated of them."""
+
+import copy
+import math
+from collections.abc import Mapping
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..agents.learned_policy import LearnedPolicy
+from ..baselines.problem import Problem
+from ..compiler.functions import leaves
+from ..compiler.interpretation import interpret
+from ..envs.backend import make_model
+from ..envs.model import Episode, Model
+from ..evaluation.competitors import kind_of
+from ..evaluation.evaluate import control_of
+from ..evaluation.rollout import rollout, start_lanes
+from ..evaluation.seeds import episode_seeds
+from .traced_filter import (
+    ANSWER,
+    MEASUREMENT,
+    STATE,
+    TracedFilter,
+    trace_filter,
+)
+
+
+class Replay(NamedTuple):
+    """E episodes of T measurements, every array of a structure row by row."""
+
+    initial: numpy.ndarray
+    """``(rows, E)``."""
+    measurements: numpy.ndarray
+    """``(T, rows, E)``."""
+    mean: numpy.ndarray
+    """Of the competitor, ``(T, C, E)``."""
+    covariance: numpy.ndarray
+    """``(T, C, C, E)``."""
+    components: list[tuple[str, str]]
+    """Name and unit of what is estimated."""
+
+    @property
+    def sigma(self) -> numpy.ndarray:
+        """Standard deviations that the competitor reports, ``(T, C, E)``."""
+        variance = numpy.moveaxis(numpy.diagonal(self.covariance, axis1=1, axis2=2), -1, 1)
+        return numpy.sqrt(numpy.maximum(variance, 0.0))
+
+    def largest_difference(self, mean: numpy.ndarray) -> float:
+        """Largest difference of other means ``(T, C, E)`` to the competitor's, in its standard deviations."""
+        with numpy.errstate(all="ignore"):
+            difference = numpy.abs(mean - self.mean) / self.sigma
+        same = (mean == self.mean) | (numpy.isnan(mean) & numpy.isnan(self.mean))
+        difference = numpy.where(same, 0.0, numpy.where(numpy.isnan(difference), math.inf, difference))
+        return float(difference.max(initial=0.0))
+
+
+def _report(model: Model, episode: Episode) -> dict[str, Any]:
+    """What a filter was given, and what it estimated."""
+    mean, covariance = model.mean(episode), model.covariance(episode)
+    return {"measurement": episode.measurement, "mean": mean, "covariance": covariance}
+
+
+def _report_estimator(model: Model, episode: Episode) -> dict[str, Any]:
+    """Of an estimator also why an episode is lost: the last valid answer is held then."""
+    return {
+        **_report(model, episode),
+        "lost": model.filter.records(episode.filter, episode.measurement)["lost"],
+    }
+
+
+def _rows(part: Any, count: int) -> numpy.ndarray:
+    """Numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
+    arrays = [numpy.asarray(array, dtype=float) for array in leaves(part)]
+    return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
+
+
+def replay(
+    problem: Problem,
+    name: str,
+    maker: Any,
+    scenario: Any = None,
+    keywords: Mapping[str, Any] | None = None,
+    episodes: int = 8,
+    measurements: int | None = None,
+) -> tuple[TracedFilter, Replay]:
+    """Trace a competitor, and let it run over episodes as an evaluation does.
+
+    Args:
+        problem: whose competitor it is.
+        name: of it, in errors.
+        maker: of it.
+        scenario: whose parameters the export has, and whose episodes are run, of the test split; a recording, too.
+        keywords: parameters of the task.
+        episodes: how many run.
+        measurements: of each, at most.
+
+    Raises:
+        ValueError: for what cannot be exported, or loses every episode.
+    """
+    kind = kind_of(maker)
+    control = control_of(maker, kind, None, problem.task, name)
+    given = {**getattr(maker, "task_keywords", {}), **(keywords or {})}
+    plain = make_model(problem.task, control, scenario, **given)
+    model = make_model(problem.task, control, scenario, backend="auto", **given)
+    seeds = episode_seeds("test", 0, episodes)
+    started: list[Any] = []
+    start_lanes(plain, seeds, lambda episode: started.append(episode.measurement))
+    kept: dict[str, list[numpy.ndarray]] = {"measurement": [], "mean": [], "covariance": []}
+    # What cannot be exported is refused before it runs. Measurements have the same form whatever steers.
+    first = start_lanes(plain, seeds[:1]).state.measurement
+    traced = trace_filter(problem.task, control, maker, name, plain, (started[0], first))
+    report = _report_estimator if kind == "estimator" else _report
+    lost = numpy.zeros(episodes, dtype=bool)
+    for found, _ in islice(rollout(model, maker, seeds, report, kind=kind, name=name), measurements):
+        lost |= found.get("lost", numpy.zeros(episodes))[:episodes] > 0.0
+        kept["measurement"].append(_rows(found["measurement"], episodes))
+        kept["mean"].append(numpy.array(found["mean"][..., :episodes]))
+        kept["covariance"].append(numpy.array(found["covariance"][..., :episodes]))
+    if lost.all():
+        raise ValueError(
+            f"{name!r} lost every episode that it was to be compared on: its answers are no estimates"
+        )
+    arrays = [numpy.stack(values)[..., ~lost] for values in kept.values()]
+    components = [(component.name, component.unit) for component in plain.task.components]
+    return traced, Replay(_rows(started[0], episodes)[:, ~lost], *arrays, components)
+
+
+class _Network:
+    """The network of a filter, asked as it is in an evaluation.
+
+    Args:
+        network: of the filter.
+        dtype: in which it computes.
+    """
+
+    def __init__(self, network: LearnedPolicy, dtype: Any) -> None:
+        self.network = copy.copy(network)
+        self.network.arrays = {name: values.astype(dtype) for name, values in network.arrays.items()}
+        self.network.layers = [tuple(values.astype(dtype) for values in layer) for layer in network.layers]
+        self.network.columns = slice(None)  # what it is shown is what it takes
+        self.memory: Any = None
+        self.answer: Any = None
+
+    def __call__(self, shown: Any) -> None:
+        """Answer, if this measurement is decided on."""
+        flag, *rest = shown
+        if not numpy.all(flag):
+            return
+        N = max(numpy.size(row) for row in rest)
+        observation = numpy.stack([numpy.broadcast_to(row, (N,)) for row in rest], axis=1)
+        fresh = numpy.full(N, self.memory is None)
+        answer, self.memory = self.network.act(observation, self.memory, fresh)
+        self.answer = numpy.atleast_2d(numpy.asarray(answer).T)
+
+
+def run_filter(
+    traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64, network_dtype: Any = numpy.float32
+) -> numpy.ndarray:
+    """Run the programs of a filter over episodes, step by step in NumPy.
+
+    Args:
+        traced: to run.
+        replayed: what it is given.
+        dtype: in which everything but a network is computed.
+        network_dtype: in which the network is; it was trained in float.
+
+    Returns:
+        Rows of the estimate, ``(T, rows, E)``.
+    """
+    E = replayed.initial.shape[1]
+    network = None if traced.network is None else _Network(traced.network, network_dtype)
+    state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
+    answers = []
+    for measured in replayed.measurements:
+
+        def read(argument: int, row: int, measured: Any = measured, state: Any = state) -> Any:
+            if argument == ANSWER:
+                assert network is not None
+                # Where nothing is decided the answer that was held is not looked at.
+                return 0.0 if network.answer is None else network.answer[row]
+            return {STATE: state, MEASUREMENT: measured}[argument][row]
+
+        found = interpret(traced.update, read, dtype, network, traced.shown)
+        state = found[traced.shown : traced.shown + len(traced.state)]
+        rows = found[traced.shown + len(traced.state) :]
+        answers.append(numpy.stack([numpy.broadcast_to(row, (E,)) for row in rows]).astype(float))
+    return numpy.stack(answers)
+
+
+def mean_rows(traced: TracedFilter) -> slice:
+    """Rows of the estimate that are its mean."""
+    return slice(0, sum(member.name == "mean" for member in traced.estimate))

@@ -1,0 +1,453 @@
+"""A whole filter as one straight line for one measurement: state and measurement in, state and estimate out.
+
+Traced is the filter's own text, the same that an evaluation runs. What the estimate does not depend on is left out of
+the state, and members that are always equal, as P[0, 1] and P[1, 0], are kept once.
+"""
+
+import ast
+import copy
+import inspect
+import math
+import re
+import textwrap
+from collections.abc import Sequence
+from itertools import count as count_from
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy
+
+from ..agents.gate import Gated
+from ..agents.learned_estimator import EstimatorMaker
+from ..agents.learned_policy import LearnedPolicy
+from ..agents.residual import ResidualPolicy
+from ..compiler import namespace
+from ..compiler.functions import leaves, map_arrays
+from ..compiler.namespace import NotTraceable, Traced
+from ..compiler.program import Graph, Program, Result, program
+from ..envs.filter import Input
+from ..envs.model import Model
+from ..envs.task import Task
+from ..evaluation.competitors import RANKED, Likelihood, Policy, RandomPolicy, kind_of, make_competitor
+from ..evaluation.steered_filter import Steered, SteeredFilter, steer
+
+STATE, MEASUREMENT, ANSWER, INITIAL, ESTIMATE, SHOWN = range(6)
+"""Arguments of the programs."""
+LIKELIHOODS = ("log_likelihood", "nis", "nis_degrees")
+"""What is told beside an estimate, where the filter tells it."""
+
+
+class Member(NamedTuple):
+    """A number in a structure of arrays."""
+
+    name: str
+    """Of its array: the names that lead to it."""
+    shape: tuple[int, ...]
+    """Of its array, without axes of one."""
+    place: int
+    """In that array, row by row."""
+    words: str
+    """What its array is, where its class says so."""
+
+
+class TracedFilter(NamedTuple):
+    """A filter as two programs."""
+
+    start: Program
+    """From the initial estimate to the state."""
+    update: Program
+    """From state and measurement to state and estimate; what a network is shown comes first among the results."""
+    initial: list[Member]
+    measurement: list[Member]
+    state: list[Member]
+    """Rows of the argument ``STATE``: what is kept from one measurement to the next."""
+    estimate: list[Member]
+    """Rows of the argument ``ESTIMATE``."""
+    shown: int
+    """Results of ``update`` that a network is shown, the first one whether it is asked; zero without network."""
+    network: LearnedPolicy | None
+    """That answers between the two parts of ``update``; None where none is asked."""
+
+
+class EstimatorSteps:
+    """An estimator alone: an answer that an evaluation would not accept is returned all the same.
+
+    Args:
+        task: on traced arrays.
+        own: the estimator, made for it.
+    """
+
+    def __init__(self, task: Task, own: Any) -> None:
+        self.task, self.own = task, own
+
+    def start(self, initial: Any) -> Any:
+        """Its memory."""
+        return self.own.start(initial, 1)
+
+    def update(self, state: Any, measurement: Any) -> tuple[Any, dict[str, Any]]:
+        """Its answer."""
+        received = self.task.world.mask_missing(measurement)
+        mean, covariance, memory, *reported = self.own.update(received, state)
+        told = Likelihood.of(*reported)._asdict() if reported else {}
+        known = {name: values for name, values in told.items() if values is not None}
+        return memory, {"mean": mean, "covariance": covariance, **known}
+
+
+class SteeredSteps:
+    """A bank closed by a policy.
+
+    Args:
+        steered: on traced arrays.
+        masked: whether it is an estimator, which never sees what was not received.
+    """
+
+    def __init__(self, steered: SteeredFilter, masked: bool = False) -> None:
+        self.steered, self.masked = steered, masked
+
+    def start(self, initial: Any) -> Steered:
+        """The bank at the start of the track."""
+        return self.steered.start(initial)
+
+    def update(self, state: Steered, measurement: Any) -> tuple[Steered, dict[str, Any]]:
+        """Predict, show, ask, update."""
+        own = self.steered
+        received = clear_missing(own.task, measurement) if self.masked else measurement
+        after = own.update(own.predict(state, received), Input(received))
+        told = own.records(after, received)
+        known = {name: told[name] for name in LIKELIHOODS if name in told}
+        return after, {"mean": own.mean(after), "covariance": own.covariance(after), **known}
+
+    def due_nodes(self, state: Steered, graph: Graph) -> list[int]:
+        """Expression of whether the policy is asked at a measurement."""
+        return nodes_of(self.steered.is_due(state)) if self.steered.interval > 1 else [graph.constant(True)]
+
+
+def clear_missing(task: Task, measurement: Any) -> Any:
+    """Return a measurement with zero in place of what was not received, whatever stands there."""
+
+    def clear(own: Any, masked: Any) -> Any:
+        if own is masked or (own.nodes == masked.nodes).all():
+            return own
+        return namespace.where(namespace.isnan(masked), 0.0, masked)
+
+    masked = iter(leaves(task.world.mask_missing(measurement)))
+    return map_arrays(lambda own: clear(own, next(masked)), measurement)
+
+
+def count_answers(network: LearnedPolicy) -> int:
+    """Numbers of an action."""
+    return 1 if network.output == "argmax" else len(network.layers[-1][1])
+
+
+class AskedNetwork(Policy):
+    """In place of a network while a filter is traced: keeps what it is shown, and answers with inputs.
+
+    Args:
+        network: in whose place it stands.
+        graph: of the inputs.
+    """
+
+    def __init__(self, network: LearnedPolicy, graph: Graph) -> None:
+        super().__init__(network.model)
+        self.network, self.graph = network, graph
+        self.control = network.control  # type: ignore[misc]
+        self.shown: list[int] = []
+
+    def act(self, observation: Any, state: Any, start: Any) -> tuple[Any, Any]:
+        """Keep what is shown; numbers are answered with zeros, whose form alone matters."""
+        if not isinstance(observation, Traced):
+            return numpy.zeros(
+                (1,) if self.network.output == "argmax" else (1, count_answers(self.network))
+            ), ()
+        self.shown = observation[:, self.network.columns].nodes.ravel().tolist()
+        nodes = [self.graph.input(ANSWER, i) for i in range(count_answers(self.network))]
+        if self.network.output == "argmax":
+            return Traced(nodes, numpy.int64), ()
+        return Traced(numpy.array(nodes)[None], numpy.float64), ()
+
+
+def check_kind(name: str, maker: Any) -> None:
+    """Raise ValueError for what is neither estimator nor policy."""
+    kind = kind_of(maker)
+    if kind not in RANKED:
+        raise ValueError(
+            f"{name!r} is of kind {kind}: an estimator or a policy can be exported, which know nothing but what is "
+            "measured, when it is measured"
+        )
+
+
+def steps_of(
+    task: type[Task], control: str, maker: Any, plain: Model, graph: Graph
+) -> tuple[EstimatorSteps | SteeredSteps, "AskedNetwork | None"]:
+    """Make the steps of a competitor on traced arrays, and what stands in its network's place; while a graph is open.
+
+    Args:
+        task: class of the environment.
+        control: of the competitor.
+        maker: of it.
+        plain: model of the same parameters on NumPy.
+        graph: that is open.
+    """
+    traced = task(plain.task.parameters, namespace)
+    if isinstance(maker, EstimatorMaker):
+        policy, network = with_asked_network(maker(plain.task).network, graph)
+        return SteeredSteps(steer(Model(traced, maker.bank), policy, 1), masked=True), network
+    if kind_of(maker) == "estimator":
+        own = make_competitor(maker, traced)
+        if not getattr(own, "traceable", False):
+            raise NotTraceable("it does not say that it is traceable")
+        return EstimatorSteps(traced, own), None
+    policy, network = with_asked_network(make_competitor(maker, plain), graph)
+    if isinstance(policy, RandomPolicy):
+        raise NotTraceable("its actions are drawn")
+    if not isinstance(policy, Policy):
+        raise NotTraceable(
+            f"{type(policy).__name__} runs in another library; `filtergym export RUN` writes an agent of a training "
+            "run as arrays"
+        )
+    return SteeredSteps(steer(Model(traced, control), policy)), network
+
+
+def with_asked_network(policy: Any, graph: Graph) -> tuple[Any, AskedNetwork | None]:
+    """Put :class:`AskedNetwork` in the place of the network of a policy, wherever it is inside."""
+    if isinstance(policy, LearnedPolicy):
+        asked = AskedNetwork(policy, graph)
+        return asked, asked
+    for outer, place in ((Gated, "policy"), (ResidualPolicy, "agent")):
+        if isinstance(policy, outer):
+            inner, asked_inside = with_asked_network(getattr(policy, place), graph)
+            policy = copy.copy(policy)
+            setattr(policy, place, inner)
+            return policy, asked_inside
+    return policy, None
+
+
+# --- structures of arrays
+
+
+def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
+    """Every number of nested tuples of arrays of one lane, in the order of ``leaves``."""
+    if part is None:
+        return []
+    if isinstance(part, dict | tuple):
+        described: dict[str, str] = {}
+        if isinstance(part, dict):
+            pairs = list(part.items())
+        elif hasattr(part, "_fields"):
+            pairs, described = list(part._asdict().items()), field_words(type(part))
+        else:
+            pairs = [(str(i), item) for i, item in enumerate(part)]
+        return [
+            member
+            for name, item in pairs
+            for member in members_of(item, f"{prefix}_{name}" if prefix else name, described.get(name, words))
+        ]
+    shape = tuple(size for size in numpy.shape(getattr(part, "nodes", part)) if size != 1)
+    return [Member(prefix or "value", shape, i, words) for i in range(math.prod(shape))]
+
+
+def field_words(cls: type) -> dict[str, str]:
+    """What a NamedTuple's text says below each of its fields; nothing where there is no text."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0]
+    except (OSError, TypeError, SyntaxError, IndexError):
+        return {}
+    lines = tree.body if isinstance(tree, ast.ClassDef) else []
+    return {
+        field.target.id: _without_shapes(below.value.value)
+        for field, below in pairwise(lines)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
+        and isinstance(below.value.value, str)
+    }  # fmt: skip
+
+
+def _without_shapes(text: str) -> str:
+    """Words without shapes such as ``(2, N)``, which are those of many tracks."""
+    return re.sub(r"(, |^)``\([^`]*\)``\.?", "", " ".join(text.split())).replace("`", "")
+
+
+def nodes_of(part: Any) -> list[int]:
+    """Expressions of all numbers."""
+    return [node for array in leaves(part) for node in namespace.asarray(array).nodes.ravel().tolist()]
+
+
+def fill(part: Any, nodes: Sequence[int], graph: Graph) -> Any:
+    """Return nested tuples of arrays like others, made of these expressions."""
+    at = iter(nodes)
+
+    def leaf(array: Any) -> Traced:
+        array = namespace.asarray(array)
+        own = [next(at) for _ in range(array.size)]
+        if array.dtype.kind == "b":
+            zero = graph.constant(0.0)
+            own = [node if graph.logical[node] else graph.node("not_equal", node, zero) for node in own]
+        shaped = numpy.array(own, dtype=numpy.int64).reshape(array.shape)
+        return Traced(shaped, array.dtype if array.dtype.kind in "ib" else numpy.float64)
+
+    return map_arrays(leaf, part)
+
+
+def one_lane(part: Any) -> Any:
+    """Nested tuples of arrays ``(..., N)`` with the first lane alone, ``(..., 1)``."""
+    return map_arrays(lambda array: array[..., :1], part)
+
+
+# --- tracing
+
+
+class _Classes:
+    """Which members of a state are the same number, and which never change.
+
+    What starts as one number is taken for one number, and for a constant where it starts as one, until the update
+    disagrees: then they are told apart, and the update is traced again. Numbers that are still told apart after some
+    rounds, as in a window that moves by one each time, are not compared any more.
+    """
+
+    ROUNDS = 4
+
+    def __init__(self, graph: Graph, first: Sequence[int]) -> None:
+        self.graph = graph
+        self.rounds = 0
+        groups: dict[int, int] = {}
+        self.members = [groups.setdefault(node, i) for i, node in enumerate(first)]
+        values = {c: graph.values[first[c]] for c in set(self.members)}
+        self.fixed = {c: value for c, value in values.items() if value is not None}
+
+    def nodes(self) -> list[int]:
+        """Expressions of the members before an update."""
+        return [
+            self.graph.constant(self.fixed[c]) if c in self.fixed else self.graph.input(STATE, c)
+            for c in self.members
+        ]
+
+    def split(self, after: Sequence[int]) -> bool:
+        """Tell apart what an update makes different; whether there was anything."""
+        pairs = list(zip(self.members, after, strict=True))
+        groups: dict[tuple[int, int], int] = {}
+        members = [groups.setdefault(pair, i) for i, pair in enumerate(pairs)]
+        fixed = {
+            c: value
+            for c, value in self.fixed.items()
+            if all(_is_constant(self.graph, node, value) for own, node in pairs if own == c)
+        }
+        if members == self.members and fixed == self.fixed:
+            return False
+        self.rounds += 1
+        if self.rounds > self.ROUNDS:
+            apart = {old for old, new in zip(self.members, members, strict=True) if old != new}
+            members = [i if self.members[i] in apart else new for i, new in enumerate(members)]
+            fixed = {c: value for c, value in fixed.items() if c not in apart}
+        self.fixed = {new: fixed[c] for new, c in zip(members, self.members, strict=True) if c in fixed}
+        self.members = members
+        return True
+
+
+def _is_constant(graph: Graph, node: int, value: Any) -> bool:
+    known = graph.values[node]
+    return known is not None and (known == value or (known != known and value != value))
+
+
+def trace_filter(
+    task: type[Task], control: str, maker: Any, name: str, plain: Model, template: tuple[Any, Any]
+) -> TracedFilter:
+    """Trace a competitor.
+
+    Args:
+        task: class of the environment.
+        control: of the competitor.
+        maker: of it.
+        name: of it, in errors.
+        plain: model of the control on NumPy, with the parameters of the export.
+        template: initial estimate and measurement, any numbers of any width.
+
+    Raises:
+        ValueError: for what is neither estimator nor policy, or no straight line of arithmetic.
+    """
+    check_kind(name, maker)
+    graph = Graph()
+    try:
+        with namespace.tracing(graph):
+            return _trace(*steps_of(task, control, maker, plain, graph), template, graph)
+    except NotTraceable as error:
+        raise ValueError(
+            f"{name!r} cannot be exported: it is no straight line of array arithmetic ({error})"
+        ) from error
+
+
+def _trace(
+    steps: EstimatorSteps | SteeredSteps,
+    asked: "AskedNetwork | None",
+    template: tuple[Any, Any],
+    graph: Graph,
+) -> TracedFilter:
+    initial, measurement = (one_lane(part) for part in template)
+    rows = count_from()
+    begin = fill(initial, [graph.input(INITIAL, next(rows)) for _ in nodes_of(initial)], graph)
+    rows = count_from()
+    z = fill(measurement, [graph.input(MEASUREMENT, next(rows)) for _ in nodes_of(measurement)], graph)
+    state = steps.start(begin)
+    first = nodes_of(state)
+    classes = _Classes(graph, first)
+    while True:
+        before = fill(state, classes.nodes(), graph)
+        following, estimate = steps.update(before, z)
+        after = nodes_of(following)
+        if len(after) != len(first):
+            raise NotTraceable("the arrays of its state change their shapes from measurement to measurement")
+        if not classes.split(after):
+            break
+    shown = []
+    if asked is not None and asked.shown and isinstance(steps, SteeredSteps):
+        shown = [*steps.due_nodes(before, graph), *asked.shown]
+    results = nodes_of(estimate)
+    live = _live_members(graph, classes.members, after, [*results, *shown])
+    place = {member: row for row, member in enumerate(live)}
+    update = program(
+        graph,
+        [
+            *(Result(SHOWN, row, node) for row, node in enumerate(shown)),
+            *(Result(STATE, place[member], after[member]) for member in live),
+            *(Result(ESTIMATE, row, node) for row, node in enumerate(results)),
+        ],
+    )
+    start = program(graph, [Result(STATE, place[member], first[member]) for member in live])
+    listed = members_of(state)
+    return TracedFilter(
+        start,
+        _renumbered(update, place),
+        members_of(initial),
+        members_of(measurement),
+        [listed[member] for member in live],
+        members_of(estimate),
+        len(shown),
+        asked.network if shown and asked is not None else None,
+    )
+
+
+def _live_members(
+    graph: Graph, classes: Sequence[int], after: Sequence[int], wanted: Sequence[int]
+) -> list[int]:
+    """Members that some result depends on, now or later."""
+
+    def read(nodes: Sequence[int]) -> set[int]:
+        inputs = (node for node in graph.live(nodes) if graph.operations[node] == "input")
+        return {graph.arguments[node][1] for node in inputs if graph.arguments[node][0] == STATE}
+
+    live = read(wanted)
+    while True:
+        more = live | read([after[member] for member in live])
+        if more == live:
+            return sorted(live)
+        live = more
+
+
+def _renumbered(code: Program, place: dict[int, int]) -> Program:
+    """The program with the rows of the state that are kept."""
+    steps = [
+        step._replace(arguments=(STATE, place[step.arguments[1]]))
+        if step.operation == "input" and step.arguments[0] == STATE
+        else step
+        for step in code.steps
+    ]
+    return code._replace(steps=steps)

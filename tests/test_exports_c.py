@@ -1,0 +1,395 @@
+"""Filters as C99: they are what was judged, compile without a warning, and nothing gets in that is no number."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from filtergym.agents.learned_policy import LearnedPolicy
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.filter import Initial
+from filtergym.filters import kalman
+
+from filtergym.exports import c_source
+from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
+from filtergym.exports.replay import mean_rows, replay, run_filter
+from filtergym.names import find_competitor
+
+EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'
+SANITIZERS = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+@pytest.fixture
+def run(command, monkeypatch, tmp_path):
+    """Run the command line in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return command
+
+
+def replayed(environment, name, **options):
+    problem = problem_of(f"filtergym/{environment}-v0")
+    maker = name if not isinstance(name, str) else find_competitor(problem, name)
+    return replay(problem, str(name), maker, **options)
+
+
+# --- programs
+
+
+@pytest.mark.parametrize(
+    ("environment", "name", "keywords"),
+    [
+        ("ManeuveringTarget", "kalman-imm", {}),
+        ("ManeuveringTarget", "adaptive", {}),
+        ("ManeuveringTarget", "kalman-net", {}),
+        ("ManeuveringTarget", "gated:ppo", {}),
+        ("LooselyCoupledNavigation", "time-varying", {"decision_interval": 5}),
+        ("UavAutopilot", "raw-sensors", {}),
+        ("UavAutopilot", "innovation-adaptive", {"decision_interval": 4}),
+        ("UavAutopilot", "ppo", {"decision_interval": 3}),
+        ("RadarEsmTracking", "forgetting-joint-type", {}),
+    ],
+)
+def test_programs_of_a_filter_answer_what_it_answers(environment, name, keywords):
+    traced, given = replayed(environment, name, keywords=keywords, episodes=8, measurements=40)
+    found = run_filter(traced, given)
+    # A sum in another order is all that may differ.
+    assert given.largest_difference(found[:, mean_rows(traced)]) < 1e-11
+    C = given.mean.shape[1]
+    covariance = found[:, C : C + C * C].reshape(len(found), C, C, -1)
+    np.testing.assert_allclose(covariance, given.covariance, rtol=1e-7, atol=1e-9)
+
+
+class Symmetric:
+    """An estimator whose memory holds numbers twice, constants, and what nobody reads."""
+
+    kind, traceable = "estimator", True
+
+    def __init__(self, task):
+        self.xp = task.xp
+
+    def start(self, initial, N):
+        own = initial.covariance[0, 0]
+        zero = 0.0 * own
+        return {
+            "P": self.xp.stack([own, zero, zero, own]),
+            "counted": zero,
+            "of": zero + 2.0,
+            "apart": (own, own),
+        }
+
+    def update(self, measurement, memory):
+        P = 0.5 * memory["P"] + memory["of"]
+        first, second = memory["apart"]
+        mean = self.xp.stack([P[0], P[3], first, second])
+        covariance = self.xp.eye(4)[:, :, None] * (1.0 + 0.0 * mean)
+        apart = (first + measurement.interval, second + 2.0 * measurement.interval)
+        after = {
+            "P": P - P[1] * self.xp.asarray([[0.0], [1.0], [0.0], [0.0]]),
+            "counted": memory["counted"] + 1.0,
+        }
+        return mean, covariance, after | {"of": memory["of"], "apart": apart}
+
+
+def test_a_state_keeps_each_number_once_and_nothing_that_is_never_read():
+    traced, given = replayed("ManeuveringTarget", Symmetric, episodes=2, measurements=5)
+    assert [(member.name, member.place) for member in traced.state] == [
+        ("P", 0),
+        ("apart_0", 0),
+        ("apart_1", 0),
+    ]
+    # Deviations are one, means some ten thousand: the last bit.
+    assert given.largest_difference(run_filter(traced, given)[:, mean_rows(traced)]) < 1e-11
+
+
+def test_a_window_that_moves_is_traced_in_a_few_rounds():
+    traced, given = replayed("UavAutopilot", "mehra", episodes=1, measurements=3)
+    assert given.largest_difference(run_filter(traced, given)[:, mean_rows(traced)]) < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("known-turn", "of kind reference: an estimator or a policy can be exported"),
+        ("imm-smoother", "of kind smoother"),
+        ("random", "no straight line of array arithmetic .its actions are drawn"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_by_name(name, sentence):
+    with pytest.raises(ValueError, match=f"'{name}'.*{sentence}"):
+        replayed("ManeuveringTarget", name, episodes=1, measurements=1)
+
+
+class InPython:
+    """An estimator that may be anything."""
+
+    kind = "estimator"
+
+    def start(self, initial, N):
+        return initial
+
+    def update(self, measurement, memory):
+        return memory.mean, memory.covariance, memory
+
+
+def test_an_estimator_in_python_is_refused():
+    with pytest.raises(ValueError, match=r"cannot be exported.*does not say that it is traceable"):
+        replayed("ManeuveringTarget", InPython, episodes=1, measurements=1)
+
+
+# --- C
+
+
+def writer_of(environment, name, scalar=c_source.DOUBLE, **options):
+    traced, given = replayed(environment, name, episodes=3, measurements=30, **options)
+    return Writer(str(name), traced, scalar, given.components), given
+
+
+def compiler():
+    found = shutil.which("cc")
+    if found is None:
+        pytest.skip("no C compiler here")
+    return found
+
+
+@pytest.mark.parametrize(
+    ("environment", "name", "scalar"),
+    [
+        ("ManeuveringTarget", "sage-husa", c_source.DOUBLE),
+        ("LooselyCoupledNavigation", "ppo", c_source.FLOAT),
+        ("UavAutopilot", "bptt", c_source.DOUBLE),
+    ],
+)
+def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
+    environment, name, scalar, tmp_path
+):
+    writer, given = writer_of(environment, name, scalar)
+    said = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
+    assert float(said.split()[2]) < (1e-4 if scalar is c_source.DOUBLE else 1e-2)
+    for file, text in files_of(writer, given).items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    table = subprocess.run(
+        [tmp_path / "run", "measurements.csv"], cwd=tmp_path, check=True, capture_output=True
+    )
+    (tmp_path / "estimates.csv").write_bytes(table.stdout)
+    estimates = pd.read_csv(tmp_path / "estimates.csv")
+    assert estimates[["track", "measurement"]].iloc[-1].tolist() == [3, 30]
+    own = estimates.filter(like="estimate_").to_numpy().reshape(3, 30, -1)
+    assert given.largest_difference(np.moveaxis(own, 0, -1)) < 1e-2
+    sigma = estimates.filter(like="sigma_").to_numpy().reshape(3, 30, -1)
+    np.testing.assert_allclose(np.moveaxis(sigma, 0, -1), given.sigma, rtol=1e-3)
+
+
+class OwnNetwork:
+    """Makes a network with random weights."""
+
+    kind = "policy"
+
+    def __init__(self, control, unit, output, activation, answers):
+        self.control, self.output, self.activation = control, output, activation
+        rng = np.random.default_rng(0)
+        fields, units = 14, 5
+        gates = {"gru": 3, "lstm": 4}.get(unit, 0) * units
+        shapes = {
+            "weight_0": (6, units if unit else fields),
+            "bias_0": (6,),
+            "weight_1": (answers, 6),
+            "bias_1": (answers,),
+        }
+        if unit:
+            shapes |= {f"{unit}_input_weight": (gates, fields), f"{unit}_input_bias": (gates,)}
+            shapes |= {f"{unit}_memory_weight": (gates, units), f"{unit}_memory_bias": (gates,)}
+        arrays = {name: 0.5 * rng.normal(size=shape) for name, shape in shapes.items()}
+        arrays |= {
+            "observation_mean": rng.normal(size=fields),
+            "observation_scale": rng.uniform(0.5, 2.0, fields),
+        }
+        self.arrays = {name: values.astype(np.float32) for name, values in arrays.items()}
+
+    def __call__(self, model):
+        fields = [field.name for field in model.fields][:14]
+        return LearnedPolicy(model, self.arrays, self.output, self.activation, fields)
+
+
+@pytest.mark.parametrize(
+    "own", [("gain", "lstm", "clip", "relu", 1), ("mode", "", "argmax", "tanh", 2)], ids=["lstm", "argmax"]
+)
+def test_networks_of_every_form_are_written(own):
+    writer, given = writer_of("ManeuveringTarget", OwnNetwork(*own))
+    assert given.largest_difference(run_filter(writer.traced, given)[:, mean_rows(writer.traced)]) < 1e-11
+    compile_and_test(writer, given, compiler(), (*FLAGS, *SANITIZERS))
+
+
+def test_a_table_of_another_form_is_refused(tmp_path):
+    writer, given = writer_of("ManeuveringTarget", "fixed-low")
+    for file, text in files_of(writer, given).items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    header, first, *_ = (tmp_path / "measurements.csv").read_text().splitlines()
+    for table, sentence in (
+        ("x,y\n1,2\n", "the first line must be initial_mean_0"),
+        (f"{header}\n1,2\n", "line 2 must have"),
+        (f"{header}\n{',' * header.count(',')}\n", "must begin a track"),
+        ("", "the first line must be"),
+    ):
+        done = subprocess.run([tmp_path / "run"], input=table, capture_output=True, text=True, check=False)
+        assert done.returncode == 2
+        assert sentence in done.stderr
+    windows = subprocess.run(
+        [tmp_path / "run"], input=f"{header}\r\n{first}\r\n\r\n", capture_output=True, text=True, check=True
+    )
+    assert len(windows.stdout.splitlines()) == 2
+
+
+def test_the_program_of_the_page_follows_a_track(tmp_path):
+    page = (Path(__file__).parent.parent / "docs" / "device.md").read_text(encoding="utf-8")
+    own = re.search(r"```c\n(.*?)```", page, re.DOTALL)[1]
+    writer, given = writer_of("ManeuveringTarget", "kalman-imm-tuned")
+    for file, text in {**files_of(writer, given), "own.c": own}.items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    words = [compiler(), *FLAGS, "-O0", "own.c", f"{writer.name}.c", "-lm", "-o", "own"]
+    subprocess.run(words, cwd=tmp_path, check=True)
+    plots = "".join(f"{6 * k},{40000 - 900 * k},{12000 + 120 * k}\n" for k in range(1, 20))
+    done = subprocess.run([tmp_path / "own"], input=plots, capture_output=True, text=True, check=True)
+    last = [float(x) for x in re.findall(r"-?[\d.]+(?= m)", done.stdout.splitlines()[-1])]
+    np.testing.assert_allclose(last, [40000 - 900 * 19, 12000 + 120 * 19, -150.0, 20.0], rtol=0.02)
+
+
+class Stranger:
+    """Filter */ #include "/etc/passwd"."""
+
+    kind, traceable = "estimator", True
+
+    def __init__(self, task):
+        self.task = task
+        self.H = task.constant([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+
+    def start(self, initial, N):
+        return {EVIL: initial.mean, "int": initial.covariance, "": 0.0 * initial.mean[0]}
+
+    def update(self, measurement, memory):
+        mean, covariance, _ = memory.values()
+        R = self.task.constant([[1.0, 0.0], [0.0, 1.0]])[:, :, None] * measurement.variance
+        there = measurement.available > 0.0
+        updated = kalman.update(mean, covariance, measurement.position, self.H, R)
+        after = Initial(
+            *(self.task.xp.where(there, a, b) for a, b in zip(updated[:2], (mean, covariance), strict=True))
+        )
+        count = memory[""] + 1.0
+        return (
+            after.mean + 0.0 * count,
+            after.covariance,
+            {EVIL: after.mean, "int": after.covariance, "": count},
+        )
+
+
+def test_a_strangers_words_cannot_get_into_the_text(tmp_path):
+    problem = problem_of("filtergym/ManeuveringTarget-v0")
+    traced, given = replay(problem, EVIL, Stranger, episodes=1, measurements=5)
+    named = given._replace(components=[(EVIL, EVIL), ("for", "*/"), ("", "\\"), ("1", "??/")])
+    writer = Writer(EVIL, traced, c_source.DOUBLE, named.components)
+    writer.about = c_source._about(problem, EVIL, Stranger, writer, "double", {"range_sigma": EVIL}, EVIL)
+    files = files_of(writer, named, [EVIL])
+    for file, text in files.items():
+        assert text.isascii()
+        assert re.fullmatch(r"\w+\.(h|c|csv)", file)
+        bare = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+        assert "passwd" not in re.sub(r'"[\w,]*"', "", bare).replace("etc_passwd", "")
+        assert set(re.findall(r'^\s*#\s*include\s+["<](\S+)[">]', bare, re.MULTILINE)) <= {
+            *files, "math.h", "float.h", "stdio.h", "stdlib.h", "string.h", "time.h",
+        }  # fmt: skip
+        assert bare.count('"') % 2 == 0
+        assert "system" not in re.sub(r"\w*_system_\w*", "", bare)
+    compile_and_test(writer, named, flags=(*FLAGS, "-O0"))
+
+
+# --- the export
+
+
+def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch):
+    monkeypatch.setattr(c_source.shutil, "which", lambda _: None)
+    problem = problem_of("filtergym/ManeuveringTarget-v0")
+    maker = find_competitor(problem, "kalman-imm")
+    folder = tmp_path / "new" / "imm"
+    figures = export_c(
+        problem, "kalman-imm", maker, folder, "float", keywords={"horizon": 20}, command="as typed"
+    )
+    assert figures.test == ""
+    assert figures.replaced == (1e-300,)
+    assert 1e-8 < figures.difference < 1e-3
+    text = (folder / "kalman_imm.h").read_text()
+    for words in (
+        "in float",
+        "as typed",
+        "horizon = 20",
+        "1e-300",
+        f"{figures.operations:,} operations",
+        "velocity_y [m/s]",
+    ):
+        assert words in text
+    assert "double" not in (folder / "kalman_imm.c").read_text()
+
+
+def test_files_of_a_filter_are_not_those_of_the_programs_around_it():
+    for name in ("test", "main", "rows", "vectors", "time", "int"):
+        assert f"{c_source.file_stem(name)}.h" not in {"rows.h", "vectors.h", "time.h"}
+        assert f"{c_source.file_stem(name)}.c" not in {"test.c", "main.c", "int.c"}
+
+
+def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setitem(c_source.WORST, "float", 1e-9)
+    problem = problem_of("filtergym/ManeuveringTarget-v0")
+    with pytest.raises(
+        ValueError, match=r"'fixed-low' in float is off by .*more than 1e-09.*export it in double"
+    ):
+        export_c(problem, "fixed-low", find_competitor(problem, "fixed-low"), tmp_path / "new", "float")
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_command_writes_a_filter(run, tmp_path):
+    code, said, errors = run(
+        "export", "filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "c", "--set", "horizon=12"
+    )
+    assert code == 0, errors
+    assert "fixed_low.h" in said
+    assert {path.name for path in (tmp_path / "fixed_low").iterdir()} == {
+        "fixed_low.h", "fixed_low.c", "rows.h", "main.c", "vectors.h", "test.c", "measurements.csv",
+    }  # fmt: skip
+
+
+def test_the_command_writes_python(run, tmp_path):
+    code, said, errors = run("export", "filtergym/ManeuveringTarget-v0", "fixed-low", "--to", "python")
+    assert code == 0, errors
+    assert "saved in fixed-low.py" in said
+    compile((tmp_path / "fixed-low.py").read_text(), "fixed-low.py", "exec")
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("filtergym/ManeuveringTarget-v0", "imm", "--to", "d"), "unknown form of an export 'd'"),
+        (("filtergym/ManeuveringTarget-v0", "--to", "c"), "name the filter"),
+        (("filtergym/ManeuveringTarget-v0", "imm"), "add --to c"),
+        (("runs", "--float"), "--float is not for --to safetensors of a run: add --to c"),
+        (
+            ("filtergym/ManeuveringTarget-v0", "imm", "--to", "python", "--float"),
+            "--float is not for --to python",
+        ),
+        (
+            ("filtergym/ManeuveringTarget-v0", "bptt", "--to", "onnx", "--set", "horizon=9"),
+            "--set is not for --to onnx",
+        ),
+        (("filtergym/ManeuveringTarget-v0", "nobody", "--to", "c"), "unknown policy 'nobody'"),
+        (("filtergym/ManeuveringTarget-v0", "imm", "--to", "c", "--set", "gians=1"), "gains"),
+    ],
+)
+def test_what_the_command_refuses(words, sentence, run, tmp_path):
+    code, _, errors = run("export", *words)
+    assert code == 2
+    assert sentence in errors
+    assert list(tmp_path.iterdir()) == []
