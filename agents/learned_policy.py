@@ -224,7 +224,7 @@ def _count_answers(arrays: Mapping[str, numpy.ndarray], width: int) -> int:
     return width
 
 
-class _Stored:
+class _StoredPolicyMaker:
     """Makes the policy of a file for a model; what an evaluation calls."""
 
     def __init__(self, path: Path) -> None:
@@ -258,13 +258,13 @@ class _Stored:
         return as_trained(model, network, *self.around)
 
 
-def load_policy(cls: type[Task], path: Path) -> _Stored | EstimatorMaker:
+def load_policy(cls: type[Task], path: Path) -> _StoredPolicyMaker | EstimatorMaker:
     """Load a learned policy or estimator of an environment from a file: what makes it.
 
     Raises:
         ValueError: if the file is not one, or it is of another environment.
     """
-    stored = _Stored(path)
+    stored = _StoredPolicyMaker(path)
     if stored.header["environment"] != cls.id:
         raise ValueError(f"{path} was trained on {stored.header['environment']}, not on {cls.id}")
     return EstimatorMaker(stored.control, stored) if stored.control in cls.trained_banks else stored

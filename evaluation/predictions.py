@@ -56,7 +56,7 @@ class Predictions:
         estimate = numpy.moveaxis(self.dataset["estimate"].sel(policy=name).values, -1, 0)
         before = numpy.roll(estimate, 1, axis=2)
         before[:, :, 0] = math.nan
-        predicted, measured = log_format.predict(before, _Measured(self.dataset, name))
+        predicted, measured = log_format.predict(before, _Measurements(self.dataset, name))
         found: numpy.ndarray = measured - predicted
         return found
 
@@ -81,7 +81,7 @@ class Predictions:
         return stretch_interval(chosen, numpy.stack([values, numpy.ones_like(values)], axis=-1), ratio)
 
 
-class _Measured:
+class _Measurements:
     """Measurements of a dataset by attribute, ``(..., episodes, time)``."""
 
     def __init__(self, dataset: xarray.Dataset, name: str) -> None:

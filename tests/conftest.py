@@ -30,7 +30,7 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 # Test after test goes through every control of every environment: more than a process usually remembers.
-compiled._remembered = functools.lru_cache(32)(compiled._trace)
+compiled._trace_once = functools.lru_cache(32)(compiled._trace)
 
 DECISIONS = 5
 """Length of the short episodes, in decisions."""

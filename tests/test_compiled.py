@@ -206,7 +206,7 @@ def test_environments_are_made_in_threads():
         env = gym.make_vec("filtergym/LooselyCoupledNavigation-v0", num_envs=8, backend="compiled", horizon=7)
         return flown(env, [np.zeros(env.action_space.shape)] * 5)
 
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
     with ThreadPoolExecutor(4) as pool:
         first, *others = pool.map(flight, range(4))
     for other in others:
@@ -259,7 +259,7 @@ class Outlandish(RadarWorld):
 )
 def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
     monkeypatch.setattr(MANEUVERING, "World", world)
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
     with pytest.warns(UserWarning, match=told) as said:
         env = gym.make(MANEUVERING.id, control="gain")
     assert len([w for w in said if "runs with NumPy" in str(w.message)]) == 1
@@ -268,7 +268,7 @@ def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
     assert np.isfinite(env.step(np.zeros(1))[1])
     with pytest.raises(ValueError, match="cannot be compiled"):
         gym.make(MANEUVERING.id, backend="compiled")
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
 
 
 def test_a_report_that_cannot_be_traced_is_made_with_numpy():

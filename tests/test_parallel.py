@@ -518,14 +518,14 @@ def test_training_seeds_are_scored_the_same(two, tmp_path):
 def test_units_of_a_reproduction_stand_in_their_places(two):
     from filtergym.evaluation.threads import one_thread
     from filtergym.papers.imm_alpha_beta.experiment import flown, squares_of
-    from filtergym.papers.reproduction import gathered, later
+    from filtergym.papers.reproduction import compute_units, later
 
     asked = {
         ("imm", 1): [later(flown, "imm", 8), 3.0],
         "few": (later(squares_of, "adaptive", 8, gains=(0.3, 0.8)),),
     }
     told = []
-    one, other = (gathered(asked, told.append, workers) for workers in (None, two))
+    one, other = (compute_units(asked, told.append, workers) for workers in (None, two))
     assert told == [1] * 4
     assert one["imm", 1][1] == 3.0
     with one_thread():  # as units run; two threads of BLAS may add up in another order
