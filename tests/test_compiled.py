@@ -67,15 +67,16 @@ def sampled(env, count):
 
 
 @pytest.mark.processors
-def test_whole_episodes_are_those_of_numpy(env_id, control):
-    keywords = {"control": control, **KEYWORDS.get(env_id, {})}
+def test_whole_episodes_are_those_of_numpy(env_id):
+    """Under one control; what each shows and is paid is compared with the stored trajectories."""
+    keywords = KEYWORDS.get(env_id, {})
     decisions = gym.make(env_id, **keywords).unwrapped.last_decision
     assert_same_episodes(env_id, 8, decisions + 2, **keywords)
 
 
 def test_every_scenario_is_that_of_numpy(env_id, short):
     for scenario in catalogue()[env_id].scenarios:
-        assert_same_episodes(env_id, 7, 8, scenario=scenario, **short)
+        assert_same_episodes(env_id, 7, 4, scenario=scenario, **short)
 
 
 def test_a_flight_without_manoeuvres_is_that_of_numpy():
@@ -83,14 +84,7 @@ def test_a_flight_without_manoeuvres_is_that_of_numpy():
 
 
 @pytest.mark.parametrize(
-    ("reward", "mode"),
-    [
-        ("cost", "NextStep"),
-        ("relative", "NextStep"),
-        ("relative", "SameStep"),
-        ("log-likelihood", "SameStep"),
-        ("cost-and-likelihood", "NextStep"),
-    ],
+    ("reward", "mode"), [("relative", "NextStep"), ("cost-and-likelihood", "SameStep")]
 )
 def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
     shortened = {"options": {"shortened_by": np.arange(7) % 3}}
@@ -322,10 +316,10 @@ def test_evaluation_and_tuning_say_the_same_on_both_backends():
     for name in ("error", "nees", "cost", "nis"):
         np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-9)
     id = "filtergym/ManeuveringTarget-v0"
-    tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["imm"]
+    tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
     found = [
-        tune(problem_of(id), "imm", Search(budget, episodes=8, backend=b)) for b in ("compiled", "numpy")
+        tune(problem_of(id), "fixed-best", Search(budget, episodes=8, backend=b)) for b in ("compiled", "numpy")
     ]
     assert found[0].values == pytest.approx(found[1].values, rel=1e-5)
     assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)

@@ -411,11 +411,12 @@ def assert_drawn_alike(env, copied):
     env.render()
     other = copied(env)
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-    np.testing.assert_array_equal(env.render(), other.render())
+    drawn = other.render()
+    np.testing.assert_array_equal(env.render(), drawn)
     # What was closed is drawn anew.
     env.close()
     again = copied(env)
-    np.testing.assert_array_equal(again.unwrapped.render(), other.render())
+    np.testing.assert_array_equal(again.unwrapped.render(), drawn)
     return again
 
 

@@ -31,7 +31,13 @@ def scenarios(id):
     return sorted({catalogue()[id].default_scenario, "paper"} & set(catalogue()[id].scenarios))
 
 
-CELLS = [(id, control, scenario) for id, control in CONTROLS for scenario in scenarios(id)]
+CELLS = [
+    (id, control, scenario)
+    for id, control in CONTROLS
+    for scenario in scenarios(id)
+    if scenario == catalogue()[id].default_scenario or control == catalogue()[id].controls[0]
+]
+"""Every control, and another scenario under the first one."""
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -210,7 +216,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
     largest = gradient.abs().max()
     assert largest > 0.0
     with torch.no_grad():
-        for _ in range(12):
+        for _ in range(3):
             where = tuple(int(generator.integers(n)) for n in actions.shape)
             moved = torch.zeros_like(actions)
             moved[where] = step
