@@ -15,7 +15,7 @@ from rounding import REPETITIONS, assert_same, move_roundings
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
 
-DECISIONS = 8
+DECISIONS = 5
 LANES = 5
 
 CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
@@ -93,8 +93,9 @@ def test_torch_equals_numpy(id, control, scenario, device):
 
 
 @pytest.mark.processors
-@pytest.mark.parametrize("reward", ["log-likelihood", "relative"])
-@pytest.mark.parametrize("id", list(catalogue()))
+@pytest.mark.parametrize(
+    ("id", "reward"), [(id, ("log-likelihood", "relative")[i % 2]) for i, id in enumerate(catalogue())]
+)
 def test_other_rewards_equal_numpy(id, reward):
     env, references = on_torch(id, reward=reward), on_numpy(id, reward=reward)
     env.action_space.seed(2)
