@@ -32,6 +32,7 @@ hypothesis.settings.load_profile("repeatable")
 # Test after test goes through every control of every environment: more than a process usually remembers.
 compiled._trace_once = functools.lru_cache(32)(compiled._trace)
 
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
     """Give whole files to the processes, and all that is of TightlyCoupledNavigation to one of them.

@@ -83,9 +83,7 @@ def test_a_flight_without_manoeuvres_is_that_of_numpy():
     assert_same_episodes(MANEUVERING.id, 7, 8, maneuver_count=(0, 0))
 
 
-@pytest.mark.parametrize(
-    ("reward", "mode"), [("relative", "NextStep"), ("cost-and-likelihood", "SameStep")]
-)
+@pytest.mark.parametrize(("reward", "mode"), [("relative", "NextStep"), ("cost-and-likelihood", "SameStep")])
 def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
     shortened = {"options": {"shortened_by": np.arange(7) % 3}}
     assert_same_episodes(env_id, 7, 12, shortened, reward=reward, autoreset_mode=mode, **short)
@@ -319,7 +317,8 @@ def test_evaluation_and_tuning_say_the_same_on_both_backends():
     tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
     found = [
-        tune(problem_of(id), "fixed-best", Search(budget, episodes=8, backend=b)) for b in ("compiled", "numpy")
+        tune(problem_of(id), "fixed-best", Search(budget, episodes=8, backend=b))
+        for b in ("compiled", "numpy")
     ]
     assert found[0].values == pytest.approx(found[1].values, rel=1e-5)
     assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)

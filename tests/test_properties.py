@@ -209,7 +209,9 @@ def bank_actions(space):
 def test_extreme_weights_leave_the_environments_finite(env_id, control, data, seed):
     if control == "gain":
         pytest.skip("gain steers no bank")
-    env = gym.make(env_id, control=control, disable_env_checker=True, detailed_info=True, **short_episodes(env_id))
+    env = gym.make(
+        env_id, control=control, disable_env_checker=True, detailed_info=True, **short_episodes(env_id)
+    )
     observation, _ = env.reset(seed=seed)
     truncated = False
     while not truncated:
