@@ -68,7 +68,6 @@ def test_an_evaluation_has_the_same_bits(two, monkeypatch):
     monkeypatch.setattr("filtergym.evaluation.bootstrap.BLOCK", 16)  # several pieces of few episodes
     one = evaluate(ENV, NAMES, episodes=40, drawn_episodes=1)
     assert one.identical(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
-    assert tidy_records(one) == tidy_records(evaluate(ENV, NAMES, episodes=40, drawn_episodes=1, workers=two))
 
 
 def test_summaries_tell_what_the_evaluation_does(env_id, short):

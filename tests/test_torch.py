@@ -113,7 +113,7 @@ def test_other_rewards_equal_numpy(id, reward):
     + [(id, MODES[i % len(MODES)]) for i, id in enumerate(list(catalogue())[1:])],
 )
 def test_autoreset_equals_numpy(id, mode):
-    last = 4
+    last = 2
     keywords = {"autoreset_mode": mode, "max_episode_steps": last, "detailed_info": True}
     env, references = on_torch(id, **keywords), on_numpy(id, **keywords)
     env.action_space.seed(3)
