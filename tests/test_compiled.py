@@ -126,18 +126,6 @@ def test_every_lane_is_the_single_environment(count):
                 np.testing.assert_array_equal(one[lane], other)
 
 
-def test_observations_stay_the_callers(env_id, short):
-    """What was handed out is not written over by later steps or resets."""
-    env = gym.make_vec(env_id, num_envs=70, backend="compiled", **short)
-    actions = sampled(env, 9)
-    kept = flown(env, actions)
-    copies = [part.copy() for part in kept]
-    env.step(actions[0])
-    env.reset(options={"reset_mask": np.arange(70) < 3})
-    for one, other in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
     """Looking at the state between steps changes nothing, and shows what the details say."""
     plain, looked_at = (
@@ -155,19 +143,6 @@ def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1] == other[1]
         assert np.isfinite(expected[0])
-
-
-def test_snapshots_are_gone_back_to(env_id, short):
-    env = gym.make_vec(env_id, num_envs=3, backend="compiled", **short).unwrapped
-    actions = sampled(env, 6)
-    flown(env, actions[:2])
-    snapshot = env.fleet.snapshot()
-    runs = []
-    for _ in range(2):
-        env.fleet.restore(snapshot)
-        runs.append([np.asarray(part) for action in actions[2:] for part in env.step(action)[:2]])
-    for one, other in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def _elsewhere(pipe):
