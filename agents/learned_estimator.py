@@ -16,7 +16,7 @@ from ..envs.task import Task
 from ..evaluation.competitors import Kind, Policy
 
 
-class Filtered(NamedTuple):
+class EstimatorMemory(NamedTuple):
     """Memory of a learned estimator."""
 
     bank: Any
@@ -37,11 +37,11 @@ class LearnedEstimator:
     def __init__(self, network: Policy) -> None:
         self.network, self.model = network, network.model
 
-    def start(self, initial: Any, N: int) -> Filtered:
+    def start(self, initial: Any, N: int) -> EstimatorMemory:
         """Start the filter where everyone starts."""
-        return Filtered(self.model.filter.start(initial), None)
+        return EstimatorMemory(self.model.filter.start(initial), None)
 
-    def update(self, measurement: Any, memory: Filtered) -> tuple[Array, Array, Filtered]:
+    def update(self, measurement: Any, memory: EstimatorMemory) -> tuple[Array, Array, EstimatorMemory]:
         """Predict, show the network what comes of it, and update as it answers."""
         bank: Any = self.model.filter
         measurement = map_arrays(numpy.nan_to_num, measurement)  # banks weigh values by their availability
@@ -50,7 +50,7 @@ class LearnedEstimator:
         action, network = self.network.predict(shown.T, memory.network)
         # In double: arithmetic with constants would stay in the network's precision.
         state = bank.act(state, measurement, action.T.astype(float))
-        return bank.mean(state), bank.covariance(state), Filtered(state, network)
+        return bank.mean(state), bank.covariance(state), EstimatorMemory(state, network)
 
 
 class EstimatorMaker:

@@ -32,7 +32,16 @@ from ..envs.parameters import check_integer
 from ..evaluation.code import code_digest
 from ..evaluation.files import writable_folder, write_text
 from .settings import merge_settings, read_section
-from .training_run import FILES, RunOptions, Session, TrainingRun, Validated, load_run, new_run, open_run
+from .training_run import (
+    FILES,
+    RunOptions,
+    Session,
+    TrainingRun,
+    ValidationEntry,
+    load_run,
+    new_run,
+    open_run,
+)
 
 VALIDATIONS = 5
 """Of each run, after which a trial may be pruned."""
@@ -253,7 +262,7 @@ def _costs(
         lowest, last_share = math.inf, -1
         behind = False
 
-        def report_validation(entry: Validated) -> bool:
+        def report_validation(entry: ValidationEntry) -> bool:
             nonlocal lowest, last_share, behind
             lowest = min(lowest, entry["cost"])
             # Rollouts differ in length, so trials are compared at the same share of their steps.

@@ -62,7 +62,7 @@ FILES = {
 VALIDATION_EPISODES = 512
 
 
-class Validated(TypedDict):
+class ValidationEntry(TypedDict):
     """One validation of a run."""
 
     steps: int
@@ -104,7 +104,7 @@ class TrainingRun:
     seconds: float = 0.0
     """Time spent, over all sessions."""
     versions: dict[str, str] = field(default_factory=dict)
-    validation: list[Validated] = field(default_factory=list)
+    validation: list[ValidationEntry] = field(default_factory=list)
     exported: dict[str, Any] | None = None
     """Cost of the exported agent on the first episodes of the validation split, to be checked anywhere."""
     interface: int = 1
@@ -137,7 +137,7 @@ class TrainingRun:
         return self.steps_done >= self.steps
 
     @property
-    def best(self) -> Validated | None:
+    def best(self) -> ValidationEntry | None:
         """The validation with the lowest cost."""
         return min(self.validation, key=lambda entry: entry["cost"], default=None)
 
@@ -614,11 +614,11 @@ class Validation:
         """Mean cost over the episodes and over every resample of them."""
         return self.bootstrap.means(self.episodes.costs(policy, control))
 
-    def score(self, policy: Any) -> Validated:
+    def score(self, policy: Any) -> ValidationEntry:
         """Return an entry of ``TrainingRun.validation``."""
         acts = self.run.algorithm not in ESTIMATORS
         cost = self._costs(policy, self.run.control if acts else None)
-        entry: Validated = {"steps": self.run.steps_done, "cost": float(cost[0])}
+        entry: ValidationEntry = {"steps": self.run.steps_done, "cost": float(cost[0])}
         if self.paper is None or self.paper_cost is None:
             return entry
         return {
@@ -629,7 +629,7 @@ class Validation:
         }
 
 
-def _curve(entry: Validated) -> dict[str, float]:
+def _curve(entry: ValidationEntry) -> dict[str, float]:
     """Numbers of a validation, as a log shows them over environment steps."""
     curve = {"validation/cost": entry["cost"]}
     if "paper_cost" in entry:
@@ -697,7 +697,7 @@ def _tell_nobody(news: Any) -> None:
     """Do nothing."""
 
 
-def _go_on(entry: Validated) -> bool:
+def _go_on(entry: ValidationEntry) -> bool:
     """Do not stop, whatever a validation says."""
     return False
 
@@ -722,7 +722,7 @@ class Session:
     """Told of all environment steps done so far."""
     report: Callable[[str], None] = _tell_nobody
     """Told of every validation in words."""
-    validated: Callable[[Validated], bool] = _go_on
+    validated: Callable[[ValidationEntry], bool] = _go_on
     """Told of every validation; returns whether to stop, with a checkpoint."""
 
     def __post_init__(self) -> None:

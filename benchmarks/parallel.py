@@ -124,7 +124,7 @@ def killing(words: list[str]) -> None:
                 nonlocal done
                 before, done = done / total, done + measurements
                 if before < 0.2 <= done / total:
-                    own = [id for id in tree(os.getpid()) if "ray::_done" in command_of(id)]
+                    own = [id for id in tree(os.getpid()) if "ray::_run_piece" in command_of(id)]
                     os.kill(own[0], signal.SIGKILL)
                     print("killed a worker", flush=True)
                 if before < 0.5 <= done / total:

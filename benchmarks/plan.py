@@ -51,7 +51,7 @@ from filtergym.envs.catalogue import catalogue, make_task, short_name
 from filtergym.evaluation.bootstrap import RESAMPLES, Bootstrap, block_of
 from filtergym.evaluation.curves import DISTRIBUTION_LIMIT
 from filtergym.evaluation.files import write_text
-from filtergym.evaluation.own_metrics import Gathered, OwnMetrics
+from filtergym.evaluation.own_metrics import MetricInputs, OwnMetrics
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.evaluation.store import Store, Work
 from filtergym.evaluation.summary import EvaluationRequest, Part, _resampling, combine_summaries, summarise
@@ -128,10 +128,10 @@ def competitor_units(asked: EvaluationRequest, two_sizes: bool) -> Units:
     """
     own, held = asked.metrics, [0]
 
-    def gather(run: Any) -> Gathered:
+    def gather(run: Any) -> MetricInputs:
         """Look at how much is held of the episodes."""
         held.append(run.nbytes)
-        return own.gather(run) if own is not None else Gathered()
+        return own.gather(run) if own is not None else MetricInputs()
 
     watched = OwnMetrics(gather, lambda *_: [])
 

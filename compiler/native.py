@@ -75,14 +75,16 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
     with LOCK:
         binding, (name, features) = llvm(), processor()
         library = library or fastest(features)
-        text = emit(program, lane_first, library)
-        version = ".".join(map(str, binding.llvm_version_info))
-        return _load(text, cache.key(text, name, features, version), library)
+        # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
+        known = cache.key(repr((program.steps, program.results, list(lane_first), library)), name, features)
+        if known not in _LIBRARIES:
+            text = emit(program, lane_first, library)
+            version = ".".join(map(str, binding.llvm_version_info))
+            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), library)
+        return _LIBRARIES[known]
 
 
 def _load(text: str, key: str, library: Library) -> Native:
-    if key in _LIBRARIES:
-        return _LIBRARIES[key]
     binding = llvm()
     for function in library.functions.values():
         binding.add_symbol(function.symbol, function.address)
@@ -97,8 +99,9 @@ def _load(text: str, key: str, library: Library) -> Native:
     engine.finalize_object()
     _ENGINES.append(engine)
     signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-    _LIBRARIES[key] = signature(engine.get_function_address("program"))
-    return _LIBRARIES[key]
+    function: Native = signature(engine.get_function_address("program"))
+    return function
 
 
 _LIBRARIES: dict[str, Native] = {}
+"""By program, processor and library: code that this process has loaded."""

@@ -26,7 +26,7 @@ from .flight_tables import FLIGHT_SUFFIXES, MOST_BYTES
 from .flights import TRAFFIC, Flights, files_of, flights_from, names_flights, read_flights
 from .plausibility import check_recording
 from .recorded_tables import TruthFile, read_columns
-from .recording import Recording, joined, recording_from
+from .recording import Recording, join_recordings, recording_from
 from .recording_files import is_recording, names_environment, read_netcdf
 from .task import Scenario, Task
 from .trajectory import Trajectory, trajectory_of
@@ -357,7 +357,7 @@ def read_recording(
     if len(files) == 1:
         return found[0]
     name = str(path) if not isinstance(path, list | tuple) else f"{len(files)} files"
-    return joined(found, name, left_out)
+    return join_recordings(found, name, left_out)
 
 
 def _read_recording(

@@ -285,7 +285,7 @@ class CompiledModel(Model):
             raise ImportError("backend 'compiled' needs llvmlite: pip install 'filtergym[fast]'")
         super().__init__(task, control)
         # Parameters that hold arrays are traced each time.
-        trace = _remembered if _hashes(task.parameters) else _trace
+        trace = _trace_once if _hashes(task.parameters) else _trace
         self.programs: Programs = trace(type(task), task.parameters, control, task.recording)
         self.threads = threads
         self._plain = Model(task, control)
@@ -368,7 +368,7 @@ def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Pr
     return programs
 
 
-_remembered = functools.lru_cache(PROGRAM_CACHE_SIZE)(_trace)
+_trace_once = functools.lru_cache(PROGRAM_CACHE_SIZE)(_trace)
 
 
 def _hashes(value: Any) -> bool:

@@ -358,7 +358,7 @@ def recording_from(fields: Mapping[str, Any]) -> Recording:
     return Recording(**arrays, **others)
 
 
-def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
+def join_recordings(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()) -> Recording:
     """Put recordings of one environment side by side; those with other parameters than the first are left out.
 
     Args:
@@ -366,7 +366,7 @@ def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()
         name: of the whole.
         notes: what is to be told of the reading, a line each; what is left out is added.
     """
-    first, told = recordings[0], list(notes)
+    first, lines = recordings[0], list(notes)
     kept: list[Recording] = []
     for one in recordings:
         differing = sorted(
@@ -375,25 +375,25 @@ def joined(recordings: Sequence[Recording], name: str, notes: Sequence[str] = ()
             if one.parameters.get(parameter) != first.parameters.get(parameter)
         )
         if differing:
-            told.append(
+            lines.append(
                 f"{one.name}: left out: {differing[0]} is {one.parameters.get(differing[0], 'the default')}, and of "
                 f"{first.name} {first.parameters.get(differing[0], 'the default')}"
             )
         else:
             kept.append(one)
-            told += [f"{one.name}: {note}" for note in one.notes]
+            lines += [f"{one.name}: {note}" for note in one.notes]
     untrue = [one.name for one in kept if one.truth is None]
     if untrue and len(untrue) < len(kept):
-        told.append(f"{untrue[0]}: has no truth, so nobody is judged")
+        lines.append(f"{untrue[0]}: has no truth, so nobody is judged")
     for key in sorted({key for one in kept for key in one.measurements}):
         lacking = [one.name for one in kept if key not in one.measurements]
         if lacking:
-            told.append(f"{lacking[0]}: has no {key}, which is left out of all")
+            lines.append(f"{lacking[0]}: has no {key}, which is left out of all")
     names = []
     for one in kept:
         alone = len(one.names) == 1
         names += [one.name] if alone else [f"{one.name}: {episode}" for episode in one.names]
-    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(told))
+    return side_by_side(kept, names=tuple(names), name=name, source=name, notes=tuple(lines))
 
 
 def side_by_side(recordings: Sequence[Recording], **fields: Any) -> Recording:

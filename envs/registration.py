@@ -83,7 +83,7 @@ def _check_contract(cls: Any) -> None:
         missing = [attribute for attribute in expected if not hasattr(model.task, attribute)]
         if missing:
             raise ValueError(
-                f"{_named(model)} needs {', '.join(missing)}: attributes of the class, or set by its set_up"
+                f"{_name_of(model)} needs {', '.join(missing)}: attributes of the class, or set by its set_up"
             )
         _check_action(model)
         _check_episodes(model)
@@ -95,7 +95,7 @@ def _check_action(model: Model) -> None:
     flat = isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.is_bounded()
     if not flat and not (isinstance(space, gymnasium.spaces.Discrete) and space.start == 0):
         raise ValueError(
-            f"{_named(model)} needs as action space a Box of shape (A,) with finite limits, or a Discrete from 0 on, "
+            f"{_name_of(model)} needs as action space a Box of shape (A,) with finite limits, or a Discrete from 0 on, "
             f"got {space}"
         )
     paper = model.task.paper_policy
@@ -105,7 +105,7 @@ def _check_action(model: Model) -> None:
         )
     if paper.control == model.control and flat and len(paper.action) != space.shape[0]:
         raise ValueError(
-            f"{_named(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
+            f"{_name_of(model)} takes actions of shape {space.shape}, and its paper_policy has {paper.action!r}"
         )
 
 
@@ -128,7 +128,7 @@ def _check_episodes(model: Model) -> None:
         return ask("measure", model.measure, episode, row)
 
     def ask(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-        with explain_errors(f"{_named(model)} fails in {what}"):
+        with explain_errors(f"{_name_of(model)} fails in {what}"):
             return function(*arguments)
 
     def check(what: str, values: Any, shape: tuple[int, ...] | None = None, finite: bool = True) -> None:
@@ -141,11 +141,11 @@ def _check_episodes(model: Model) -> None:
                 else type(values).__name__
             )
             raise ValueError(
-                f"{_named(model)}: {what} must be numbers of shape {expected}, {WIDTH} episodes on the last axis, "
+                f"{_name_of(model)}: {what} must be numbers of shape {expected}, {WIDTH} episodes on the last axis, "
                 f"got {got}"
             )
         if finite and not numpy.isfinite(values).all():
-            raise ValueError(f"{_named(model)}: {what} must be finite")
+            raise ValueError(f"{_name_of(model)}: {what} must be finite")
 
     uniforms, normals = random.random((noise.uniforms, WIDTH)), numpy.zeros((noise.initial_normals, WIDTH))
     start = ask("begin", model.begin, uniforms, normals)
@@ -156,7 +156,7 @@ def _check_episodes(model: Model) -> None:
         rows, fields = values.size // WIDTH, max(1, len(block.parts))
         if rows != fields:
             raise ValueError(
-                f"{_named(model)}: block {block.name!r} has {rows} rows for {fields} "
+                f"{_name_of(model)}: block {block.name!r} has {rows} rows for {fields} "
                 f"field{'s' if fields > 1 else ''}: name in its parts one ending for each row, got {block.parts!r}"
             )
     shown = ask("observe", model.observe, episode)
@@ -165,7 +165,7 @@ def _check_episodes(model: Model) -> None:
         values = ask(f"quantity {quantity.name!r}", model.reader(quantity.name), shown.T)
         if numpy.shape(values)[:1] != (WIDTH,) or numpy.ndim(values) != 2:
             raise ValueError(
-                f"{_named(model)}: quantity {quantity.name!r} must have shape ({WIDTH}, parts), {WIDTH} episodes on "
+                f"{_name_of(model)}: quantity {quantity.name!r} must have shape ({WIDTH}, parts), {WIDTH} episodes on "
                 f"the first axis, got {numpy.shape(values)}"
             )
     if isinstance(space, gymnasium.spaces.Box):
@@ -191,7 +191,7 @@ def _check_episodes(model: Model) -> None:
             first = numpy.shape(before.get(name, values))
             if first != values.shape:
                 raise ValueError(
-                    f"{_named(model)}: {name} must keep its shape, got {first} at the start of the track and "
+                    f"{_name_of(model)}: {name} must keep its shape, got {first} at the start of the track and "
                     f"{values.shape} after two measurements"
                 )
 
@@ -205,5 +205,5 @@ def _leaves(name: str, part: Any) -> Iterator[tuple[str, Any]]:
         yield name, part
 
 
-def _named(model: Model) -> str:
+def _name_of(model: Model) -> str:
     return f"{type(model.task).__name__} with control {model.control!r}"

@@ -331,7 +331,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
             _refuse_losses(piece, found["lost"][:count], step)
         series.add(found)
         if boxed:
-            series.add({"action": _applied(model.action_space, action, count)})
+            series.add({"action": _limit_actions(model.action_space, action, count)})
         tick(count)
     arrays = series.arrays()
     if kind in ("estimator", "smoother", "reference"):
@@ -341,7 +341,7 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     return arrays
 
 
-def _applied(box: Any, action: Any, count: int) -> numpy.ndarray:
+def _limit_actions(box: Any, action: Any, count: int) -> numpy.ndarray:
     """Return the actions that are applied, within the limits of their box, ``(A, count)``."""
     bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
     return bounded.reshape(count, -1).T

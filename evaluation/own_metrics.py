@@ -19,7 +19,7 @@ from .statistics import ALL, Key, Statistic
 Arrays = Mapping[str, numpy.ndarray]
 
 
-class Gathered(NamedTuple):
+class MetricInputs(NamedTuple):
     """What the metrics of an environment need of episodes of one competitor; empty where there is nothing to tell."""
 
     each: Arrays = {}  # noqa: RUF012  (nobody writes to it)
@@ -34,9 +34,9 @@ class Gathered(NamedTuple):
 class OwnMetrics:
     """The metrics of an environment."""
 
-    gather: Callable[[xarray.Dataset], Gathered]
+    gather: Callable[[xarray.Dataset], MetricInputs]
     """From one policy's part of some episodes of an evaluation to what is needed of each."""
-    measures: Callable[[Gathered, Bootstrap, xarray.Dataset], list[Measure]]
+    measures: Callable[[MetricInputs, Bootstrap, xarray.Dataset], list[Measure]]
     """From what was gathered of all episodes, and the evaluation, of whose variables none is needed."""
 
     def statistics(self, run: xarray.Dataset) -> Iterator[Statistic]:
@@ -63,7 +63,7 @@ class OwnMetrics:
             bootstrap: over them.
             evaluation: its part of the evaluation, of whose variables none is needed.
         """
-        gathered = Gathered(
-            *({key[1]: results[key] for key in results if key[0] == f} for f in Gathered._fields)
+        gathered = MetricInputs(
+            *({key[1]: results[key] for key in results if key[0] == f} for f in MetricInputs._fields)
         )
         return self.measures(gathered, bootstrap, evaluation)

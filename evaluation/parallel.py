@@ -84,7 +84,7 @@ def _end_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _done(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
+def _run_piece(index: int, packed: bytes, packed_item: bytes, place: Place) -> Outcome:
     """Do a piece of work, in a process that may know nothing yet."""
     if os.getcwd() != place.folder:
         with suppress(OSError):  # another machine may not have it
@@ -223,7 +223,7 @@ class Workers:
         calls = ((index, packed, cloudpickle.dumps(item), place) for index, item in enumerate(items))
         spread = {"ray": self._over_ray, "dask": self._over_dask}.get(self.engine, self._over_processes)
         shown_warnings: set[tuple[str, type[Warning]]] = set()
-        # Processes that begin do not search the working directory for libraries; :func:`_done` tells them the paths.
+        # Processes that begin search no libraries in the working directory; :func:`_run_piece` tells them the paths.
         with _environment(PYTHONSAFEPATH="1"):
             for outcome in spread(calls):
                 for text, category in outcome.warnings:
@@ -267,7 +267,7 @@ class Workers:
                 pool = joblib.Parallel(
                     self.jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None
                 )
-                yield from pool(joblib.delayed(_done)(*call) for call in calls)
+                yield from pool(joblib.delayed(_run_piece)(*call) for call in calls)
         except TerminatedWorkerError as error:
             raise ValueError(
                 "a process that did part of the work was ended from outside, perhaps because memory ran out: take "
@@ -302,7 +302,7 @@ class Workers:
             except (OSError, ValueError) as error:
                 raise ValueError(f"there is no cluster of Dask at {self.cluster}: {error}") from error
             self._ended.callback(self._dask.close)
-        futures = [self._dask.submit(_done, *call, pure=False) for call in calls]
+        futures = [self._dask.submit(_run_piece, *call, pure=False) for call in calls]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -324,7 +324,7 @@ class Workers:
             except (ConnectionError, OSError, ValueError, RuntimeError) as error:
                 raise ValueError(f"there is no cluster of Ray at {self.cluster}: {error}") from error
             self._ended.callback(ray.shutdown)
-        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_done)
+        remote = ray.remote(num_cpus=1, max_retries=RETRIES)(_run_piece)
         pending: list[Any] = []
         try:
             yield from self._from_ray(ray, remote, calls, pending)

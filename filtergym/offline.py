@@ -36,7 +36,7 @@ OF_THE_FACE = ("reward", "dtype")
 """Keywords of ``gymnasium.make`` that are no parameters of the task, and change what an agent is given."""
 
 
-class Written(NamedTuple):
+class DatasetSummary(NamedTuple):
     """A data set that was written."""
 
     name: str
@@ -79,7 +79,7 @@ def write_datasets(
     *,
     trust: bool = False,
     **keywords: Any,
-) -> list[Written]:
+) -> list[DatasetSummary]:
     """Write the episodes of policies as Minari data sets, one for each policy.
 
     A policy acts in its own control and with its own parameters, which its environment is made with. One that has no
@@ -136,7 +136,7 @@ class DatasetPlan(NamedTuple):
 
     def write(
         self, folder: Path | None = None, namespace: str | None = None, progress: Progress | None = None
-    ) -> list[Written]:
+    ) -> list[DatasetSummary]:
         """Write the data sets; arguments, result and refusals as of :func:`write_datasets`."""
         from minari.storage import get_dataset_path
 
@@ -151,7 +151,7 @@ class DatasetPlan(NamedTuple):
                     space.unlink()
         return written
 
-    def _write_one(self, i: int, name: str, progress: Progress) -> tuple[Written, Any]:
+    def _write_one(self, i: int, name: str, progress: Progress) -> tuple[DatasetSummary, Any]:
         """Write the data set of a policy; return what was written, and the data set."""
         policy, stepping, id = self.names[i], self.policies[i], self.experiment.task.id
         made_with = {**stepping.keywords, **self.of_the_face}
@@ -167,7 +167,7 @@ class DatasetPlan(NamedTuple):
             else:
                 dataset.update_dataset_from_buffer(_buffers(part))
         mean = sum(returns) / len(returns)
-        return Written(name, policy, made_with, len(returns), dataset.total_steps, mean), dataset
+        return DatasetSummary(name, policy, made_with, len(returns), dataset.total_steps, mean), dataset
 
     def _description(self, policy: str, control: str) -> str:
         asked = self.experiment
@@ -306,7 +306,7 @@ def _create(name: str, episodes: Sequence[Transitions], env: Any, policy: str, a
         )
 
 
-def _tell_scores(written: Sequence[Written], stored: Sequence[Any]) -> None:
+def _tell_scores(written: Sequence[DatasetSummary], stored: Sequence[Any]) -> None:
     """Say which mean return is 0 and which is 1 in ``minari.get_normalized_score``, where both are known."""
     for entry, dataset in zip(written, stored, strict=True):
         alike = [other for other in written if other.environment == entry.environment]

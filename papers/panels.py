@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ..evaluation.looks import LINES, styles
-from .measured import band
+from .quantities import band
 
 
 def panels(rows: int, columns: int, size: tuple[float, float], **keywords: Any) -> tuple[Any, Any]:

@@ -1,12 +1,12 @@
 """What a reproduction of a paper consists of.
 
 A folder beside this file is a paper: ``experiment`` (what is run and computed), ``claims`` (a table of statements,
-which :func:`judged` reads, and the quantities that they rest on; tables of results), ``figures``. Its ``__init__.py``
-defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and ``reproduce(progress,
-episodes=None, workers=None) -> Reproduction``, which runs the experiment (``episodes`` Monte Carlo runs instead of its
-own number; units of work :func:`gathered` from workers) and judges the claims.
+which :func:`judge_claims` reads, and the quantities that they rest on; tables of results), ``figures``. Its
+``__init__.py`` defines ``TITLE``, ``STEPS`` (units of work that it reports to the progress callback) and
+``reproduce(progress, episodes=None, workers=None) -> Reproduction``, which runs the experiment (``episodes`` Monte
+Carlo runs instead of its own number; units of work :func:`compute_units` from workers) and judges the claims.
 
-There is one kind of uncertainty, a bootstrap over the runs: :mod:`.measured`. Pictures: :mod:`.panels`.
+There is one kind of uncertainty, a bootstrap over the runs: :mod:`.quantities`. Pictures: :mod:`.panels`.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -39,11 +39,11 @@ class Later(NamedTuple):
 
 
 def later(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-    """Leave a unit of work to :func:`gathered`, which puts its result in this place."""
+    """Leave a unit of work to :func:`compute_units`, which puts its result in this place."""
     return Later(function, arguments, keywords)
 
 
-def gathered(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
+def compute_units(results: Any, progress: Progress, workers: Workers | None = None) -> Any:
     """Do what was left for later, and return the same structure with what came out of it.
 
     Args:
@@ -115,7 +115,7 @@ class Statement(NamedTuple):
     """How the measured quantities, attributes of the argument, judge it."""
 
 
-def judged(table: Iterable[Statement], quantities: Mapping[str, Any]) -> list[Claim]:
+def judge_claims(table: Iterable[Statement], quantities: Mapping[str, Any]) -> list[Claim]:
     """Return the claims of a table with the quantities that were measured, by their names in the table."""
     found = SimpleNamespace(**quantities)
     return [

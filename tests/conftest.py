@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from filtergym.envs import compiled
 from filtergym.envs.catalogue import catalogue
-from models import make_model
+from models import short_episodes
 
 from filtergym.__main__ import main
 from filtergym.commands.terminal import console, output_width
@@ -30,10 +30,7 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 # Test after test goes through every control of every environment: more than a process usually remembers.
-compiled._remembered = functools.lru_cache(32)(compiled._trace)
-
-DECISIONS = 5
-"""Length of the short episodes, in decisions."""
+compiled._trace_once = functools.lru_cache(32)(compiled._trace)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -97,8 +94,7 @@ def paired_controls(cases):
 @pytest.fixture
 def short(env_id):
     """Keywords that make episodes of an environment five decisions long, of two measurements at most."""
-    interval = min(make_model(env_id).task.decision_interval, 2)
-    return {"horizon": DECISIONS * interval, "decision_interval": interval}
+    return short_episodes(env_id)
 
 
 @pytest.fixture

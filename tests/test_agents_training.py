@@ -388,110 +388,100 @@ def test_recurrent_agent_that_cannot_be_exported():
         network_arrays(recurrent_agent("gain", layers=2)[0], "recurrent-ppo")
 
 
-class TestCommandLine:
-    def run(self, monkeypatch, capsys, *words):
-        from filtergym.__main__ import main
+def test_train_resume_export_evaluate(command, tmp_path):
+    train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run", "--no-compare")
+    assert command(*train, "--steps", 400)[0] == 0
+    code, _, errors = command(*train, "--steps", 400)
+    assert code == 2
+    assert "add --resume" in errors
+    assert command(*train, "--steps", 800, "--resume")[0] == 0
+    run = load_run(tmp_path / "run")
+    assert run.steps_done == 800
+    assert run.command.startswith("filtergym train " + ID)
+    assert run.versions["torch"] == torch.__version__
+    assert run.seconds > 0.0
+    assert command("export", tmp_path / "run")[0] == 0
+    file = tmp_path / "run" / "agent.safetensors"
+    words = ("evaluate", ID, "--policy", file, "--policy", "imm", "--episodes", 4)
+    assert command(*words)[0] == 0
 
-        monkeypatch.setattr("sys.argv", ["filtergym", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return ended.value.code, capsys.readouterr()
 
-    def test_train_resume_export_evaluate(self, monkeypatch, capsys, tmp_path):
-        train = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "run", "--no-compare")
-        assert self.run(monkeypatch, capsys, *train, "--steps", 400)[0] == 0
-        code, printed = self.run(monkeypatch, capsys, *train, "--steps", 400)
-        assert code == 2
-        assert "add --resume" in printed.err
-        assert self.run(monkeypatch, capsys, *train, "--steps", 800, "--resume")[0] == 0
-        run = load_run(tmp_path / "run")
-        assert run.steps_done == 800
-        assert run.command.startswith("filtergym train " + ID)
-        assert run.versions["torch"] == torch.__version__
-        assert run.seconds > 0.0
-        assert self.run(monkeypatch, capsys, "export", tmp_path / "run")[0] == 0
-        file = tmp_path / "run" / "agent.safetensors"
-        words = ("evaluate", ID, "--policy", file, "--policy", "imm", "--episodes", 4)
-        assert self.run(monkeypatch, capsys, *words)[0] == 0
+def test_seeds_are_trained_skipped_and_resumed(command, tmp_path):
+    words = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "x", "--no-compare")
 
-    def test_seeds_are_trained_skipped_and_resumed(self, monkeypatch, capsys, tmp_path):
-        words = ("train", ID, "--algo", "bptt", "--envs", 2, "--out", tmp_path / "x", "--no-compare")
+    assert command(*words, "--seeds", "0,2", "--steps", 400)[0] == 0
+    assert command(*words, "--seeds", "2", "--steps", 800)[0] == 0
+    before = contents(tmp_path / "x-2")
+    code, output, _ = command(*words, "--seeds", "0-2", "--steps", 800)
+    assert code == 0
+    assert "x-2 is finished: 800 steps" in output
+    assert contents(tmp_path / "x-2") == before
+    runs = {path.name: load_run(path) for path in tmp_path.iterdir()}
+    found = {name: (run.seed, run.steps_done, run.validation[0]["steps"]) for name, run in runs.items()}
+    # Validated every 20 of 400 steps before the first 400 are done, or every 40 of 800: an update is 200 steps.
+    assert found == {"x-0": (0, 800, 200), "x-1": (1, 800, 200), "x-2": (2, 800, 200)}
+    for more, message in (
+        (("--seeds", "0", "--seed", 3), "--seeds names every seed"),
+        (("--seeds", "2-1"), "--seeds needs whole numbers such as 0-4"),
+        (("--seeds", "0-3", "--envs", 3), "holds a run with envs 2, not 3"),
+    ):
+        code, _, errors = command(*words, *more)
+        assert (code, errors.count("\n")) == (2, 1)
+        assert message in errors
+    assert not (tmp_path / "x-3").exists()
 
-        def train(*more):
-            return self.run(monkeypatch, capsys, *words, *more)
 
-        assert train("--seeds", "0,2", "--steps", 400)[0] == 0
-        assert train("--seeds", "2", "--steps", 800)[0] == 0
-        before = contents(tmp_path / "x-2")
-        code, printed = train("--seeds", "0-2", "--steps", 800)
-        assert code == 0
-        assert "x-2 is finished: 800 steps" in printed.out
-        assert contents(tmp_path / "x-2") == before
-        runs = {path.name: load_run(path) for path in tmp_path.iterdir()}
-        found = {name: (run.seed, run.steps_done, run.validation[0]["steps"]) for name, run in runs.items()}
-        # Validated every 20 of 400 steps before the first 400 are done, or every 40 of 800: an update is 200 steps.
-        assert found == {"x-0": (0, 800, 200), "x-1": (1, 800, 200), "x-2": (2, 800, 200)}
-        for more, message in (
-            (("--seeds", "0", "--seed", 3), "--seeds names every seed"),
-            (("--seeds", "2-1"), "--seeds needs whole numbers such as 0-4"),
-            (("--seeds", "0-3", "--envs", 3), "holds a run with envs 2, not 3"),
-        ):
-            code, printed = train(*more)
-            assert (code, printed.err.count("\n")) == (2, 1)
-            assert message in printed.err
-        assert not (tmp_path / "x-3").exists()
+def test_seeds_of_stable_baselines3_are_resumed_with_trust(command, tmp_path):
+    folder = tmp_path / "x-0"
+    train(small_run("ppo", 240), folder)
+    settings = [f"--set=algo.{name}={json.dumps(value)}" for name, value in SMALL["ppo"].items()]
+    words = (
+        "train",
+        ID,
+        "--control",
+        "gain",
+        "--envs",
+        4,
+        *settings,
+        "--out",
+        tmp_path / "x",
+        "--no-compare",
+    )
+    code, _, errors = command(*words, "--seeds", "0-1", "--steps", 480)
+    assert code == 2
+    assert "add --trust" in errors
+    assert not (tmp_path / "x-1" / "run.json").exists()
+    assert command(*words, "--seeds", "0", "--steps", 480, "--trust")[0] == 0
+    assert load_run(folder).steps_done == 480
 
-    def test_seeds_of_stable_baselines3_are_resumed_with_trust(self, monkeypatch, capsys, tmp_path):
-        folder = tmp_path / "x-0"
-        train(small_run("ppo", 240), folder)
-        settings = [f"--set=algo.{name}={json.dumps(value)}" for name, value in SMALL["ppo"].items()]
-        words = (
-            "train",
-            ID,
-            "--control",
-            "gain",
-            "--envs",
-            4,
-            *settings,
-            "--out",
-            tmp_path / "x",
-            "--no-compare",
-        )
-        code, printed = self.run(monkeypatch, capsys, *words, "--seeds", "0-1", "--steps", 480)
-        assert code == 2
-        assert "add --trust" in printed.err
-        assert not (tmp_path / "x-1" / "run.json").exists()
-        assert self.run(monkeypatch, capsys, *words, "--seeds", "0", "--steps", 480, "--trust")[0] == 0
-        assert load_run(folder).steps_done == 480
 
-    def test_wrong_input_writes_nothing(self, monkeypatch, capsys, tmp_path):
-        code, printed = self.run(
-            monkeypatch, capsys, "train", ID, "--scenario", "paper", "--out", tmp_path / "x"
-        )
-        assert code == 2
-        assert printed.err.startswith("Error: scenario 'paper' is held out")
-        assert self.run(monkeypatch, capsys, "export", tmp_path / "x")[0] == 2
-        assert not (tmp_path / "x").exists()
+def test_wrong_input_writes_nothing(command, tmp_path):
+    code, _, errors = command("train", ID, "--scenario", "paper", "--out", tmp_path / "x")
+    assert code == 2
+    assert errors.startswith("Error: scenario 'paper' is held out")
+    assert command("export", tmp_path / "x")[0] == 2
+    assert not (tmp_path / "x").exists()
 
-    def test_export_refuses_what_is_no_file_for_it(self, monkeypatch, capsys, tmp_path):
-        best = tmp_path / "best"
-        best.mkdir()
-        shipped = PRETRAINED / "ManeuveringTarget-v0" / "bptt"
-        shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")
-        shutil.copyfile(shipped.with_suffix(".json"), tmp_path / "run.json")
-        (tmp_path / "folder.safetensors").mkdir()
-        (tmp_path / "taken.json").mkdir()
-        before = contents(tmp_path)
-        for out, expected in (
-            (".", "must end in .safetensors"),
-            (tmp_path / "a.json", "must end in .safetensors"),
-            (tmp_path / "folder.safetensors", "a folder or device has that name"),
-            (tmp_path / "taken.safetensors", "a folder or device has that name"),
-        ):
-            code, printed = self.run(monkeypatch, capsys, "export", tmp_path, "--out", out)
-            assert (code, printed.err.count("\n")) == (2, 1)
-            assert expected in printed.err
-            assert contents(tmp_path) == before
+
+def test_export_refuses_what_is_no_file_for_it(command, tmp_path):
+    best = tmp_path / "best"
+    best.mkdir()
+    shipped = PRETRAINED / "ManeuveringTarget-v0" / "bptt"
+    shutil.copyfile(shipped.with_suffix(".safetensors"), best / "agent.safetensors")
+    shutil.copyfile(shipped.with_suffix(".json"), tmp_path / "run.json")
+    (tmp_path / "folder.safetensors").mkdir()
+    (tmp_path / "taken.json").mkdir()
+    before = contents(tmp_path)
+    for out, expected in (
+        (".", "must end in .safetensors"),
+        (tmp_path / "a.json", "must end in .safetensors"),
+        (tmp_path / "folder.safetensors", "a folder or device has that name"),
+        (tmp_path / "taken.safetensors", "a folder or device has that name"),
+    ):
+        code, _, errors = command("export", tmp_path, "--out", out)
+        assert (code, errors.count("\n")) == (2, 1)
+        assert expected in errors
+        assert contents(tmp_path) == before
 
 
 def test_the_best_agent_is_that_of_the_lowest_validation_cost(tmp_path):

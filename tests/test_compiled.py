@@ -67,31 +67,23 @@ def sampled(env, count):
 
 
 @pytest.mark.processors
-def test_whole_episodes_are_those_of_numpy(env_id, control):
-    keywords = {"control": control, **KEYWORDS.get(env_id, {})}
+def test_whole_episodes_are_those_of_numpy(env_id):
+    """Under one control; what each shows and is paid is compared with the stored trajectories."""
+    keywords = KEYWORDS.get(env_id, {})
     decisions = gym.make(env_id, **keywords).unwrapped.last_decision
     assert_same_episodes(env_id, 8, decisions + 2, **keywords)
 
 
 def test_every_scenario_is_that_of_numpy(env_id, short):
     for scenario in catalogue()[env_id].scenarios:
-        assert_same_episodes(env_id, 7, 8, scenario=scenario, **short)
+        assert_same_episodes(env_id, 7, 4, scenario=scenario, **short)
 
 
 def test_a_flight_without_manoeuvres_is_that_of_numpy():
     assert_same_episodes(MANEUVERING.id, 7, 8, maneuver_count=(0, 0))
 
 
-@pytest.mark.parametrize(
-    ("reward", "mode"),
-    [
-        ("cost", "NextStep"),
-        ("relative", "NextStep"),
-        ("relative", "SameStep"),
-        ("log-likelihood", "SameStep"),
-        ("cost-and-likelihood", "NextStep"),
-    ],
-)
+@pytest.mark.parametrize(("reward", "mode"), [("relative", "NextStep"), ("cost-and-likelihood", "SameStep")])
 def test_rewards_and_autoreset_are_those_of_numpy(env_id, short, reward, mode):
     shortened = {"options": {"shortened_by": np.arange(7) % 3}}
     assert_same_episodes(env_id, 7, 12, shortened, reward=reward, autoreset_mode=mode, **short)
@@ -134,18 +126,6 @@ def test_every_lane_is_the_single_environment(count):
                 np.testing.assert_array_equal(one[lane], other)
 
 
-def test_observations_stay_the_callers(env_id, short):
-    """What was handed out is not written over by later steps or resets."""
-    env = gym.make_vec(env_id, num_envs=70, backend="compiled", **short)
-    actions = sampled(env, 9)
-    kept = flown(env, actions)
-    copies = [part.copy() for part in kept]
-    env.step(actions[0])
-    env.reset(options={"reset_mask": np.arange(70) < 3})
-    for one, other in zip(kept, copies, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
     """Looking at the state between steps changes nothing, and shows what the details say."""
     plain, looked_at = (
@@ -163,19 +143,6 @@ def test_open_and_closed_loop_agree(env_id, control, short, random_actions):
         np.testing.assert_array_equal(one[0], other[0])
         assert one[1] == other[1]
         assert np.isfinite(expected[0])
-
-
-def test_snapshots_are_gone_back_to(env_id, short):
-    env = gym.make_vec(env_id, num_envs=3, backend="compiled", **short).unwrapped
-    actions = sampled(env, 6)
-    flown(env, actions[:2])
-    snapshot = env.fleet.snapshot()
-    runs = []
-    for _ in range(2):
-        env.fleet.restore(snapshot)
-        runs.append([np.asarray(part) for action in actions[2:] for part in env.step(action)[:2]])
-    for one, other in zip(*runs, strict=True):
-        np.testing.assert_array_equal(one, other)
 
 
 def _elsewhere(pipe):
@@ -206,7 +173,7 @@ def test_environments_are_made_in_threads():
         env = gym.make_vec("filtergym/LooselyCoupledNavigation-v0", num_envs=8, backend="compiled", horizon=7)
         return flown(env, [np.zeros(env.action_space.shape)] * 5)
 
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
     with ThreadPoolExecutor(4) as pool:
         first, *others = pool.map(flight, range(4))
     for other in others:
@@ -259,7 +226,7 @@ class Outlandish(RadarWorld):
 )
 def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
     monkeypatch.setattr(MANEUVERING, "World", world)
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
     with pytest.warns(UserWarning, match=told) as said:
         env = gym.make(MANEUVERING.id, control="gain")
     assert len([w for w in said if "runs with NumPy" in str(w.message)]) == 1
@@ -268,7 +235,7 @@ def test_what_cannot_be_traced_runs_with_numpy(monkeypatch, world, told):
     assert np.isfinite(env.step(np.zeros(1))[1])
     with pytest.raises(ValueError, match="cannot be compiled"):
         gym.make(MANEUVERING.id, backend="compiled")
-    compiled_tasks._remembered.cache_clear()
+    compiled_tasks._trace_once.cache_clear()
 
 
 def test_a_report_that_cannot_be_traced_is_made_with_numpy():
@@ -322,10 +289,11 @@ def test_evaluation_and_tuning_say_the_same_on_both_backends():
     for name in ("error", "nees", "cost", "nis"):
         np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-9)
     id = "filtergym/ManeuveringTarget-v0"
-    tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["imm"]
+    tunable = filtergym.baselines.catalogue.baselines_of(id).tunable["fixed-best"]
     budget = 2 * (4 * len(tunable.limits) + 4) * 8 * 100
     found = [
-        tune(problem_of(id), "imm", Search(budget, episodes=8, backend=b)) for b in ("compiled", "numpy")
+        tune(problem_of(id), "fixed-best", Search(budget, episodes=8, backend=b))
+        for b in ("compiled", "numpy")
     ]
     assert found[0].values == pytest.approx(found[1].values, rel=1e-5)
     assert found[0].cost == pytest.approx(found[1].cost, rel=1e-9)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from filtergym.compiler import cache, emission, functions, namespace
+from filtergym.compiler import cache, emission, functions, namespace, native
 from filtergym.compiler.emission import emit
 from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.library import portable
@@ -84,6 +84,7 @@ def computed(recipe, arrays, part, constants=()):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(emission, "PART", part)
+        patch.setattr(native, "_LIBRARIES", {})  # made of parts of another length
         patch.setattr(functions, "FEWEST", 8)
         compiled = Function(function, Graph())
         for width in WIDTHS:

@@ -128,8 +128,9 @@ def test_registration_twice_changes_nothing(env_id):
     assert gym.spec(env_id) is before
 
 
-def test_spawned_processes(env_id, short, random_actions):
+def test_spawned_processes(random_actions):
     # A process that starts afresh imports the package by the name before the colon.
+    env_id, short = "filtergym/ManeuveringTarget-v0", {"horizon": 5}
     make = partial(gym.make, f"filtergym:{env_id}", disable_env_checker=True, **short)
     there = gym.vector.AsyncVectorEnv([make], context="spawn")
     here = gym.make_vec(env_id, num_envs=1, **short)
@@ -246,17 +247,16 @@ def test_papers_policy_equals_the_papers_constant_action(env_id):
 
 
 def test_policies_answer_one_and_many(env_id, short):
-    interval = short["decision_interval"]
     known = baselines_of(env_id)
     for name, maker in known.policies.items():
-        model = make_model(env_id, getattr(maker, "control", None))
+        model = make_model(env_id, getattr(maker, "control", None), **short)
         policy = maker(model)
         assert policy.control == model.control
-        env = TaskVectorEnv(env_id, 3, control=model.control, decision_interval=interval)
+        env = TaskVectorEnv(env_id, 3, control=model.control, **short)
         observation, _ = env.reset(seed=0)
         state, single_state = None, None
         start = np.ones(3, dtype=bool)
-        for _ in range(12):
+        for _ in range(5):
             action, state = policy.predict(observation, state, start, deterministic=True)
             first = observation[0]
             single, single_state = policy.predict(first, single_state, start[:1], deterministic=True)

@@ -116,22 +116,22 @@ def random_policy(env, dtype):
 
 @pytest.mark.processors
 @pytest.mark.parametrize(
-    ("name", "control", "keywords"),
+    ("name", "control", "keywords", "largest"),
     [
-        ("ManeuveringTarget", "gain", {}),
-        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}),
-        ("ManeuveringTarget", "kalman-net", {}),
-        ("LooselyCoupledNavigation", "kalman-net", {}),
-        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}),
-        ("UavAutopilot", "gain", {}),
-        ("RadarEsmTracking", "evidence", {}),
+        ("ManeuveringTarget", "gain", {}, None),
+        ("ManeuveringTarget", "gain", {}, 0.01),
+        ("ManeuveringTarget", "weights", {"decision_interval": 3, "horizon": 99}, None),
+        ("ManeuveringTarget", "kalman-net", {}, 0.01),
+        ("LooselyCoupledNavigation", "kalman-net", {}, None),
+        ("LooselyCoupledNavigation", "gain", {"decision_interval": 2}, 0.01),
+        ("UavAutopilot", "gain", {}, None),
+        ("RadarEsmTracking", "evidence", {}, 0.01),
         # Of ten measurements each; its gradient takes longest to compile.
         pytest.param(
-            "TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, marks=pytest.mark.slow
+            "TightlyCoupledNavigation", "evidence", {"max_episode_steps": 2}, None, marks=pytest.mark.slow
         ),
     ],
 )
-@pytest.mark.parametrize("largest", [None, 0.01])
 def test_gradients_of_a_policy_are_those_of_torch(name, control, keywords, largest):
     def descended(backend, repetition=None):
         """Mean cost, and gradients by window: of three decisions, three and one; five episodes in eight lanes."""

@@ -349,8 +349,8 @@ def test_a_vector_draws_what_single_environments_draw(mode, monkeypatch):
     vector.close()
 
 
-@pytest.mark.parametrize("backend", ["compiled", "torch"])
-def test_drawing_leaves_the_episodes_of_every_environment_alone(env_id, short, backend, monkeypatch):
+def test_drawing_leaves_the_episodes_of_every_environment_alone(env_id, short, monkeypatch):
+    backend = "torch" if env_id == ID else "compiled"
     pytest.importorskip(NEEDED[backend])
     monkeypatch.setattr(rendering, "MAX_PICTURES", 1)
     plain, drawn = (
@@ -411,11 +411,12 @@ def assert_drawn_alike(env, copied):
     env.render()
     other = copied(env)
     assert_all_equal(continued(env, actions[2:]), continued(other, actions[2:]))
-    np.testing.assert_array_equal(env.render(), other.render())
+    drawn = other.render()
+    np.testing.assert_array_equal(env.render(), drawn)
     # What was closed is drawn anew.
     env.close()
     again = copied(env)
-    np.testing.assert_array_equal(again.unwrapped.render(), other.render())
+    np.testing.assert_array_equal(again.unwrapped.render(), drawn)
     return again
 
 

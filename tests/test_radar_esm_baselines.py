@@ -11,7 +11,7 @@ from filtergym.baselines.radar_esm_tracking.metrics import time_quantile
 from filtergym.baselines.radar_esm_tracking.references import Ideal
 from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import start_lanes
-from filtergym.papers.measured import Measured
+from filtergym.papers.quantities import Quantity
 from filtergym.papers.radar_esm_class_fusion import claims, experiment
 from models import make_model
 
@@ -518,7 +518,7 @@ def test_reproduction_has_a_verdict_for_every_claim_and_four_figures(reproduced)
 
 def test_recognition_verdict():
     def measured(value, error):
-        return Measured(value, value - 2 * error, value + 2 * error, error)
+        return Quantity(value, value - 2 * error, value + 2 * error, error)
 
     good, bad = measured(0.999, 0.001), measured(0.9, 0.001)
     assert claims.recognition_verdict([good, good, good]) == "reproduced"

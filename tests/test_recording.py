@@ -16,7 +16,6 @@ import xarray
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.compiled import AVAILABLE
-from filtergym.envs.flight_tables import MOST_ROWS
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.envs.recorded_tables import Columns
@@ -62,8 +61,10 @@ def blind(recording):
 # --- replay
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("env", OPEN)
+@pytest.mark.parametrize(
+    ("env", "backend"),
+    [(env, backend) for env in OPEN for backend in BACKENDS if (env, backend) != (TIGHT, "compiled")],
+)
 def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
     keywords = OPEN[env]
     control = make_model(env).task.controls[-1]
@@ -699,10 +700,10 @@ def test_a_table_does_not_say_of_which_environment_it_is(tmp_path):
         read_recording(tmp_path / "nothing.nc")
 
 
-def test_ten_million_rows_are_refused_early(tmp_path):
-    row = b"1,2,3\n"
-    (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + row * (MOST_ROWS + 2))
-    with pytest.raises(ValueError, match="more than 1,000,000 rows"):
+def test_too_many_rows_are_refused_early(tmp_path, monkeypatch):
+    monkeypatch.setattr("filtergym.envs.flight_tables.MOST_ROWS", 1000)
+    (tmp_path / "long.csv").write_bytes(b"time,x,y\n" + b"1,2,3\n" * 1002)
+    with pytest.raises(ValueError, match="more than 1,000 rows"):
         read_recording(tmp_path / "long.csv", TARGET)
     with pytest.raises(ValueError, match="more than the 50,000,000 numbers that a recording may hold"):
         record(TARGET, episodes=10, horizon=10_000_000)

@@ -7,7 +7,7 @@ import numpy
 import pytest
 from filtergym.evaluation.print_layout import save
 from filtergym.papers.grid import Grid
-from filtergym.papers.measured import Measured, mean, means, measured
+from filtergym.papers.quantities import Quantity, mean, means, quantity
 from filtergym.papers.reproduction import (
     Claim,
     Reproduction,
@@ -114,13 +114,13 @@ def test_a_figure_that_fails_halfway_leaves_the_one_before(tmp_path: Path) -> No
 
 
 def test_a_measured_number_is_written_with_its_standard_error() -> None:
-    number = Measured(0.07512, 0.069, 0.081, 0.0031)
+    number = Quantity(0.07512, 0.069, 0.081, 0.0031)
     assert f"{number}" == "0.0751 ± 0.0031"
     assert f"{number:.3f}" == "0.075 ± 0.003"
     assert f"{number:+.1%}" == "+7.5 ± 0.3 %"
     # Without error digits to go by, an exact number is written alone, and a certain one with four.
-    assert f"{Measured(45.9, 45.9, 45.9):.2f}" == "45.90"
-    assert f"{Measured(1.0, 1.0, 1.0, 0.0)}" == "1.0000 ± 0.0000"
+    assert f"{Quantity(45.9, 45.9, 45.9):.2f}" == "45.90"
+    assert f"{Quantity(1.0, 1.0, 1.0, 0.0)}" == "1.0000 ± 0.0000"
 
 
 def test_uncertainty_comes_from_the_runs_and_is_paired() -> None:
@@ -131,9 +131,9 @@ def test_uncertainty_comes_from_the_runs_and_is_paired() -> None:
     assert found.error == pytest.approx(values.std() / 20.0, rel=0.13)
     assert found.low == pytest.approx(found.value - 1.96 * found.error, abs=0.3 * found.error)
     assert found.high == pytest.approx(found.value + 1.96 * found.error, abs=0.3 * found.error)
-    ratio = measured(means(3.0 * values) / means(values))
+    ratio = quantity(means(3.0 * values) / means(values))
     assert (ratio.value, ratio.error) == pytest.approx((3.0, 0.0), abs=1e-14)
-    assert numpy.isnan(measured(numpy.array([2.0])).error)
+    assert numpy.isnan(quantity(numpy.array([2.0])).error)
 
 
 def test_a_claim_of_several_parts() -> None:

@@ -31,7 +31,7 @@ CASES = {
     "filtergym/UavAutopilot-v0": {"scenario": "paper-noise", "horizon": 60},
     "filtergym/RadarEsmTracking-v0": {},
     "filtergym/LooselyCoupledNavigation-v0": {"duration": 0.5},
-    "filtergym/TightlyCoupledNavigation-v0": {"horizon": 20},
+    "filtergym/TightlyCoupledNavigation-v0": {"horizon": 10, "decision_interval": 2},
 }
 ENGINES = [
     "scipy",

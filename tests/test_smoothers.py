@@ -307,7 +307,8 @@ class HoldsToTheEnd(Holds):
     ],
 )
 def test_every_open_loop_takes_a_smoother(env, keywords):
-    found = evaluate(env, {"smoother": HoldsToTheEnd, "estimator": Holds}, episodes=9, **keywords)
+    makers = {"smoother": HoldsToTheEnd, "estimator": Holds}
+    found = evaluate(env, makers, episodes=9, backend="numpy", **keywords)
     for name in ("error", "cost", "nees", "lost"):
         one, other = (found[name].sel(policy=policy).values for policy in ("smoother", "estimator"))
         np.testing.assert_array_equal(one, other)

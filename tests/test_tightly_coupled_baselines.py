@@ -15,8 +15,8 @@ from filtergym.evaluation.bootstrap import Bootstrap
 from filtergym.evaluation.rollout import rollout
 from filtergym.evaluation.seeds import episode_seeds
 from filtergym.filters import gnss_ins
-from filtergym.papers.measured import Measured
 from filtergym.papers.multi_hypothesis_ins_gnss import claims, experiment
+from filtergym.papers.quantities import Quantity
 from models import make_model
 from naive import dense
 
@@ -483,14 +483,14 @@ def test_reproduction_makes_claims_tables_and_figures(monkeypatch, tmp_path):
 
 
 def near(value):
-    return Measured(value, value - 0.01, value + 0.01)
+    return Quantity(value, value - 0.01, value + 0.01)
 
 
 def test_verdicts_follow_the_data():
     assert claims.matched_verdict([near(1.03)], [near(1.0)]) == "reproduced"
     assert claims.matched_verdict([near(1.03)], [near(1.6)]) == "reproduced in part"
     assert claims.matched_verdict([near(1.2)], [near(1.0)]) == "not reproduced"
-    exact = Measured(1.0, 1.0, 1.0)
+    exact = Quantity(1.0, 1.0, 1.0)
     assert claims.weight_verdict([0.0, 0.06, 0.3], [exact, near(1.03), near(1.3)]) == "reproduced"
     assert claims.weight_verdict([0.0, 0.3, 0.06], [exact, near(1.03), near(1.3)]) == "reproduced in part"
     assert claims.weight_verdict([0.0, 0.06], [near(1.05), near(1.06)]) == "reproduced in part"

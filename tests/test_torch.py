@@ -15,7 +15,7 @@ from rounding import REPETITIONS, assert_same, move_roundings
 torch = pytest.importorskip("torch")
 xp = pytest.importorskip("array_api_compat.torch")
 
-DECISIONS = 8
+DECISIONS = 5
 LANES = 5
 
 CONTROLS = [(id, control) for id, task in catalogue().items() for control in task.controls]
@@ -31,7 +31,13 @@ def scenarios(id):
     return sorted({catalogue()[id].default_scenario, "paper"} & set(catalogue()[id].scenarios))
 
 
-CELLS = [(id, control, scenario) for id, control in CONTROLS for scenario in scenarios(id)]
+CELLS = [
+    (id, control, scenario)
+    for id, control in CONTROLS
+    for scenario in scenarios(id)
+    if scenario == catalogue()[id].default_scenario or control == catalogue()[id].controls[0]
+]
+"""Every control, and another scenario under the first one."""
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
@@ -87,8 +93,9 @@ def test_torch_equals_numpy(id, control, scenario, device):
 
 
 @pytest.mark.processors
-@pytest.mark.parametrize("reward", ["log-likelihood", "relative"])
-@pytest.mark.parametrize("id", list(catalogue()))
+@pytest.mark.parametrize(
+    ("id", "reward"), [(id, ("log-likelihood", "relative")[i % 2]) for i, id in enumerate(catalogue())]
+)
 def test_other_rewards_equal_numpy(id, reward):
     env, references = on_torch(id, reward=reward), on_numpy(id, reward=reward)
     env.action_space.seed(2)
@@ -106,7 +113,7 @@ def test_other_rewards_equal_numpy(id, reward):
     + [(id, MODES[i % len(MODES)]) for i, id in enumerate(list(catalogue())[1:])],
 )
 def test_autoreset_equals_numpy(id, mode):
-    last = 4
+    last = 2
     keywords = {"autoreset_mode": mode, "max_episode_steps": last, "detailed_info": True}
     env, references = on_torch(id, **keywords), on_numpy(id, **keywords)
     env.action_space.seed(3)
@@ -210,7 +217,7 @@ def test_gradient_of_an_episode_equals_finite_differences(id, control):
     largest = gradient.abs().max()
     assert largest > 0.0
     with torch.no_grad():
-        for _ in range(12):
+        for _ in range(3):
             where = tuple(int(generator.integers(n)) for n in actions.shape)
             moved = torch.zeros_like(actions)
             moved[where] = step

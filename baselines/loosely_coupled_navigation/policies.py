@@ -16,7 +16,7 @@ from ...evaluation.bootstrap import Bootstrap, ratio
 from ...evaluation.competitors import ConstantPolicy, Policy, RandomPolicy
 from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, sums_of_present
-from ...evaluation.own_metrics import Gathered, OwnMetrics
+from ...evaluation.own_metrics import MetricInputs, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
 from ..measurement_noise import MeasurementNoise, select_memory
 from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
@@ -260,10 +260,10 @@ def recovery_times(
     return numpy.where(counted, time.astype(float), math.nan)
 
 
-def _recoveries(run: xarray.Dataset) -> Gathered:
+def _recoveries(run: xarray.Dataset) -> MetricInputs:
     """Seconds to recover of each episode, and whether it does not within a second; NaN without an outage."""
     if "available" not in run or numpy.isnan(run["available"].values).all():
-        return Gathered()
+        return MetricInputs()
     cls = task_class(run.attrs["environment"])
     scenario = cls.scenarios.get(run.attrs["scenario"])
     parameters = cls.Parameters(**{**(scenario.parameters if scenario else {}), **keywords_of(run)})
@@ -273,10 +273,12 @@ def _recoveries(run: xarray.Dataset) -> Gathered:
     times = recovery_times(size, run["available"].values, limit, held, longest)
     lost = numpy.where(numpy.isnan(times), math.nan, times == longest)
     found = {"time": times * parameters.sampling_interval, "lost": lost}
-    return Gathered({}, {name: sums_of_present(values[:, None]) for name, values in found.items()})
+    return MetricInputs({}, {name: sums_of_present(values[:, None]) for name, values in found.items()})
 
 
-def _outage_measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def _outage_measures(
+    gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset
+) -> list[Measure]:
     """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
     means = gathered.averaged
     if not means or not means["time"][0, 1]:

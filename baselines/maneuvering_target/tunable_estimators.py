@@ -11,7 +11,7 @@ from ..table import tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
 
-Applied = tuple[dict[str, Any], Callable[[Any], Any]]
+Settings = tuple[dict[str, Any], Callable[[Any], Any]]
 
 ESTIMATORS = {
     "kalman-imm": KalmanInteractingMultipleModel,
@@ -23,13 +23,13 @@ ESTIMATORS = {
 }
 
 
-def _imm(values: Mapping[str, float]) -> Applied:
+def _imm(values: Mapping[str, float]) -> Settings:
     accelerations = values["acceleration_quiet"], values["acceleration_noisy"]
     stay = values["stay_quiet"], values["stay_noisy"]
     return {}, lambda task: KalmanInteractingMultipleModel(task, accelerations, stay)
 
 
-def _imm_turn(values: Mapping[str, float]) -> Applied:
+def _imm_turn(values: Mapping[str, float]) -> Settings:
     v = without_logarithms(values)
     modes = ("quiet", "noisy", "turn")
     return {}, lambda task: KalmanTurnInteractingMultipleModel(

@@ -9,7 +9,7 @@ import xarray
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import slices_of, windows_of
 from ...evaluation.metrics import Measure, squared_errors
-from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
+from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
 
 CLASSES = 3
 SURE = 0.9
@@ -72,10 +72,10 @@ def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
-def gather(run: xarray.Dataset) -> Gathered:
+def gather(run: xarray.Dataset) -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound, and of a reference no beliefs."""
     if _missing(run, "true_class"):
-        return Gathered()
+        return MetricInputs()
     true_class = run["true_class"].values.astype(int)
     of_class, slices = _of_class(true_class), slices_of(run).values()
     squares, by_class, variance = [], [], []
@@ -88,11 +88,13 @@ def gather(run: xarray.Dataset) -> Gathered:
         variance.append([run[f"variance_{component}"].values[:, times].mean(axis=1) for times in slices])
     share = [[of_class[:, times, s].mean(axis=1) for s in range(CLASSES)] for times in slices]
     means = {"squares": squares, "squares_by_class": by_class, "variance": variance, "share": share}
-    found = Gathered({}, {key: numpy.moveaxis(numpy.array(values), -1, 0) for key, values in means.items()})
+    found = MetricInputs(
+        {}, {key: numpy.moveaxis(numpy.array(values), -1, 0) for key, values in means.items()}
+    )
     return found if _missing(run, "mode_probability") else _with_beliefs(run, found)
 
 
-def _with_beliefs(run: xarray.Dataset, errors: Gathered) -> Gathered:
+def _with_beliefs(run: xarray.Dataset, errors: MetricInputs) -> MetricInputs:
     true_class, seconds = run["true_class"].values.astype(int), run["seconds"].values[0]
     true_probability, probability = run["true_class_probability"].values, run["mode_probability"].values
     moments = _moments(seconds)
@@ -116,7 +118,7 @@ def _with_beliefs(run: xarray.Dataset, errors: Gathered) -> Gathered:
         "change": change,
         "recognised_again": numpy.where(waited < len(seconds), waited - change, len(seconds)),
     }
-    return Gathered(each, {**errors.averaged, **averaged}, {"seconds": seconds})
+    return MetricInputs(each, {**errors.averaged, **averaged}, {"seconds": seconds})
 
 
 def _moments(seconds: numpy.ndarray) -> dict[float, int]:
@@ -129,7 +131,7 @@ def _last(seconds: numpy.ndarray) -> int:
     return _moments(seconds).get(TIMES[-1], len(seconds) - 1)
 
 
-def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Errors by true class, recognition of the class, and calibration, of one policy.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
@@ -164,7 +166,7 @@ def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> 
             yield Measure("calibration_ratio", component, window, bootstrap.interval(ratio), "1")
 
 
-def _beliefs(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
+def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
     each, means, seconds = gathered.each, gathered.averaged, gathered.common["seconds"]
     for k, moment in enumerate(_moments(seconds)):
         shares, probability = means["share_at_moments"][:, k], means["probability"][:, k]

@@ -11,7 +11,7 @@ from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import groups_of
 from ...evaluation.metrics import Measure, squared_errors
-from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
+from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
 
 UNITS = {"position": "m", "velocity": "m/s"}
 LASTING = 10
@@ -72,10 +72,10 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
     return found
 
 
-def gather(run: xarray.Dataset) -> Gathered:
+def gather(run: xarray.Dataset) -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound."""
     if str(run["kind"].values) == "bound":
-        return Gathered()
+        return MetricInputs()
     true_mode = run["true_mode"].values.astype(int)
     there = [true_mode == i for i in range(len(HYPOTHESES))]
     squares = [
@@ -88,7 +88,7 @@ def gather(run: xarray.Dataset) -> Gathered:
         "cost": run["cost"].values.mean(axis=1),
     }
     if "mode_probability" not in run or numpy.isnan(run["mode_probability"].values).all():
-        return Gathered(each)
+        return MetricInputs(each)
     step = float(run["seconds"].values[0, 0])
     moved = true_mode != true_mode[:, :1]
     begin = numpy.where(moved.any(axis=1), moved.argmax(axis=1), 0)
@@ -99,7 +99,7 @@ def gather(run: xarray.Dataset) -> Gathered:
         "lost": numpy.asarray(outside.any(axis=1)),
         "lost_after": (outside.argmax(axis=1) - begin + 1.0) * step,
     }
-    return Gathered(each)
+    return MetricInputs(each)
 
 
 def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> numpy.ndarray:
@@ -115,7 +115,7 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
     return found
 
 
-def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,

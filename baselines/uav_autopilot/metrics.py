@@ -11,7 +11,7 @@ from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import keywords_of, slices_of
 from ...evaluation.metrics import Measure
-from ...evaluation.own_metrics import Arrays, Gathered, OwnMetrics
+from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
 from .theory import stationary
 
 LOST_SIGMAS = 100.0
@@ -25,10 +25,10 @@ def _task(evaluation: xarray.Dataset) -> UavAutopilot:
     return task
 
 
-def gather(run: xarray.Dataset) -> Gathered:
+def gather(run: xarray.Dataset) -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound, and of a reference no innovation."""
     if "output" not in run or numpy.isnan(run["output"].values).all():
-        return Gathered()
+        return MetricInputs()
     task, slices = _task(run), slices_of(run)
     output, control = run["output"].values, run["control_signal"].values
     tracking = output - run["command"].values
@@ -51,7 +51,7 @@ def gather(run: xarray.Dataset) -> Gathered:
     if "innovation" in run and not numpy.isnan(run["innovation"].values).all():
         parts = [_lag_products(run["innovation"].values[:, times]) for times in slices.values()]
         each["innovation"] = numpy.stack(parts, axis=1)
-    return Gathered(each, averaged)
+    return MetricInputs(each, averaged)
 
 
 def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
@@ -61,7 +61,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
     return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
 
 
-def measures(gathered: Gathered, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
     """Measures of the loop, beside those of the estimate.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each
@@ -120,7 +120,7 @@ def _exact(value: float) -> Estimate:
 
 
 def _step_response(
-    task: UavAutopilot, gathered: Gathered, windows: Mapping[str, slice], unit: str, bootstrap: Bootstrap
+    task: UavAutopilot, gathered: MetricInputs, windows: Mapping[str, slice], unit: str, bootstrap: Bootstrap
 ) -> list[Measure]:
     p = task.parameters
     T, first = p.value("sampling_interval"), p.step_time - 1

@@ -21,7 +21,7 @@ STRONGEST = 4
 DIFFERENCE = "relative_cost_difference"
 
 
-class Benchmarked(NamedTuple):
+class BenchmarkRecords(NamedTuple):
     """What a benchmark has measured in one environment."""
 
     problem: Problem
@@ -36,7 +36,7 @@ class Comparison(NamedTuple):
     figure: Any
 
 
-def read_benchmark(paths: Sequence[Path]) -> list[Benchmarked]:
+def read_benchmark(paths: Sequence[Path]) -> list[BenchmarkRecords]:
     """Read the records of benchmarks, those of an environment together.
 
     Raises:
@@ -49,7 +49,7 @@ def read_benchmark(paths: Sequence[Path]) -> list[Benchmarked]:
         found.setdefault(result.environment, []).extend(result.records)
     if not found:
         raise ValueError(f"{paths[0]} holds no records: make them by filtergym benchmark --full")
-    return [Benchmarked(problem_of(id), records) for id, records in found.items()]
+    return [BenchmarkRecords(problem_of(id), records) for id, records in found.items()]
 
 
 def check_known(record: Record) -> None:
@@ -97,7 +97,7 @@ def _cells(name: str, records: Sequence[Record]) -> list[str]:
     ]
 
 
-def summary(found: Sequence[Benchmarked]) -> Grid:
+def summary(found: Sequence[BenchmarkRecords]) -> Grid:
     """Best of every origin on the training distribution of each environment, and the reference."""
     rows = []
     for problem, every in found:
@@ -125,7 +125,7 @@ def summary(found: Sequence[Benchmarked]) -> Grid:
     return Grid("The best of every origin on the training distribution", [*header, "share of the room"], rows)
 
 
-def harm(found: Sequence[Benchmarked]) -> Grid:
+def harm(found: Sequence[BenchmarkRecords]) -> Grid:
     """The scenario in which each learned agent stands worst against the paper's algorithm."""
     rows = []
     for problem, records in found:
@@ -149,7 +149,7 @@ def harm(found: Sequence[Benchmarked]) -> Grid:
     return Grid("Where learned agents do worst", [*header, "wins, %", "ANEES", last], rows)
 
 
-def compare_environment(measured: Benchmarked, width: int = 2) -> Comparison:
+def compare_environment(measured: BenchmarkRecords, width: int = 2) -> Comparison:
     """Tables of one environment: cost against the paper's algorithm, and the physical error.
 
     Args:
@@ -257,7 +257,7 @@ def _two_lines(record: Record | None, scale: float) -> str:
     return "0" if shown == "0 [0, 0]" else shown.replace(" [", "<br>[")
 
 
-def overview_markdown(found: Sequence[Benchmarked]) -> str:
+def overview_markdown(found: Sequence[BenchmarkRecords]) -> str:
     """Both tables over all environments."""
     lines: list[str] = []
     for grid in (summary(found), harm(found)):
@@ -265,7 +265,9 @@ def overview_markdown(found: Sequence[Benchmarked]) -> str:
     return "\n".join(lines[:-1])
 
 
-def comparison_markdown(comparison: Comparison, measured: Benchmarked, picture: str, command: str) -> str:
+def comparison_markdown(
+    comparison: Comparison, measured: BenchmarkRecords, picture: str, command: str
+) -> str:
     """Tables and picture of one environment, with the command that made the records."""
     records, paper = measured.records, measured.problem.paper
     first = records[0]

@@ -17,7 +17,7 @@ def check_markers(path: Path, names: Iterable[str]) -> None:
     Raises:
         ValueError: if the page does not exist or lacks one of the markers.
     """
-    inserted(path, dict.fromkeys(names, ""))
+    insert_texts(path, dict.fromkeys(names, ""))
 
 
 def markers_of(path: Path) -> list[str]:
@@ -25,7 +25,7 @@ def markers_of(path: Path) -> list[str]:
     return re.findall(r"<!-- (.+?): begin -->", _read(path))
 
 
-def inserted(path: Path, texts: Mapping[str, str]) -> str:
+def insert_texts(path: Path, texts: Mapping[str, str]) -> str:
     """Return a page with each text between ``<!-- NAME: begin -->`` and ``<!-- NAME: end -->``.
 
     Raises:
@@ -44,4 +44,4 @@ def inserted(path: Path, texts: Mapping[str, str]) -> str:
 
 def insert_between_markers(path: Path, texts: Mapping[str, str]) -> None:
     """Put each text between its markers on a page, all of them at once."""
-    write_text(path, inserted(path, texts))
+    write_text(path, insert_texts(path, texts))

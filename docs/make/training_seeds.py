@@ -244,7 +244,7 @@ def episode_means(
     store = store or Store()
     found: dict[str, PolicyMeans | None] = {}
     missing: list[tuple[str, EvaluationRequest, Work | None]] = []
-    for name, (asked, work) in _asked_of(study, scenario).items():
+    for name, (asked, work) in _requests_of(study, scenario).items():
         found[name] = store.read(work, PolicyMeans)
         if found[name] is None:
             missing.append((name, asked, work))
@@ -268,7 +268,7 @@ def episode_means(
     return EpisodeMeans(cost, squares, units)
 
 
-def _asked_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
+def _requests_of(study: Study, scenario: str | None) -> dict[str, tuple[EvaluationRequest, Work | None]]:
     """Return every run and opponent over the episodes of a scenario, and the piece of work that its means are."""
     problem = study.problem
     makers = {member.name: find_competitor(problem, str(member.agent), study.trust) for member in study.runs}

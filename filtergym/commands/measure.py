@@ -318,21 +318,21 @@ def benchmark(
     options = BenchmarkOptions(full, seed, environment or (), split, backend, threads, command_line())
     with Workers(jobs, cluster) as workers, progress_bar() as bar:
 
-        def started(total: int) -> Progress:
+        def add_line(total: int) -> Progress:
             line = bar.add_task("benchmark", total=total)
             return lambda done: bar.update(line, advance=done)
 
-        def finished(result: Result) -> None:
+        def print_details(result: Result) -> None:
             if details:
                 print_results(result.records, result.knows)
 
-        def drawn(cell: Cell, curves: xarray.Dataset) -> None:
+        def save_figures(cell: Cell, curves: xarray.Dataset) -> None:
             learned = pretrained_agents(cell.environment)
             for name, figure in evaluation_figures(curves, columns, learned=learned) if formats else ():
                 for suffix in formats:
                     save(figure, out / f"{cell.name}.{name}.{suffix}")
 
-        results = run_benchmark(out, options, Callbacks(started, finished, drawn), workers)
+        results = run_benchmark(out, options, Callbacks(add_line, print_details, save_figures), workers)
     tables = [headline_table(results)]
     tables += [table for r in results for table in results_tables(r.records, r.knows, console.width)]
     with whole_files(out) as waiting:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ..baselines.tuned_values import Tuned
 from ..evaluation.competitors import NOT_CAUSAL, RANKED
-from ..offline import Written
+from ..offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
 """Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
@@ -306,7 +306,7 @@ def tuning_table(outcome: Tuned, start: Mapping[str, float]) -> Table:
     return table
 
 
-def datasets_table(written: Iterable[Written]) -> Table:
+def datasets_table(written: Iterable[DatasetSummary]) -> Table:
     """Return what data sets hold; those whose environments are the same can be combined."""
     table = Table("data set", "environment")
     for title in ("episodes", "steps", "mean return"):

@@ -10,7 +10,7 @@ Reading: it gives no criterion for the best gains; here the RMS over the whole r
 """
 
 from ...evaluation.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judged
+from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 
 TITLE = "Tracking a manoeuvring target with an IMM algorithm over two alpha-beta filters"
@@ -22,5 +22,5 @@ def reproduce(
 ) -> Reproduction:
     """Run the paper's experiment and judge its claims; at most ``GRID_EPISODES`` runs in a cell of the grids."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
-    shown = judged(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
+    shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..grid import Grid
-from ..measured import Measured, mean, means, measured
+from ..quantities import Quantity, mean, means, quantity
 from ..reproduction import Statement, Verdict, verdict_of
 from .experiment import (
     BOX_PAIRS,
@@ -35,7 +35,7 @@ LOW_BOX, HIGH_BOX = (0.3, 0.45), (0.7, 0.95)
 SPAN = f"{SECTION[0]}-{SECTION[1]}"
 
 
-def improvement_verdict(section: Sequence[Measured], parts: Sequence[Measured]) -> Verdict:
+def improvement_verdict(section: Sequence[Quantity], parts: Sequence[Quantity]) -> Verdict:
     """Verdict on "substantially smaller error on the manoeuvre section".
 
     Args:
@@ -55,10 +55,10 @@ def improvement_verdict(section: Sequence[Measured], parts: Sequence[Measured]) 
 class Comparison(NamedTuple):
     """Relative changes of the IMM's RMS against a comparator's, position then velocity."""
 
-    section: Sequence[Measured]
-    turn: Sequence[Measured]
-    recovery: Sequence[Measured]
-    peak: Sequence[Measured]
+    section: Sequence[Quantity]
+    turn: Sequence[Quantity]
+    recovery: Sequence[Quantity]
+    peak: Sequence[Quantity]
 
     @property
     def verdict(self) -> Verdict:
@@ -73,12 +73,12 @@ class Comparison(NamedTuple):
         )
 
 
-def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Measured]:
+def changes(ours: numpy.ndarray, theirs: numpy.ndarray, window: tuple[int, int] | None) -> Sequence[Quantity]:
     """``ours / theirs - 1`` of the RMS over a window (None: the peak) of position and velocity."""
-    return [measured(change) for change in (rms(ours, window) / rms(theirs, window) - 1.0).T]
+    return [quantity(change) for change in (rms(ours, window) / rms(theirs, window) - 1.0).T]
 
 
-def compared(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
+def compare_sections(ours: numpy.ndarray, theirs: numpy.ndarray, later: int = 0) -> Comparison:
     """Compare the IMM with an adaptive filter on the manoeuvre section, moved by ``later`` scans."""
     windows = (SECTION, WINDOWS["turn"], WINDOWS["recovery"])
     section, turn, recovery = (
@@ -95,7 +95,7 @@ def comparisons(r: Results) -> dict[str, Comparison]:
     experiments |= {"polar measurements": r.polar, f"turn {LATER} scan later": r.later}
     experiments |= {name: canonical | {"imm": squares} for name, squares in r.readings.items()}
     return {
-        f"{name}; against {NAMES[other]}": compared(e["imm"], e[other], LATER if e is r.later else 0)
+        f"{name}; against {NAMES[other]}": compare_sections(e["imm"], e[other], LATER if e is r.later else 0)
         for name, e in experiments.items()
         for other in COMPARED_POLICIES[1:]
     }
@@ -112,7 +112,7 @@ class GridFinding(NamedTuple):
     """Cells within ``NEAR_MINIMUM`` of the smallest."""
     near_inside: int
     """Those of them in the box."""
-    inside_excess: Measured
+    inside_excess: Quantity
     """Smallest error in the box over the smallest anywhere, minus one."""
 
 
@@ -142,7 +142,7 @@ def grid_finding(errors: numpy.ndarray) -> GridFinding:
         float(inside.ravel()[best[1:]].mean()),
         int(near.sum()),
         int((near & inside).sum()),
-        measured(flat[:, inside.ravel()].min(axis=1) / flat.min(axis=1) - 1.0),
+        quantity(flat[:, inside.ravel()].min(axis=1) / flat.min(axis=1) - 1.0),
     )
 
 
@@ -163,7 +163,7 @@ def box_verdict(found: Sequence[GridFinding]) -> Verdict:
     return certain if certain != "reproduced" or alone else "reproduced in part"
 
 
-def dominance_verdict(straight: Sequence[Measured], turn: Measured) -> Verdict:
+def dominance_verdict(straight: Sequence[Quantity], turn: Quantity) -> Verdict:
     """Verdict on "mode 1 dominates on the straight legs, mode 2 in the turn".
 
     Args:
@@ -182,7 +182,7 @@ def ramps_begun(alpha: numpy.ndarray, high: float) -> numpy.ndarray:
 
 def pair(squares: numpy.ndarray, window: tuple[int, int] | None) -> list[str]:
     """Position and velocity RMS of a window, or their peaks: ``135.68 ± 0.31``, ``27.123 ± 0.021``."""
-    position, velocity = map(measured, rms(squares, window).T)
+    position, velocity = map(quantity, rms(squares, window).T)
     return [f"{position:.2f}", f"{velocity:.3f}"]
 
 
@@ -320,10 +320,10 @@ def quantities(r: Results) -> dict[str, Any]:
             for k, squares in r.forced.items()
             if k < begins + 5
         ),
-        "detected": _detected(alarms, begins),
+        "detected": _detection_shares(alarms, begins),
         "false_alarms": alarms[:, 8 : begins - 1].mean(),
         "excess": [
-            measured(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
+            quantity(errors[:, row, column] / errors.min(axis=(1, 2)) - 1.0)
             for errors in grid_errors(r.grids["gains used"], WINDOWS["all"])
         ],
         "imm": pair(imm, WINDOWS["all"]),
@@ -372,7 +372,7 @@ def _straight(imm: numpy.ndarray, adaptive: numpy.ndarray) -> str:
     return "; ".join(straight)
 
 
-def _detected(alarms: numpy.ndarray, begins: int) -> str:
+def _detection_shares(alarms: numpy.ndarray, begins: int) -> str:
     """Share of episodes by the scan of their first alarm, of those without one before the turn begins."""
     later = alarms[:, begins - 1 :][~alarms[:, : begins - 1].any(axis=1)]
     detected = numpy.where(later.any(axis=1), later.argmax(axis=1) + begins, 0)
@@ -503,7 +503,7 @@ def tables(r: Results) -> list[Grid]:
             "Probability of mode 1",
             ["scan", "mean", "10-90 % range over episodes"],
             [
-                [str(k), f"{measured(samples[:, k - 1]):.4f}", "{:.2f} to {:.2f}".format(*quantiles[:, k - 1])]
+                [str(k), f"{quantity(samples[:, k - 1]):.4f}", "{:.2f} to {:.2f}".format(*quantiles[:, k - 1])]
                 for k in scans
             ],
         ),

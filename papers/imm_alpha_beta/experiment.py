@@ -12,8 +12,8 @@ from ...envs.maneuvering_target.task import ManeuveringTarget
 from ...evaluation.parallel import Workers
 from ...evaluation.rollout import start_lanes
 from ...evaluation.seeds import episode_seeds
-from ..measured import evaluated, means
-from ..reproduction import Progress, gathered, later
+from ..quantities import evaluate_policy, means
+from ..reproduction import Progress, compute_units, later
 from .gain_schedules import best_schedule, maneuver_flight, mean_square_errors, ramp_schedule
 from .imm_readings import Likelihood, Reading, Recording, interacting_multiple_model
 
@@ -89,7 +89,7 @@ class Run(NamedTuple):
 
 def flown(name: str, episodes: int, **keywords: Any) -> Run:
     """Run a policy, reference or bound of the environment over the paper's flight; one unit of work."""
-    one = evaluated(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
+    one = evaluate_policy(ManeuveringTarget.id, name, "paper", episodes, seed=SEED, **keywords)
     nothing = numpy.empty((0, 0))
     if "mean_square" in one:
         squares = one["mean_square"].values[:1]
@@ -99,7 +99,7 @@ def flown(name: str, episodes: int, **keywords: Any) -> Run:
     return Run(mean_squares(error), probability, one["alpha"].values if "alpha" in one else nothing, error[0])
 
 
-def recorded(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
+def record_measurements(episodes: int, seed: int, scenario: str = "paper", **keywords: Any) -> Recording:
     """Record the measurements of test episodes of ManeuveringTarget.
 
     Args:
@@ -180,9 +180,9 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     schedule = best_schedule(flight)
     exact = {f"fixed gain {a:g}": exactly(numpy.full(scans, a)) for a in (low, high, 0.65)}
     first, last = WINDOWS["turn"]
-    recording = recorded(episodes, SEED)
+    recording = record_measurements(episodes, SEED)
     grid_episodes = min(episodes, GRID_EPISODES)
-    few = recorded(grid_episodes, SEED)
+    few = record_measurements(grid_episodes, SEED)
     results = Results(
         episodes,
         grid_episodes,
@@ -197,5 +197,5 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         recording=recording,
         schedule=schedule,
     )
-    done: Results = gathered(results, progress, workers)
+    done: Results = compute_units(results, progress, workers)
     return done._replace(grids={kind: numpy.array(rows) for kind, rows in done.grids.items()})

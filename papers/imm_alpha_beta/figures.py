@@ -6,8 +6,8 @@ from typing import Any
 import numpy
 
 from ...evaluation.looks import styles
-from ..measured import means
 from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..quantities import means
 from .claims import HIGH_BOX, LOW_BOX, NEAR_MINIMUM, grid_errors
 from .experiment import COMPARED_POLICIES, COMPONENTS, HIGH_GAINS, LOW_GAINS, NAMES, WINDOWS, Results
 from .gain_schedules import ramp_schedule

@@ -9,7 +9,7 @@ as removal (no mean error left).
 """
 
 from ...evaluation.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judged
+from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 
 TITLE = "Kalman-Bucy filters in orientation and navigation complexes: what they follow, and INS/GNSS fusion"
@@ -21,5 +21,5 @@ def reproduce(
 ) -> Reproduction:
     """Run the examples and judge the claims."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
-    shown = judged(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
+    shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -6,7 +6,7 @@ from typing import Any
 import numpy
 
 from ..grid import Grid
-from ..measured import Measured, mean, means, measured
+from ..quantities import Quantity, mean, means, quantity
 from ..reproduction import Statement, verdict_if, verdict_of
 from .experiment import (
     DRIFT,
@@ -25,10 +25,10 @@ DIFFERENCES = {
 }  # fmt: skip
 
 
-def roots(r: Results) -> tuple[dict[str, Measured], dict[str, Measured]]:
+def roots(r: Results) -> tuple[dict[str, Quantity], dict[str, Quantity]]:
     """Root mean squares of examples (a) and (b)."""
-    a = {name: measured(numpy.sqrt(means(r.example.squares[name]))) for name in DIFFERENCES}
-    return a, {name: measured(numpy.sqrt(squares)) for name, squares in r.squares.items()}
+    a = {name: quantity(numpy.sqrt(means(r.example.squares[name]))) for name in DIFFERENCES}
+    return a, {name: quantity(numpy.sqrt(squares)) for name, squares in r.squares.items()}
 
 
 METHOD = "{r.episodes} episodes of `paper`, common noise, 2.5 to 5 s"
@@ -115,9 +115,9 @@ def quantities(r: Results) -> dict[str, Any]:
     a, b = roots(r)
     p, gains = PARAMETERS, dict(zip(("white", "reduced", "best"), GAINS.values(), strict=True))
 
-    def change(name: str, other: str) -> Measured:
+    def change(name: str, other: str) -> Quantity:
         """Relative change of the root mean square error, paired."""
-        return measured(numpy.sqrt(r.squares[name] / r.squares[other]) - 1.0)
+        return quantity(numpy.sqrt(r.squares[name] / r.squares[other]) - 1.0)
 
     return {
         "r": r,
@@ -127,10 +127,10 @@ def quantities(r: Results) -> dict[str, Any]:
         "theory": {name: math.sqrt(square) for name, square in r.example.theory.items()},
         "agreement": riccati_agreement(),
         "continuous": math.sqrt(closed_form([5.0])[0]),
-        "kept": {name: measured(samples[:, -1]) for name, samples in r.drift.items()},
+        "kept": {name: quantity(samples[:, -1]) for name, samples in r.drift.items()},
         "gains": gains,
         "held": {name: DRIFT / gain for name, gain in gains.items()},
-        "smoothing": measured(numpy.sqrt(r.squares["gnss-only"] / r.squares["plain-reduced"])),
+        "smoothing": quantity(numpy.sqrt(r.squares["gnss-only"] / r.squares["plain-reduced"])),
         "sample": math.sqrt(p.receiver_variance),
         "receiver": math.sqrt(gains["reduced"] * p.receiver_intensity / 2.0),
         "ins": math.sqrt(p.white_intensity / (2.0 * gains["reduced"])),

@@ -15,8 +15,8 @@ from ...evaluation.seeds import episode_seeds
 from ...filters import kalman_bucy
 from ...filters import loosely_coupled as ins_gnss
 from ...filters.linear_systems import steady_kalman_bucy, van_loan
-from ..measured import evaluated, means, recorded
-from ..reproduction import Progress, gathered, later
+from ..quantities import evaluate_policy, means, record_run
+from ..reproduction import Progress, compute_units, later
 
 EPISODES = 4000
 SEED = 0
@@ -121,7 +121,7 @@ def example_run(name: str) -> dict[str, numpy.ndarray]:
         shown = (episode.truth.reference, measurement.ins, measurement.fix, model.mean(episode))
         return dict(zip(("reference", "ins", "measurement", "estimate"), (x[0] for x in shown), strict=True))
 
-    series = recorded(model, maker(model), episode_seeds("test", SEED, 1), fields)
+    series = record_run(model, maker(model), episode_seeds("test", SEED, 1), fields)
     return {field: values[0] for field, values in series.items()}
 
 
@@ -247,13 +247,13 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         {name: later(_drift, name, drifting) for name in DRIFTING},
         later(_example_runs),
     )
-    done: Results = gathered(results, progress, workers)
+    done: Results = compute_units(results, progress, workers)
     return done
 
 
 def _errors(name: str, count: int, **keywords: Any) -> numpy.ndarray:
     # A policy is tuned to the model; a fixed drift is one value of that model's prior.
-    one = evaluated(LooselyCoupledNavigation.id, name, "paper", count, seed=SEED, **keywords)
+    one = evaluate_policy(LooselyCoupledNavigation.id, name, "paper", count, seed=SEED, **keywords)
     values: numpy.ndarray = one["error"].values[:, :, 0]
     return values
 

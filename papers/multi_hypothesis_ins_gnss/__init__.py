@@ -13,7 +13,7 @@ Reading: "without rates", "pseudoranges only": the standard deviation of what is
 """
 
 from ...evaluation.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judged
+from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 
 TITLE = "Adaptive multi-hypothesis algorithm of an inertial-satellite navigation system"
@@ -25,5 +25,5 @@ def reproduce(
 ) -> Reproduction:
     """Run the paper's experiment and judge its claims; comparators have at most ``FEW`` runs."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
-    shown = judged(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
+    shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -8,7 +8,7 @@ import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES, LINE, REST, SINGER
 from ..grid import Grid
-from ..measured import Measured, measured
+from ..quantities import Quantity, quantity
 from ..reproduction import Statement, Verdict, verdict_of
 from .experiment import (
     ADAPTIVE,
@@ -41,7 +41,7 @@ COORDINATE_LOSS = 0.10
 # --- verdicts
 
 
-def matched_verdict(coordinates: Sequence[Measured], others: Sequence[Measured]) -> Verdict:
+def matched_verdict(coordinates: Sequence[Quantity], others: Sequence[Quantity]) -> Verdict:
     """Verdict on "at most 10 % in coordinates, the other components close".
 
     Args:
@@ -54,7 +54,7 @@ def matched_verdict(coordinates: Sequence[Measured], others: Sequence[Measured])
     return "reproduced" if all(r.high <= limit for r in (*coordinates, *others)) else "reproduced in part"
 
 
-def weight_verdict(weights: Sequence[float], ratios: Sequence[Measured]) -> Verdict:
+def weight_verdict(weights: Sequence[float], ratios: Sequence[Quantity]) -> Verdict:
     """Verdict on "the loss comes from the weights of the other channels".
 
     Reproduced if the loss in coordinates vanishes (less than 0.1 %) where the other channels have less than a
@@ -104,7 +104,7 @@ def stability_verdict(found: Sequence[Loss]) -> Verdict:
 # --- claims
 
 
-def matched_ratios(runs: dict[str, Run]) -> list[Measured]:
+def matched_ratios(runs: dict[str, Run]) -> list[Quantity]:
     """RMS of the adaptive measurer over Singer's on Singer's motion: position, velocity, acceleration."""
     return [ratio(runs[ADAPTIVE], runs["Singer"], c, MATCHED_WINDOW) for c in range(3)]
 
@@ -186,7 +186,7 @@ def quantities(r: Results) -> dict[str, Any]:
     settings = {name: loss(run, SHORTEST_LEG + 1) for name, run in r.settings.items()}
     paired = kinematic[ADAPTIVE].some(0, few)
     room = [
-        [measured(run.rms(c, window)) for c in range(2) for run in (adaptive, best)]
+        [quantity(run.rms(c, window)) for c in range(2) for run in (adaptive, best)]
         for window in WINDOWS.values()
     ]
     return {
@@ -246,7 +246,7 @@ def tables(r: Results) -> list[Grid]:
             [
                 name,
                 leg,
-                *(f"{measured(run.rms(c, window))}" for c in range(len(COMPONENTS))),
+                *(f"{quantity(run.rms(c, window))}" for c in range(len(COMPONENTS))),
                 f"{numpy.sqrt(run.variance[:, window[0] - 1 : window[1]].mean()):.3f}",
                 f"{run.nis[:, window[0] - 1 : window[1]].mean():.3f}",
             ]

@@ -17,8 +17,8 @@ from ...evaluation.filters import Estimated
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
 from ...filters import gnss_ins, imm
-from ..measured import Measured, means, measured, recorded
-from ..reproduction import Progress, gathered, later
+from ..quantities import Quantity, means, quantity, record_run
+from ..reproduction import Progress, compute_units, later
 
 EPISODES = 100
 FEW = 40
@@ -114,9 +114,9 @@ class Run(NamedTuple):
         return float(1.0 - self.probability[:, MATCHED_WINDOW[0] - 1 :, SINGER].mean())
 
 
-def ratio(ours: Run, theirs: Run, component: int, window: tuple[int, int]) -> Measured:
+def ratio(ours: Run, theirs: Run, component: int, window: tuple[int, int]) -> Quantity:
     """Ratio of RMS errors, paired."""
-    return measured(ours.rms(component, window) / theirs.rms(component, window))
+    return quantity(ours.rms(component, window) / theirs.rms(component, window))
 
 
 class _SideBySide(Policy):
@@ -172,7 +172,7 @@ def simulate(scenario: str, filters: Mapping[str, int], **keywords: Any) -> dict
 
     lanes = [FILTERS.get(name) for name, count in filters.items() for _ in range(count)]
     actor = KnownMode(task) if "known mode" in filters else _SideBySide(model, lanes)
-    run = Run(**recorded(model, actor, seeds, fields))
+    run = Run(**record_run(model, actor, seeds, fields))
     ends = numpy.cumsum(list(filters.values()))
     return {
         name: run.some(end - count, end) for (name, count), end in zip(filters.items(), ends, strict=True)
@@ -205,7 +205,7 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         "leg_steps": (SHORTEST_LEG, SHORTEST_LEG + 1000),
     }
     blind = {"accelerometer_sigma": NOTHING}
-    found = gathered(
+    found = compute_units(
         {
             "courses": {course: run(scenario, both) for course, scenario in COURSES.items()},
             "no aperture": run("paper", {"Singer": few}, aperture=False),

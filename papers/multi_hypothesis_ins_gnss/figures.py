@@ -6,8 +6,8 @@ import numpy
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.looks import styles
-from ..measured import means
 from ..panels import draw, finish, legend_outside, looks, panels, shade
+from ..quantities import means
 from .claims import BAND, COORDINATE_LOSS, matched_ratios
 from .experiment import ADAPTIVE, COMPONENTS, JUMP, MOTION, SHORTEST_LEG, Results, loss
 

@@ -12,7 +12,7 @@ are most likely the filters' own; both those and the errors really made are draw
 """
 
 from ...evaluation.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judged
+from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 
 TITLE = "Adaptive radar and ESM tracking filter with recognition of the target's class"
@@ -24,5 +24,5 @@ def reproduce(
 ) -> Reproduction:
     """Run the paper's experiment and judge its claims; 100 episodes at least, so that every class has some."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES, least=100), workers)
-    shown = judged(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
+    shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -9,7 +9,7 @@ import numpy
 from ...baselines.radar_esm_tracking.metrics import SURE
 from ...filters import class_fusion
 from ..grid import Grid
-from ..measured import Measured, means, measured
+from ..quantities import Quantity, means, quantity
 from ..reproduction import Statement, Verdict, verdict_if, verdict_of
 from .experiment import (
     CLASSES,
@@ -33,14 +33,14 @@ TYPES = ("advanced fighter", "fighter", "early warning", "missile")
 SECONDS = (2, 5, 10, 20, 30, 60)
 
 
-def recognition_verdict(at_30: Sequence[Measured]) -> Verdict:
+def recognition_verdict(at_30: Sequence[Quantity]) -> Verdict:
     """Verdict on D1: mean P(true class) at 30 s certainly reaches ``RECOGNITION_PROBABILITY`` in all classes,
     in some, or in none.
     """
     return verdict_of(m.low >= RECOGNITION_PROBABILITY for m in at_30)
 
 
-def approach_verdict(excess: Sequence[Sequence[Measured]]) -> Verdict:
+def approach_verdict(excess: Sequence[Sequence[Quantity]]) -> Verdict:
     """Verdict on D2: the error is within ``CLOSE`` of the ideal filter's, late in all classes, or sooner in some.
 
     Args:
@@ -57,9 +57,9 @@ class Variant(NamedTuple):
     recognised: float
     """Median time of the first P >= 0.9, s."""
     radar_alone: float
-    gain: Measured
+    gain: Quantity
     """RMSE of the acceleration at 30-60 s, non-adaptive over adaptive."""
-    excess: Measured
+    excess: Quantity
     """The same, adaptive over ideal, minus one."""
     radar_sure: float
     """Share of runs in which the radar alone ever reaches P >= 0.9 for the true class."""
@@ -70,7 +70,7 @@ def variant(r: Results, name: str, s: int) -> Variant:
     fused, radar = r.variants[name]
     of = fused.true_class == s
     if not of.any():
-        nothing = Measured(*[math.nan] * 3)
+        nothing = Quantity(*[math.nan] * 3)
         return Variant(math.nan, math.nan, nothing, nothing, math.nan)
     p = parameters(name)
     error = numpy.sqrt(fused.mean_square(2, LATE, of))
@@ -78,8 +78,8 @@ def variant(r: Results, name: str, s: int) -> Variant:
     return Variant(
         fused.recognition(0.5, of),
         radar.recognition(0.5, of),
-        measured(fixed / error),
-        measured(error / ideal - 1.0),
+        quantity(fixed / error),
+        quantity(error / ideal - 1.0),
         float((radar.true_probability[of] >= SURE).any(axis=1).mean()),
     )
 
@@ -218,7 +218,7 @@ def quantities(r: Results) -> dict[str, Any]:
             f"{_seconds(radar.recognition(0.5))} s by radar alone, {_seconds(esm.recognition(0.5))} s by ESM alone"
             for name, fused, radar, esm in zip(CLASSES, r.fused, r.radar, r.esm, strict=True)
         ),
-        "ungated": measured(means(ungated.cost) / means(gated.cost) - 1.0),
+        "ungated": quantity(means(ungated.cost) / means(gated.cost) - 1.0),
         "calibration": "; ".join(
             f"{name} {', '.join(f'{m:.3f}' for m in gated.calibration(window))}"
             for name, window in WINDOWS.items()
@@ -242,7 +242,7 @@ def tables(r: Results) -> list[Grid]:
         [
             f"{name} {component}, {unit}",
             *(
-                f"{measured(numpy.sqrt(r.fused[s].mean_square(c, w))):.{d}f} / {rms(r.exact[s, 2][c], w):.{d}f} / "
+                f"{quantity(numpy.sqrt(r.fused[s].mean_square(c, w))):.{d}f} / {rms(r.exact[s, 2][c], w):.{d}f} / "
                 f"{rms(r.exact[s, s][c], w):.{d}f}"
                 for w in WINDOWS.values()
             ),

@@ -11,8 +11,8 @@ from ...envs.radar_esm_tracking.parameters import RadarEsmTrackingParameters
 from ...envs.radar_esm_tracking.task import RadarEsmTracking
 from ...evaluation.parallel import Workers
 from ...filters import class_fusion
-from ..measured import Measured, evaluated, mean, means, measured
-from ..reproduction import Progress, gathered, later
+from ..quantities import Quantity, evaluate_policy, mean, means, quantity
+from ..reproduction import Progress, compute_units, later
 
 EPISODES = 20000
 SEED = 2008
@@ -96,7 +96,7 @@ class Run(NamedTuple):
         """Mean square error over a window, ``(1 + resamples,)``."""
         return means((self.error[of][:, window[0] - 1 : window[1], component] ** 2).mean(axis=1))
 
-    def true_at(self, second: float, of: Any = ...) -> Measured:
+    def true_at(self, second: float, of: Any = ...) -> Quantity:
         """Mean probability of the true class at a time."""
         return mean(self.true_probability[of][:, round(second / INTERVAL) - 1])
 
@@ -116,23 +116,23 @@ class Run(NamedTuple):
         other = numpy.arange(len(CLASSES)) != self.true_class[:, None, None]
         return ((self.probability >= SURE) & other).any(axis=2)
 
-    def sure_and_wrong(self, of: Any = ...) -> Measured:
+    def sure_and_wrong(self, of: Any = ...) -> Quantity:
         """Share of runs that end with P >= 0.9 for a wrong class."""
         return mean(self.wrong()[of][:, -1].astype(float))
 
-    def calibration(self, window: tuple[int, int]) -> list[Measured]:
+    def calibration(self, window: tuple[int, int]) -> list[Quantity]:
         """Mean square error over mean reported variance of each component."""
         reported = self.variance[window[0] - 1 : window[1]].mean(axis=0)
-        return [measured(self.mean_square(c, window) / reported[c]) for c in range(len(COMPONENTS))]
+        return [quantity(self.mean_square(c, window) / reported[c]) for c in range(len(COMPONENTS))]
 
 
 def _quantile(scan: numpy.ndarray, share: float) -> float:
     return INTERVAL * (float(numpy.sort(scan)[math.ceil(share * len(scan)) - 1]) + 1.0)
 
 
-def tracked(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
+def run_policy(name: str, scenario: str, episodes: int, **keywords: Any) -> Run:
     """Run a policy; one unit of work."""
-    one = evaluated(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
+    one = evaluate_policy(RadarEsmTracking.id, name, scenario, episodes, seed=SEED, **keywords)
     variance = [one[f"variance_{c.name}"].values for c in RadarEsmTracking.components]
     return Run(
         one["error"].values,
@@ -167,15 +167,15 @@ class Results(NamedTuple):
     variants: dict[str, list[Run]]
     """Adaptive filter and radar alone, by name of the variant."""
 
-    def excess(self, s: int, component: int, window: tuple[int, int]) -> Measured:
+    def excess(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
         """RMSE of the adaptive filter over the ideal one's on targets of class s, minus one."""
         ideal = rms(self.exact[s, s][component], window)
-        return measured(numpy.sqrt(self.fused[s].mean_square(component, window)) / ideal - 1.0)
+        return quantity(numpy.sqrt(self.fused[s].mean_square(component, window)) / ideal - 1.0)
 
-    def gain(self, s: int, component: int, window: tuple[int, int]) -> Measured:
+    def gain(self, s: int, component: int, window: tuple[int, int]) -> Quantity:
         """RMSE of the non-adaptive filter over the adaptive one's."""
         fixed = rms(self.exact[s, 2][component], window)
-        return measured(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
+        return quantity(fixed / numpy.sqrt(self.fused[s].mean_square(component, window)))
 
 
 def run_everything(progress: Progress, episodes: int, workers: Workers | None = None) -> Results:
@@ -186,10 +186,10 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
     channels = class_fusion.design_channels(models, start, p.horizon)
 
     def by_class(name: str, count: int) -> list[Any]:
-        return [later(tracked, name, "paper", count, true_class=s) for s in CLASSES]
+        return [later(run_policy, name, "paper", count, true_class=s) for s in CLASSES]
 
     def both(one: str, other: str, count: int, **keywords: Any) -> list[Any]:
-        return [later(tracked, name, "paper", count, **keywords) for name in (one, other)]
+        return [later(run_policy, name, "paper", count, **keywords) for name in (one, other)]
 
     results = Results(
         episodes,
@@ -200,8 +200,8 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         by_class("radar-only", small),
         by_class("esm-only", small),
         both("quasi-optimal", "ungated", episodes),
-        {name: later(tracked, name, "fixed-type", episodes) for name in ("quasi-optimal", "joint-type")},
+        {name: later(run_policy, name, "fixed-type", episodes) for name in ("quasi-optimal", "joint-type")},
         {name: both("quasi-optimal", "radar-only", small, **keywords) for name, keywords in VARIANTS.items()},
     )
-    done: Results = gathered(results, progress, workers)
+    done: Results = compute_units(results, progress, workers)
     return done

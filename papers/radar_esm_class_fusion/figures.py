@@ -6,8 +6,8 @@ import numpy
 
 from ...baselines.radar_esm_tracking.metrics import SURE
 from ...evaluation.looks import styles
-from ..measured import means
 from ..panels import draw, finish, legend_outside, looks, panels
+from ..quantities import means
 from .experiment import CLASSES, COMPONENTS, INTERVAL, Results
 
 FILTERS = {"non-adaptive": 1.8, "ideal": 3.2, "synthesised": 1.4}

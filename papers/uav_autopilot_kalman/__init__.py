@@ -9,7 +9,7 @@ innovation; all of the output coordinate. Energy spectrum: ``|DFT|^2 T / n`` ave
 """
 
 from ...evaluation.parallel import Workers
-from ..reproduction import Progress, Reproduction, episode_count, its_command, judged
+from ..reproduction import Progress, Reproduction, episode_count, its_command, judge_claims
 from . import claims, experiment, figures
 
 TITLE = "Stochastic simulation of a UAV autopilot with the optimal Kalman filter (Gridnev, Rusetski, Rak)"
@@ -21,5 +21,5 @@ def reproduce(
 ) -> Reproduction:
     """Run the experiments and judge the claims."""
     r = experiment.run_everything(progress, episode_count(episodes, experiment.EPISODES), workers)
-    shown = judged(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
+    shown = judge_claims(claims.CLAIMS, claims.quantities(r)), claims.tables(r), figures.figures(r)
     return Reproduction(TITLE, *shown, command=its_command(__name__, episodes))

@@ -9,7 +9,7 @@ import numpy
 from ...baselines.uav_autopilot.theory import stationary
 from ...filters import linear_systems
 from ..grid import Grid
-from ..measured import means, measured
+from ..quantities import means, quantity
 from ..reproduction import Statement
 from .experiment import (
     AFTER_STEP,
@@ -32,7 +32,7 @@ def _excess(datasets: dict) -> str:
     """Cost of the paper's filter above that of the filter told the noise, and its consistency."""
     ours, best = (datasets[name]["cost"].values.mean(axis=1) for name in ("kalman", "matched"))
     nees = datasets["kalman"]["nees"].values.mean() / datasets["kalman"].sizes["component"]
-    return f"{measured(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
+    return f"{quantity(means(ours) / means(best) - 1.0):.0%}, NEES {nees:.1f} per coordinate"
 
 
 CLAIMS = (
@@ -157,7 +157,7 @@ def tables(r: Results) -> list[Grid]:
             theory = stationary(s.task, name)
             assert theory is not None
             output, control = (
-                f"{measured(means((values[:, STEADY_WINDOW] ** 2).mean(axis=1))):.5f}"
+                f"{quantity(means((values[:, STEADY_WINDOW] ** 2).mean(axis=1))):.5f}"
                 for values in (s.output, s.control)
             )
             rows.append(

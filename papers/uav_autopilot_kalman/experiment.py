@@ -13,8 +13,8 @@ from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.parallel import Workers
 from ...evaluation.seeds import episode_seeds
 from ...filters import linear_systems
-from ..measured import evaluated, mean, recorded
-from ..reproduction import Progress, gathered, later
+from ..quantities import evaluate_policy, mean, record_run
+from ..reproduction import Progress, compute_units, later
 
 EPISODES = 600
 HORIZON = 600
@@ -98,7 +98,7 @@ def simulate(keywords: dict[str, Any], scenario: str, loop: str, episodes: int) 
     actor = {**BASELINES.policies, **BASELINES.references}[loop](
         model if loop in BASELINES.policies else task
     )
-    series = recorded(model, actor, episode_seeds("test", 0, episodes), fields)
+    series = record_run(model, actor, episode_seeds("test", 0, episodes), fields)
     truth, plant_input = series.pop("truth"), series["control"].copy()
     if task.parameters.plant == "P":
         # What drives the plant to the next measurement; the last one has no next.
@@ -153,13 +153,13 @@ def run_everything(progress: Progress, episodes: int, workers: Workers | None = 
         },
         {
             plant: {
-                name: later(evaluated, "UavAutopilot", name, "random", episodes, plant=plant)
+                name: later(evaluate_policy, "UavAutopilot", name, "random", episodes, plant=plant)
                 for name in RANDOM
             }
             for plant in "PU"
         },
     )
-    done: Results = gathered(results, progress, workers)
+    done: Results = compute_units(results, progress, workers)
     return done
 
 

@@ -25,7 +25,7 @@ def _resampling(runs: int) -> Bootstrap:
     return Bootstrap(runs, RESAMPLES)
 
 
-class Measured(NamedTuple):
+class Quantity(NamedTuple):
     """A value and its uncertainty; "certainly" in a verdict means by the whole interval.
 
     As text it is ``value ± standard error``, both in the digits asked for (``f"{m:.3f}"``, ``f"{m:+.1%}"``),
@@ -53,17 +53,17 @@ def means(values: numpy.ndarray) -> numpy.ndarray:
     return _resampling(len(values)).means(values)
 
 
-def measured(samples: numpy.ndarray) -> Measured:
+def quantity(samples: numpy.ndarray) -> Quantity:
     """Value and uncertainty of a quantity, ``(1 + resamples,)``."""
     if len(samples) == 1:
-        return Measured(*[float(samples[0])] * 3)
+        return Quantity(*[float(samples[0])] * 3)
     value, low, high = percentile_interval(samples).tolist()
-    return Measured(value, low, high, float(samples[1:].std()))
+    return Quantity(value, low, high, float(samples[1:].std()))
 
 
-def mean(values: numpy.ndarray) -> Measured:
+def mean(values: numpy.ndarray) -> Quantity:
     """Mean over the runs ``(runs,)``."""
-    return measured(means(values))
+    return quantity(means(values))
 
 
 def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
@@ -72,7 +72,9 @@ def band(samples: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
     return low, high
 
 
-def evaluated(environment: str, name: str, scenario: str, episodes: int, **keywords: Any) -> xarray.Dataset:
+def evaluate_policy(
+    environment: str, name: str, scenario: str, episodes: int, **keywords: Any
+) -> xarray.Dataset:
     """Evaluate a policy, reference or bound on test episodes; one unit of work.
 
     Args:
@@ -85,7 +87,7 @@ def evaluated(environment: str, name: str, scenario: str, episodes: int, **keywo
     return evaluate(environment, [name], scenario, episodes, **keywords).isel(policy=0)
 
 
-def recorded(
+def record_run(
     task: Any, actor: Any, seeds: Sequence[int], fields: Callable[[Any, Any], Mapping[str, numpy.ndarray]]
 ) -> dict[str, numpy.ndarray]:
     """Run a policy or a reference estimator and keep what an evaluation does not record.
