@@ -200,13 +200,9 @@ def lines(
             continue
         double, double_ns, writer = run_in_c(name, traced, given, DOUBLE, compiler)
         line |= {"double_sigmas": double, "double_ns": double_ns}
-        found = writer.figures
-        line |= {
-            "operations": found["operations"],
-            "state_bytes": found["state_bytes"],
-            "weight_bytes": found["constant_bytes"],
-        }
-        if found["operations"] > 10_000:
+        operations, state, weights, _ = writer.sizes
+        line |= {"operations": operations, "state_bytes": state, "weight_bytes": weights}
+        if operations > 10_000:
             # What takes a compiler minutes is run in float by NumPy.
             line["float_sigmas"] = given.largest_difference(
                 run_filter(traced, given, numpy.float32)[:, mean_rows(traced)]

@@ -86,8 +86,8 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
 
 def _load(text: str, key: str, library: Library) -> Native:
     binding = llvm()
-    for function in library.functions.values():
-        binding.add_symbol(function.symbol, function.address)
+    for own in library.functions.values():
+        binding.add_symbol(own.symbol, own.address)
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(text)

@@ -13,7 +13,7 @@ from filtergym.baselines.maneuvering_target.anchored import DeadReckoning, regre
 from filtergym.baselines.maneuvering_target.log_families import log_families
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import make_task
-from filtergym.envs.recording import Recording, joined
+from filtergym.envs.recording import Recording, join_recordings
 from filtergym.evaluation.likelihood import Span, cut_windows
 from filtergym.filters import dead_reckoning
 
@@ -204,7 +204,7 @@ def test_it_is_kept_in_files_and_left_out_of_what_only_some_have(tmp_path):
     for name, values in first.measurements.items():
         np.testing.assert_array_equal(values, again.measurements[name])
     other = read(drive(count=50, seed=1).drop(columns=["odometry_x", "odometry_y"]), tmp_path, "other.csv")
-    both: Recording = joined([first, other], "both")
+    both: Recording = join_recordings([first, other], "both")
     assert "odometry_displacement" not in both.measurements
     assert "other: has no odometry_displacement, which is left out of all" in both.notes
 

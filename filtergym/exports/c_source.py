@@ -238,18 +238,14 @@ class Writer:
         return f"{source.functions}\n{function_text('void', f'{own}_update', parameters, body)}", source
 
     @property
-    def figures(self) -> dict[str, int]:
-        """Operations and bytes."""
+    def sizes(self) -> tuple[int, int, int, int]:
+        """Operations, and bytes of state, weights and stack."""
         size = numpy.dtype(self.scalar.dtype).itemsize
         network = self.traced.network
         weights = 0 if network is None else network_text(network, self.name, self.scalar)[1]
         after = len(self.traced.state) * size + 4 * self.memory
-        return {
-            "operations": self.update_source.operations,
-            "state_bytes": after,
-            "constant_bytes": weights,
-            "scratch_bytes": (self.update_source.scratch + self.traced.shown) * size + after,
-        }
+        scratch = (self.update_source.scratch + self.traced.shown) * size + after
+        return self.update_source.operations, after, weights, scratch
 
     @property
     def replaced(self) -> tuple[float, ...]:
@@ -571,9 +567,7 @@ def export_c(
     writer = Writer(name, traced, scalar, replayed.components)
     writer.limit = max(WORST[precision], 3.0 * sensitivity)
     writer.about = _about(problem, name, maker, writer, precision, keywords, command)
-    figures = Figures(
-        **writer.figures, difference=difference, sensitivity=sensitivity, replaced=writer.replaced
-    )
+    figures = Figures(*writer.sizes, difference, sensitivity, writer.replaced)
     test = compile_and_test(writer, replayed)
     figures = figures._replace(test=test)
     folder.mkdir(parents=True, exist_ok=True)

@@ -122,9 +122,10 @@ def replay(
         raise ValueError(
             f"{name!r} lost every episode that it was to be compared on: its answers are no estimates"
         )
-    arrays = [numpy.stack(values)[..., ~lost] for values in kept.values()]
+    measured, mean, covariance = (numpy.stack(values)[..., ~lost] for values in kept.values())
     components = [(component.name, component.unit) for component in plain.task.components]
-    return traced, Replay(_rows(started[0], episodes)[:, ~lost], *arrays, components)
+    initial = _rows(started[0], episodes)[:, ~lost]
+    return traced, Replay(initial, measured, mean, covariance, components)
 
 
 class _Network:
@@ -138,7 +139,7 @@ class _Network:
     def __init__(self, network: LearnedPolicy, dtype: Any) -> None:
         self.network = copy.copy(network)
         self.network.arrays = {name: values.astype(dtype) for name, values in network.arrays.items()}
-        self.network.layers = [tuple(values.astype(dtype) for values in layer) for layer in network.layers]
+        self.network.layers = [(weight.astype(dtype), bias.astype(dtype)) for weight, bias in network.layers]
         self.network.columns = slice(None)  # what it is shown is what it takes
         self.memory: Any = None
         self.answer: Any = None

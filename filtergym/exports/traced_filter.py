@@ -234,7 +234,8 @@ def members_of(part: Any, prefix: str = "", words: str = "") -> list[Member]:
         if isinstance(part, dict):
             pairs = list(part.items())
         elif hasattr(part, "_fields"):
-            pairs, described = list(part._asdict().items()), field_words(type(part))
+            named: Any = part
+            pairs, described = list(named._asdict().items()), field_words(type(part))
         else:
             pairs = [(str(i), item) for i, item in enumerate(part)]
         return [
