@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
+from .causes import Moment, cause_number
 from .draws import Draws
 from .filter import Filter, Input
 from .observation import Array, Blocks, Field, Reader
@@ -162,6 +163,20 @@ class Model:
         """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
+
+    def causes(self, episode: Episode) -> Array:
+        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        task, measurement = self.task, episode.measurement
+        world = task.world
+        moment = Moment(
+            task.xp,
+            self.context(episode),
+            world.state(episode.truth),
+            measurement,
+            world.component_readings(measurement),
+            world.component_deviations(measurement),
+        )
+        return cause_number(task.causes, moment)
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""

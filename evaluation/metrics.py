@@ -14,6 +14,8 @@ import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
+from .cause_split import VARIABLE as CAUSES
+from .cause_split import EVERYTHING, CauseMeans, cause_means, cause_sums, compare, opponent_of, split
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
 from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
@@ -156,6 +158,9 @@ def record_statistics(
         charge = run["charge"].values
         total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
         yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
+    if CAUSES in run and not is_bound and judged:
+        nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
+        yield Statistic(("causes",), cause_sums(run, nees))
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     if "lost" in run and not numpy.isnan(run["lost"].values).all():
@@ -181,8 +186,8 @@ def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[St
     interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
     """
     component = "state" if metric == "nees" else "measurement"
-    values, degrees = run[metric].values, consistency_degrees(run, metric)
-    normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
+    normalised, degrees = _over_dimension(run, metric)
+    values = run[metric].values
     there = ~numpy.isnan(normalised)
     low, high = chi_square_band(degrees)
     inside = numpy.where(there, (values >= low) & (values <= high), numpy.nan)
@@ -194,6 +199,13 @@ def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[St
             sums = numpy.stack([there[:, times].sum(axis=1), inverse[:, times].sum(axis=1)], axis=1)
             key = ("record", "anis_band", component, window, "1")
             yield Statistic(key, sums, functools.partial(_band, episodes=episodes), optional=True)
+
+
+def _over_dimension(run: xarray.Dataset, metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
+    degrees = consistency_degrees(run, metric)
+    some = numpy.where(degrees > 0.0, degrees, 1.0)
+    return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
 def _band(means: numpy.ndarray, episodes: int) -> Estimate:
@@ -257,6 +269,8 @@ class Contender(NamedTuple):
     costs: numpy.ndarray | None
     """Mean cost of every episode; None of bounds, and without truth."""
     losses: Losses | None
+    causes: CauseMeans | None = None
+    """None of bounds, without truth, and of an evaluation that holds no causes."""
 
 
 def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
@@ -387,7 +401,26 @@ def contender_of(
             measures.append(Measure(metric, component, window, estimate, unit))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)))
+    causes = None if ("causes",) not in results else cause_means(results["causes",], run)
+    return Contender(
+        name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
+    )
+
+
+def _cause_measures(
+    contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
+) -> Iterator[Measure]:
+    """Cost and consistency by cause; a cause stands in the place of a window."""
+    if contender.causes is None:
+        return
+    others = {c.name: c for c in contenders if c.causes is not None}
+    costs = {name: float(c.causes.cost(EVERYTHING)[0]) for name, c in others.items() if c.causes is not None}
+    opponent = opponent_of(contender.name, costs, [name for name, c in others.items() if c.kind in RANKED])
+    found = list(split(contender.causes, bootstrap))
+    if opponent and (theirs := others[opponent].causes) is not None:
+        found += compare(contender.causes, theirs, opponent, bootstrap)
+    for m in found:
+        yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
 
 
 def records_of(
@@ -409,6 +442,7 @@ def records_of(
     records = []
     for c in contenders:
         measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
+        measures += _cause_measures(c, contenders, bootstrap)
         for m in measures:
             records.append(
                 Record(
