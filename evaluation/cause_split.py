@@ -15,6 +15,8 @@ from .bootstrap import Bootstrap, Estimate, ratio
 
 EVERYTHING = "all"
 """Name of the whole, in the place of a cause."""
+CAUSE_METRICS = "cause_"
+"""Begins the names of metrics by cause."""
 START, OTHER = "start", "other"
 VARIABLE = "causes"
 """Of an evaluation: which causes hold, see :func:`.envs.causes.cause_number`."""
@@ -34,18 +36,18 @@ class CauseMeasure(NamedTuple):
     """With whom it is compared."""
 
 
-class CauseMeans(NamedTuple):
-    """What the measurements under each cause come to, in the data and in every resample."""
+class CauseCosts(NamedTuple):
+    """Mean cost of a measurement under each cause, in the data and in every resample."""
 
     names: list[str]
     """Of the causes, those that never hold left out; first ``EVERYTHING``."""
-    sums: numpy.ndarray
-    """Means over episodes of ``COUNT``, ``COST``, ``NEES`` and ``JUDGED``, ``(1 + resamples, causes, 4)``."""
+    means: numpy.ndarray
+    """``(1 + resamples, causes)``."""
 
-    def cost(self, cause: str) -> numpy.ndarray:
-        """Mean cost of a measurement under a cause, ``(1 + resamples,)``."""
-        of = self.sums[:, self.names.index(cause)]
-        return ratio(of[:, [COST, COUNT]])
+    def of(self, cause: str) -> numpy.ndarray:
+        """Return those under a cause, ``(1 + resamples,)``."""
+        found: numpy.ndarray = self.means[:, self.names.index(cause)]
+        return found
 
 
 def cause_coords(names: Sequence[str], phrases: Sequence[str], start: int) -> dict[str, object]:
@@ -105,36 +107,36 @@ def cause_sums(run: xarray.Dataset, nees: numpy.ndarray | None) -> numpy.ndarray
     )
 
 
-def cause_means(sums: numpy.ndarray, run: xarray.Dataset) -> CauseMeans:
-    """Return what the measurements under each cause come to, without causes that never hold.
+def split(
+    sums: numpy.ndarray, run: xarray.Dataset, bootstrap: Bootstrap
+) -> tuple[list[CauseMeasure], CauseCosts]:
+    """Split a competitor's cost and consistency by cause; causes that never hold are left out.
 
     Args:
         sums: means over the episodes of :func:`cause_sums`, ``(1 + resamples, causes, 4)``.
         run: of whose variables none is needed.
+        bootstrap: over the episodes.
+
+    Returns:
+        For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement under
+        it) and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, to be compared.
     """
     names = [EVERYTHING, *run["cause"].values.tolist(), START, OTHER]
-    there = numpy.flatnonzero(sums[0, :, COUNT] > 0.0)
-    return CauseMeans([names[i] for i in there], sums[:, there])
-
-
-def split(means: CauseMeans, bootstrap: Bootstrap) -> Iterator[CauseMeasure]:
-    """Split a competitor's cost and consistency by cause.
-
-    Yields:
-        For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement under
-        it) and ``cause_anees`` (mean NEES over its dimension), with intervals over the episodes.
-    """
-    whole = means.sums[:, 0]
-    for i, name in enumerate(means.names):
-        own = means.sums[:, i]
-        for metric, first, second in (
-            ("cause_measurement_share", own[:, COUNT], whole[:, COUNT]),
-            ("cause_cost_share", own[:, COST], whole[:, COST]),
-            ("cause_cost", own[:, COST], own[:, COUNT]),
-            ("cause_anees", own[:, NEES], own[:, JUDGED]),
-        ):
-            estimate = bootstrap.interval(ratio(numpy.stack([first, second], axis=1)))
-            yield CauseMeasure(metric, name, estimate)
+    measures, present, costs = [], [], []
+    for name, own in zip(names, numpy.moveaxis(sums, 1, 0), strict=True):
+        if own[0, COUNT] <= 0.0:
+            continue
+        found = {
+            "cause_measurement_share": (own[:, COUNT], sums[:, 0, COUNT]),
+            "cause_cost_share": (own[:, COST], sums[:, 0, COST]),
+            "cause_cost": (own[:, COST], own[:, COUNT]),
+            "cause_anees": (own[:, NEES], own[:, JUDGED]),
+        }
+        ratios = {metric: ratio(numpy.stack(both, axis=1)) for metric, both in found.items()}
+        measures += [CauseMeasure(metric, name, bootstrap.interval(each)) for metric, each in ratios.items()]
+        present.append(name)
+        costs.append(ratios["cause_cost"])
+    return measures, CauseCosts(present, numpy.stack(costs, axis=1))
 
 
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
@@ -150,10 +152,10 @@ def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) ->
 
 
 def compare(
-    own: CauseMeans, other: CauseMeans, opponent: str, bootstrap: Bootstrap
+    own: CauseCosts, other: CauseCosts, opponent: str, bootstrap: Bootstrap
 ) -> Iterator[CauseMeasure]:
     """Compare the cost under every cause, paired: ``cause_cost_ratio``, that of a competitor over its opponent's."""
     for name in own.names:
         if name in other.names:
-            both = numpy.stack([own.cost(name), other.cost(name)], axis=1)
+            both = numpy.stack([own.of(name), other.of(name)], axis=1)
             yield CauseMeasure("cause_cost_ratio", name, bootstrap.interval(ratio(both)), opponent)

@@ -15,7 +15,7 @@ from scipy.special import gammaincinv  # scipy.stats has the quantile too, and t
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
 from .cause_split import VARIABLE as CAUSES
-from .cause_split import EVERYTHING, CauseMeans, cause_means, cause_sums, compare, opponent_of, split
+from .cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
 from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
@@ -269,7 +269,7 @@ class Contender(NamedTuple):
     costs: numpy.ndarray | None
     """Mean cost of every episode; None of bounds, and without truth."""
     losses: Losses | None
-    causes: CauseMeans | None = None
+    causes: CauseCosts | None = None
     """None of bounds, without truth, and of an evaluation that holds no causes."""
 
 
@@ -401,26 +401,27 @@ def contender_of(
             measures.append(Measure(metric, component, window, estimate, unit))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    causes = None if ("causes",) not in results else cause_means(results["causes",], run)
+    causes = None
+    if ("causes",) in results:
+        found, causes = split(results["causes",], run, bootstrap)
+        further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
     return Contender(
         name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
     )
 
 
-def _cause_measures(
+def _compare_causes(
     contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
 ) -> Iterator[Measure]:
-    """Cost and consistency by cause; a cause stands in the place of a window."""
-    if contender.causes is None:
+    """Cost under each cause over that of the opponent; a cause stands in the place of a window."""
+    split = {c.name: c.causes for c in contenders if c.causes is not None}
+    if contender.name not in split:
         return
-    others = {c.name: c for c in contenders if c.causes is not None}
-    costs = {name: float(c.causes.cost(EVERYTHING)[0]) for name, c in others.items() if c.causes is not None}
-    opponent = opponent_of(contender.name, costs, [name for name, c in others.items() if c.kind in RANKED])
-    found = list(split(contender.causes, bootstrap))
-    if opponent and (theirs := others[opponent].causes) is not None:
-        found += compare(contender.causes, theirs, opponent, bootstrap)
-    for m in found:
-        yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
+    costs = {name: float(causes.of(EVERYTHING)[0]) for name, causes in split.items()}
+    opponent = opponent_of(contender.name, costs, [c.name for c in contenders if c.kind in RANKED])
+    if opponent:
+        for m in compare(split[contender.name], split[opponent], opponent, bootstrap):
+            yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
 
 
 def records_of(
@@ -442,7 +443,7 @@ def records_of(
     records = []
     for c in contenders:
         measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
-        measures += _cause_measures(c, contenders, bootstrap)
+        measures += _compare_causes(c, contenders, bootstrap)
         for m in measures:
             records.append(
                 Record(

@@ -38,9 +38,9 @@ def _is_calm(moment: Moment) -> Array | None:
 
 CAUSES = (
     Cause("command", f"in the {SETTLING:g} measurements after a command", _has_new_command),
-    Cause("disturbance", f"where the disturbance is {RAISED:g} times the nominal one or more", _is_gusty),
+    Cause("disturbance", f"where the disturbance is at least {RAISED:g} times the nominal one", _is_gusty),
     Cause(
-        "sensor noise", f"where a sensor's noise is {RAISED:g} times the nominal one or more", _has_noisy_sensor
+        "sensor noise", f"where a sensor's noise is at least {RAISED:g} times the nominal one", _has_noisy_sensor
     ),
     Cause("calm", "where all noise is near its nominal level", _is_calm),
     MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),

@@ -24,7 +24,17 @@ from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
-from .evaluation import FlightOptions, Outputs, find_data, find_names, run, say_departures, write
+from ..reports.worst import find_worst
+from .evaluation import (
+    FlightOptions,
+    Outputs,
+    check_explained,
+    find_data,
+    find_names,
+    run,
+    say_departures,
+    write,
+)
 from .shown import REPORT, make_report, print_results, print_verdict
 from .terminal import (
     Backend,
@@ -133,6 +143,13 @@ def evaluate_policies(
     threads: Threads = 1,
     jobs: Jobs = 1,
     cluster: Cluster = None,
+    why: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Whose cost is explained; repeat for several; default: the first --policy, else the paper's algorithm.",
+            autocompletion=complete_policy,
+        ),
+    ] = None,
     site: Annotated[
         str | None,
         typer.Option(
@@ -166,6 +183,7 @@ def evaluate_policies(
     outputs.check()
     problem, data = find_data(environment, scenario, recording, options, keywords)
     names = find_names(problem, data, policy)
+    check_explained(why or [], names)
     learned = [name for name in names if is_learned(problem, name)]
     check_names(problem.task, keywords)
     experiment = problem.experiment(
@@ -183,7 +201,13 @@ def evaluate_policies(
     )
     with Workers(jobs, cluster) as workers:
         outcome = run(problem, experiment, names, outputs, workers, trust)
-    write(problem, outcome, outputs, learned)
+    explained = outcome.explained(policy or [], why or [])
+    worst = (
+        []
+        if out is None
+        else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
+    )
+    write(problem, outcome, outputs, learned, explained, worst)
     say_departures(problem, data, learned, keywords, trust)
 
 

@@ -168,7 +168,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(median, _number(median)),
                 Entry(wins, _number(wins)),
                 Entry("-" if value is None else f"{value:.3g}", value),
-                Entry(consistency_word(value), consistency_word(value)),
+                Entry(consistency_word(nees), consistency_word(nees)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
                 *(number(name, "rmse", component) for component in shown),
                 Entry(origin(result, name, kind), origin(result, name, kind)),

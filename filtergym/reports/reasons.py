@@ -1,16 +1,18 @@
 """Why a competitor costs what it costs: its records by cause in sentences and as a table."""
 
+import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ..evaluation.cause_split import EVERYTHING
+from ..evaluation.cause_split import CAUSE_METRICS, EVERYTHING
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .tables import rank_competitors, with_interval
 
 MOST_REASONS = 3
 """Sentences about one competitor."""
-LEAST_EXCESS = 0.02
+LEAST_EXCESS = 0.05
 """Share of the cost beyond the share of the measurements from which a cause is a reason."""
 
 
@@ -46,8 +48,8 @@ def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
     """
     found: dict[str, dict[str, Record]] = {}
     for r in records:
-        if r.policy == name and r.metric.startswith("cause_") and r.value is not None:
-            found.setdefault(r.window, {})[r.metric.removeprefix("cause_")] = r
+        if r.policy == name and r.metric.startswith(CAUSE_METRICS) and r.value is not None:
+            found.setdefault(r.window, {})[r.metric.removeprefix(CAUSE_METRICS)] = r
     needed = {"measurement_share", "cost_share", "cost"}
     return [
         Reason(
@@ -92,6 +94,12 @@ def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name
             sentence += f"; there it costs {_times(reason.ratio)}"
         sentences.append(f"{sentence}.")
     return sentences or [f"{name}: no cause holds much more of its cost than of the measurements."]
+
+
+def fill(sentence: str, width: int) -> str:
+    """Break a sentence into lines, no number from its unit and no interval apart."""
+    kept = re.sub(r"\[[^\]]*\]| %", lambda found: found[0].replace(" ", "\xa0"), sentence)
+    return textwrap.fill(kept, width, break_on_hyphens=False).replace("\xa0", " ")
 
 
 def _percent(record: Record) -> str:

@@ -1,0 +1,64 @@
+"""The worst episodes of competitors, run once more for the report."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy
+
+from ..baselines.problem import Problem
+from ..evaluation.dataset import groups_of
+from ..evaluation.evaluate import Experiment
+from ..evaluation.metrics import Record
+from ..evaluation.worst_episodes import describe_worst, run_episodes, select_worst
+from ..names import competitors_of
+from .reasons import reasons_of
+from .results import WorstTrack, components_to_draw, track_of
+
+
+def find_worst(
+    problem: Problem,
+    experiment: Experiment,
+    costs: Mapping[str, numpy.ndarray],
+    records: Sequence[Record],
+    explained: Sequence[str],
+    trust: bool = False,
+) -> list[WorstTrack]:
+    """Run the worst episodes of some competitors once more, each beside the opponent, and return their tracks.
+
+    Args:
+        problem: whose competitors they are.
+        experiment: of the evaluation.
+        costs: mean cost of every episode by name, ``(episodes,)``.
+        records: of the evaluation.
+        explained: names of the competitors.
+        trust: load models that can execute code.
+    """
+    found = []
+    for name in explained:
+        if name not in costs:
+            continue
+        opponent = opponent_in(records, name)
+        numbers = select_worst(costs[name])
+        makers = competitors_of(problem, [name, opponent] if opponent else [name], trust)
+        dataset = run_episodes(experiment, makers, numbers)
+        components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
+        for i, worst in enumerate(describe_worst(dataset, numbers, name, opponent)):
+            ratio = worst.cost / worst.opponent_cost if worst.opponent_cost > 0.0 else math.nan
+            found.append(
+                WorstTrack(
+                    name,
+                    opponent,
+                    worst.seed,
+                    worst.cost,
+                    ratio if math.isfinite(ratio) else None,
+                    worst.cause,
+                    track_of(dataset, components, plane, i),
+                )
+            )
+    return found
+
+
+def opponent_in(records: Sequence[Record], name: str) -> str:
+    """Return with whom the records compare a competitor's cost; empty: with nobody."""
+    ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
+    return ratios[0] if ratios else ""
