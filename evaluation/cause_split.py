@@ -139,6 +139,24 @@ def split(
     return measures, CauseCosts(present, numpy.stack(costs, axis=1))
 
 
+def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
+    """Weigh causes by how much of the cost falls under them, and how much dearer than elsewhere a measurement is there.
+
+    The share of the cost times the logarithm of the mean cost under the cause over that of all measurements: of much cost
+    in few measurements it is large, of a cause that holds nearly always small.
+
+    Args:
+        cost_share: of the whole cost, of any shape.
+        measurement_share: of all measurements, likewise.
+
+    Returns:
+        Weights of that shape; zero where no cost falls.
+    """
+    some = (cost_share > 0.0) & (measurement_share > 0.0)
+    dearer = numpy.divide(cost_share, measurement_share, out=numpy.ones_like(cost_share), where=some)
+    return numpy.where(some, cost_share, 0.0) * numpy.log(dearer)
+
+
 def opponent_of(name: str, costs: Mapping[str, float], ranked: Sequence[str]) -> str:
     """Return with whom a competitor is compared: the cheapest other one that is ranked; empty where there is nobody.
 

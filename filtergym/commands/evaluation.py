@@ -40,6 +40,7 @@ from ..reports.records import write_records
 from ..reports.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables import flights_table, recording_table, results_tables
 from ..reports.work import work_of
+from ..reports.worst import worst_figures
 from .shown import REPORT, make_report
 from .terminal import command_line, console, pair, progress_bar
 
@@ -311,6 +312,9 @@ def write(
             if not refusal:
                 write_dataset(place / "results.nc", whole)
             for name, figure in evaluation_figures(outcome.curves, outputs.columns, learned=learned):
+                for suffix in outputs.formats:
+                    save(figure, place / f"{name}.{suffix}")
+            for name, figure in worst_figures(worst, phrases_of(outcome.dataset), outputs.columns):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
             if results:

@@ -5,7 +5,9 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ..evaluation.cause_split import CAUSE_METRICS, EVERYTHING
+import numpy
+
+from ..evaluation.cause_split import CAUSE_METRICS, EVERYTHING, reason_weight
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .tables import rank_competitors, with_interval
@@ -34,6 +36,12 @@ class Reason(NamedTuple):
     def excess(self) -> float:
         """Share of the cost beyond the share of the measurements."""
         return (self.share.value or 0.0) - (self.measurements.value or 0.0)
+
+    @property
+    def weight(self) -> float:
+        """See :func:`.evaluation.cause_split.reason_weight`."""
+        shares = (numpy.array(record.value or 0.0) for record in (self.share, self.measurements))
+        return float(reason_weight(*shares))
 
 
 def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
@@ -66,13 +74,13 @@ def reasons_of(records: Sequence[Record], name: str) -> list[Reason]:
 
 
 def largest_reasons(reasons: Sequence[Reason]) -> list[Reason]:
-    """Return the causes that hold most of the cost beyond their share of the measurements, the largest first.
+    """Return the causes of the largest weight that hold clearly more of the cost than of the measurements.
 
     Args:
         reasons: of :func:`reasons_of`.
     """
     causes = [reason for reason in reasons if reason.cause != EVERYTHING and reason.excess >= LEAST_EXCESS]
-    return sorted(causes, key=lambda reason: -reason.excess)[:MOST_REASONS]
+    return sorted(causes, key=lambda reason: -reason.weight)[:MOST_REASONS]
 
 
 def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name: str) -> list[str]:

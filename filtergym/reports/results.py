@@ -62,8 +62,8 @@ class WorstTrack(NamedTuple):
     """Mean over the episode."""
     ratio: float | None
     """Of the cost to the opponent's."""
-    cause: str
-    """Under which most of the cost falls beyond its share of the measurements; empty: none."""
+    causes: list[str]
+    """The main ones; empty: none."""
     track: xarray.Dataset | None
     """See :func:`track_of`."""
 

@@ -1,7 +1,10 @@
 """The worst episodes of competitors, run once more for the report."""
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy
 
@@ -9,7 +12,7 @@ from ..baselines.problem import Problem
 from ..evaluation.dataset import groups_of
 from ..evaluation.evaluate import Experiment
 from ..evaluation.metrics import Record
-from ..evaluation.worst_episodes import describe_worst, run_episodes, select_worst
+from ..evaluation.worst_episodes import describe_worst, draw_worst, run_episodes, select_worst
 from ..names import competitors_of
 from .reasons import reasons_of
 from .results import WorstTrack, components_to_draw, track_of
@@ -51,7 +54,7 @@ def find_worst(
                     worst.seed,
                     worst.cost,
                     ratio if math.isfinite(ratio) else None,
-                    worst.cause,
+                    worst.causes,
                     track_of(dataset, components, plane, i),
                 )
             )
@@ -62,3 +65,34 @@ def opponent_in(records: Sequence[Record], name: str) -> str:
     """Return with whom the records compare a competitor's cost; empty: with nobody."""
     ratios = [reason.ratio.component for reason in reasons_of(records, name) if reason.ratio is not None]
     return ratios[0] if ratios else ""
+
+
+def worst_figures(
+    worst: Sequence[WorstTrack], phrases: Mapping[str, str], columns: int
+) -> Iterator[tuple[str, Any]]:
+    """Draw the worst episodes of each competitor: the name of a file, and the figure.
+
+    Args:
+        worst: of any competitors.
+        phrases: when each cause holds, by name.
+        columns: of a paper, 1 or 2, as wide as which figures are.
+    """
+    names = list(dict.fromkeys(one.policy for one in worst))
+    for name in names:
+        own = [(one, one.track) for one in worst if one.policy == name and one.track is not None]
+        titles = [_titles(one, phrases) for one, _ in own]
+        if own:
+            place = "worst_episodes" if len(names) == 1 else f"worst_episodes_{_file_name(name)}"
+            yield place, draw_worst([track for _, track in own], titles, name, columns=columns)
+
+
+def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
+    """Seed and main cause, and cost, of an episode."""
+    against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
+    cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
+    return f"seed {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
+
+
+def _file_name(name: str) -> str:
+    """Return a competitor's name as a part of a file's."""
+    return re.sub(r"[^\w.-]", "_", Path(name).name)
