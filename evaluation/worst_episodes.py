@@ -143,7 +143,7 @@ def draw_worst(tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str
     colours = dict(zip([name, *others], COLOURS, strict=False))
     for pair, track, title in zip(axes, tracks, titles, strict=True):
         for axis, words in zip(pair, title, strict=True):
-            lines = (textwrap.fill(line, {1: 24, 2: 48}[columns]) for line in words.split("\n"))
+            lines = (textwrap.fill(line, {1: 20, 2: 48}[columns]) for line in words.split("\n"))
             axis.set_title("\n".join(lines), loc="left")
         _draw_positions(pair[0], track, colours, name)
         _draw_errors(pair[1], track, colours)

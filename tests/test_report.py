@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+from types import SimpleNamespace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -208,9 +209,38 @@ def command_console():
 
 
 def test_consistency_in_a_word():
-    assert [consistency_word(x) for x in (0.4, 0.5, 2.0, 2.1, None)] == [
-        "cautious", "consistent", "consistent", "overconfident", "says nothing",
-    ]  # fmt: skip
+    """Consistent where the interval of the mean NEES holds one, however near or far the mean is."""
+    words = {
+        (0.9, 0.8, 1.01): "consistent",
+        (1.6, 0.9, 4.0): "consistent",
+        (1.02, 1.01, 1.03): "slightly overconfident",
+        (0.98, 0.97, 0.99): "slightly cautious",
+        (2.1, 2.0, 2.2): "overconfident",
+        (0.4, 0.3, 0.5): "cautious",
+        (1.0, 1.0, 1.0): "no interval",
+        (1.0, None, None): "no interval",
+        (None, None, None): "says nothing",
+    }
+    assert {ends: consistency_word(SimpleNamespace(value=ends[0], low=ends[1], high=ends[2])) for ends in words} == words
+    assert consistency_word(None) == "says nothing"
+
+
+def test_only_who_is_consistent_is_called_so(result):
+    """The word in the table, the headline and the verdict follows from the interval of the record."""
+    for record in result.records:
+        if (record.metric, record.window) == ("anees", "all"):
+            holds_one = record.low <= 1.0 <= record.high
+            assert (consistency_word(record) == "consistent") == holds_one
+    told = [
+        r._replace(value=1.1, low=1.05, high=1.2) if r.metric == "anees" and r.window == "all" else r
+        for r in result.records
+    ]
+    assert any("not consistent" in sentence and "1.1" in sentence for sentence in verdict([result._replace(records=told)]))
+    held = [
+        r._replace(value=1.1, low=0.9, high=1.2) if r.metric == "anees" and r.window == "all" else r
+        for r in result.records
+    ]
+    assert any("of every winner is consistent" in sentence for sentence in verdict([result._replace(records=held)]))
 
 
 def test_verdict_follows_from_the_numbers(result):

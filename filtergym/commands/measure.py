@@ -357,7 +357,12 @@ def benchmark(
 def animate(
     environment: Environment,
     policy: Annotated[
-        list[str], typer.Option(help="Policy; repeat for several.", autocompletion=complete_policy)
+        list[str],
+        typer.Option(
+            help="Policy, estimator, smoother or reference; repeat for several. Also a file, the folder of a training "
+            "run, or module:Class.",
+            autocompletion=complete_policy,
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
     scenario: ScenarioName = None,
@@ -365,7 +370,7 @@ def animate(
     every: Annotated[int, typer.Option(help="Actions from one frame to the next.")] = 2,
     trust: Trust = False,
 ) -> None:
-    """Draw an episode under each policy as an animated GIF.
+    """Draw an episode under each policy, estimator, smoother or reference as an animated GIF.
 
     Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
     """
