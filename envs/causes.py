@@ -18,6 +18,12 @@ LARGE_ERROR = 4.0
 rightly, one of 16,000."""
 
 
+MOST_CAUSES = 50
+"""Of a task: which of them hold is one number."""
+RESERVED = ("all", "start", "other")
+"""Names that an evaluation gives to causes of its own."""
+
+
 class Moment(NamedTuple):
     """What causes are computed from, at one measurement of N episodes."""
 
@@ -123,7 +129,7 @@ def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
     """Return which causes hold, as one number: the sum of 2 to the power of the place of each, ``(N,)``.
 
     Args:
-        causes: of the task, at most 50.
+        causes: of the task, at most ``MOST_CAUSES``.
         moment: at a measurement.
     """
     xp, total = moment.xp, 0.0 * moment.state[0]

@@ -164,19 +164,21 @@ class Model:
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
 
-    def causes(self, episode: Episode) -> Array:
-        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
-        task, measurement = self.task, episode.measurement
-        world = task.world
-        moment = Moment(
-            task.xp,
+    def moment(self, episode: Episode) -> Moment:
+        """What causes are computed from."""
+        world, measurement = self.task.world, episode.measurement
+        return Moment(
+            self.task.xp,
             self.context(episode),
             world.state(episode.truth),
             measurement,
             world.component_readings(measurement),
             world.component_deviations(measurement),
         )
-        return cause_number(task.causes, moment)
+
+    def causes(self, episode: Episode) -> Array:
+        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        return cause_number(self.task.causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""

@@ -11,13 +11,13 @@ from typing import NamedTuple
 import numpy
 import xarray
 
+from ..envs.causes import RESERVED
 from .bootstrap import Bootstrap, Estimate, ratio
 
-EVERYTHING = "all"
-"""Name of the whole, in the place of a cause."""
+EVERYTHING, START, OTHER = RESERVED
+"""Names of the whole, in the place of a cause, and of the causes that every evaluation adds."""
 CAUSE_METRICS = "cause_"
 """Begins the names of metrics by cause."""
-START, OTHER = "start", "other"
 VARIABLE = "causes"
 """Of an evaluation: which causes hold, see :func:`.envs.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .dataset import windows_of
+from .curves import stretches_of
+from .dataset import windows_of, with_windows
 from .looks import GREY, distinguish_lines, group_equal_lines, join_names, looks, styles
 from .print_layout import (
     add_title,
@@ -237,9 +238,11 @@ def draw_cost_difference(
     Arguments as of :func:`draw_error_over_time`.
     """
     look = looks(curves) if look is None else look
-    over = curves.drop_dims(["time", *(["window"] if curves.sizes["stretch"] < curves.sizes["time"] else [])])
-    over = over.rename({name: name.replace("stretch_", "") for name in over.coords if "stretch_" in str(name)})
-    over = over.rename(stretch="time")
+    length = stretches_of(curves.sizes["time"])[0].stop
+    windows = {name: tuple(1 + (end - 1) // length for end in ends) for name, ends in windows_of(curves).items()}
+    renamed = {"stretch": "time", "stretch_elapsed": "elapsed"}
+    over = curves.drop_dims(["time", "window"])
+    over = with_windows(over.rename({k: v for k, v in renamed.items() if k in over.coords}), windows)
     bases = {"paper": curves.attrs["paper"], "best": curves.attrs.get("best", "")}
     drawn: dict[str, Panel] = {}
     for key, base in bases.items():
@@ -254,9 +257,10 @@ def draw_cost_difference(
         # One line, or a moment, must not squash all others.
         sizes = numpy.concatenate([numpy.abs(line[numpy.isfinite(line)]) for line in shown])
         reach = 1.5 * float(numpy.quantile(sizes, 0.99)) if len(sizes) else 1.0
-        lowest, highest = (float(end([end(line) for line in shown if numpy.isfinite(line).all()] or [0.0])) for end in (min, max))
+        there = numpy.concatenate([line[numpy.isfinite(line)] for line in shown])
+        lowest, highest = (float(there.min()), float(there.max())) if len(there) else (0.0, 0.0)
         margin = 0.05 * (highest - lowest) or 1.0
-        axis.set_ylim(max(lowest - margin, -reach), min(highest + margin, reach))
+        axis.set_ylim(max(lowest - margin, -reach or -1.0), min(highest + margin, reach or 1.0))
 
     title = f"{_title(curves)}; below zero is better, 95 % bands, paired"
     return _over_time(over, list(drawn.values()), look, title, columns, finish)

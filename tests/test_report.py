@@ -7,6 +7,7 @@ import re
 from types import SimpleNamespace
 from html.parser import HTMLParser
 
+import markupsafe
 import numpy as np
 import pytest
 from made_results import results_of
@@ -14,6 +15,7 @@ from made_results import results_of
 from filtergym.reports.headline import headline_table
 from filtergym.reports.html_report import report_html
 from filtergym.reports.ranking import best_of_origins, verdict
+from filtergym.reports.reasons import reason_sentences
 from filtergym.reports.results import (
     MOST_SHOWN,
     MOST_TIMES,
@@ -46,7 +48,7 @@ def hostile(result, text=HOSTILE):
     records = [
         r._replace(
             policy=renamed[r.policy], environment=text, scenario=text, control=text, unit=text, split=text,
-            component=r.component and r.component + text, kind=r.kind,
+            component=r.component and r.component + text, kind=r.kind, window=r.window + text * (r.window != "all"),
         )
         for r in result.records
     ]  # fmt: skip
@@ -54,7 +56,7 @@ def hostile(result, text=HOSTILE):
         data.assign_coords(policy=[renamed[name] for name in data["policy"].values.tolist()])
         for data in (result.curves, result.track)
     )
-    curves = curves.assign_coords(
+    curves = curves.assign_attrs(best=renamed[curves.attrs["best"]]).assign_coords(
         quantity=[f"{name}{text}" for name in curves["quantity"].values.tolist()],
         unit=("quantity", [text] * curves.sizes["quantity"]),
     )
@@ -70,6 +72,18 @@ def hostile(result, text=HOSTILE):
         records=records,
         curves=curves,
         track=track.assign_attrs(seed=text),
+        causes={cause: text for cause in result.causes},
+        explained=[renamed[name] for name in result.explained],
+        worst=[
+            one._replace(
+                policy=renamed[one.policy],
+                opponent=renamed[one.opponent],
+                seed=text,
+                causes=[text],
+                track=one.track.assign_coords(policy=[renamed[n] for n in one.track["policy"].values.tolist()]),
+            )
+            for one in result.worst
+        ],
     )
 
 
@@ -110,9 +124,12 @@ def test_results_are_read_as_they_were_written(result, tmp_path):
     write_results(tmp_path / "results.json", [result], SETTINGS)
     [read], settings = read_results(tmp_path)
     assert settings == SETTINGS
-    assert read._replace(curves=None, track=None) == result._replace(curves=None, track=None)
-    for name, tolerance in (("curves", 5e-4), ("track", 1e-3)):
-        before, after = getattr(result, name), getattr(read, name)
+    without = {"curves": None, "track": None, "worst": []}
+    assert read._replace(**without) == result._replace(**without)
+    assert [one._replace(track=None) for one in read.worst] == [one._replace(track=None) for one in result.worst]
+    pairs = [(getattr(result, name), getattr(read, name)) for name in ("curves", "track")]
+    pairs += [(one.track, other.track) for one, other in zip(result.worst, read.worst, strict=True)]
+    for (before, after), tolerance in zip(pairs, (5e-4, 1e-3, 1e-3, 1e-3, 1e-3), strict=True):
         assert set(before.variables) == set(after.variables)
         for key, values in before.data_vars.items():
             # Four significant digits, seven of positions.
@@ -142,6 +159,12 @@ def test_what_tells_most_is_shown(result):
         (lambda d: {**d, "results": [{**d["results"][0], "records": []}]}, "no records"),
         (lambda d: {**d, "results": [{**d["results"][0], "scenario": "x"}]}, "another environment or scenario"),
         (lambda d: {**d, "results": [{**d["results"][0], "learned": 3}]}, "learned must be"),
+        (lambda d: {**d, "results": [{**d["results"][0], "worst": [3]}]}, "worst episode needs its fields"),
+        (lambda d: {**d, "results": [{**d["results"][0], "causes": {"turn": 3}}]}, "causes must be"),
+        (
+            lambda d: {**d, "results": [{**d["results"][0], "worst": [{**d["results"][0]["worst"][0], "cost": 1e999}]}]},
+            "must be finite",
+        ),
         (lambda d: {**d, "results": [{**d["results"][0], "curves": {"coords": {}}}]}, "expected coords"),
         (
             lambda d: {**d, "results": [{**d["results"][0], "track": {"coords": {}, "variables": {}, "attrs": {}}}]},
@@ -270,8 +293,15 @@ def test_page_holds_what_the_file_says(result):
     for name in NAMES:
         assert f'data-sort="{name}"' in html
     assert "filtergym benchmark" in html
+    # Why: the sentences, a row for every cause that holds, and seeds that show an episode again.
+    for sentence in reason_sentences(result.records, result.causes, "imm"):
+        assert str(markupsafe.escape(sentence.removeprefix("imm: "))) in html
+    assert html.count("<details class=\"why\"") == len({r.policy for r in result.records if r.metric == "cause_cost"})
+    assert "<td>in turns and other manoeuvres</td>" in html
+    assert [one.policy for one in result.worst] == ["imm"] * 3
+    assert all(f"<code>{one.seed}</code>" in html for one in result.worst)
     # Every figure says in words what it shows.
-    assert html.count('role="img"') == html.count('<div class="plot"') == 6
+    assert html.count('role="img"') == html.count('<div class="plot"') == 8
     assert not [address for address in page.addresses if not address.startswith("#")]
 
 
