@@ -1,8 +1,8 @@
 """Causes of an estimate's cost: circumstances of a measurement that an author declares, such as a turn.
 
 A cause holds at a measurement or does not, and several may hold at once. Each is computed from what is at hand there, a
-:class:`Moment`, and is traced with the steps of the task. What cannot be known, such as the context of a recording, makes
-no error: a cause that is not known holds nowhere, and an evaluation leaves it out.
+:class:`Moment`, and is traced with the steps of the task. A cause that cannot be known, such as that of a context which
+a recording has not, holds nowhere, and an evaluation leaves it out.
 """
 
 import itertools

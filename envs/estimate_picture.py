@@ -84,19 +84,34 @@ class EstimatePicture(Picture):
         panel.tick_params(labelsize=8)
         panel.grid(color=PALE, linewidth=0.6)
         panel.set_axisbelow(True)
-        labels = [f"{self.task.components[i].name.replace('_', ' ')}, {self.task.components[i].unit}" for i in self.drawn]
+        labels = [
+            f"{self.task.components[i].name.replace('_', ' ')}, {self.task.components[i].unit}"
+            for i in self.drawn
+        ]
         panel.set_xlabel(labels[0] if self.plane else self.clock, fontsize=9)
         panel.set_ylabel(labels[-1], fontsize=9)
         (self.true,) = panel.plot([], [], color=BLACK, linewidth=1.6, label="truth", zorder=3)
         (self.seen,) = panel.plot(
-            [], [], color=ORANGE, linestyle="", marker="x", markersize=4, label="measured" if self.measured else "_", zorder=2
+            [],
+            [],
+            color=ORANGE,
+            linestyle="",
+            marker="x",
+            markersize=4,
+            label="measured" if self.measured else "_",
+            zorder=2,
         )
         (self.believed,) = panel.plot([], [], color=BLUE, linewidth=1.3, label="estimate", zorder=4)
         (self.now,) = panel.plot([], [], color=BLUE, linestyle="", marker="o", markersize=6, zorder=5)
         self.ellipse = Ellipse((0.0, 0.0), 0.0, 0.0, fill=False, color=BLUE, linewidth=1.3, zorder=5)
         panel.add_patch(self.ellipse)
         panel.legend(
-            loc="lower left", bbox_to_anchor=(0.0, 1.005), ncols=3, fontsize=8, frameon=False, borderaxespad=0.2
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.005),
+            ncols=3,
+            fontsize=8,
+            frameon=False,
+            borderaxespad=0.2,
         )
 
     def arrange(self) -> None:
@@ -108,20 +123,20 @@ class EstimatePicture(Picture):
         # One scale for both axes, in the shape of the panel.
         sides = FIGURE_SIZE[0] * PANEL[2], FIGURE_SIZE[1] * PANEL[3]
         scale = max((high - low) / side for (low, high), side in zip(self.limits, sides, strict=True))
-        for set_limits, (low, high), side in zip(
-            (self.panel.set_xlim, self.panel.set_ylim), self.limits, sides, strict=True
-        ):
-            middle, half = 0.5 * (low + high), 0.5 * scale * side
-            set_limits(middle - half, middle + half)
+        (west, east), (south, north) = (
+            (0.5 * (low + high - scale * side), 0.5 * (low + high + scale * side))
+            for (low, high), side in zip(self.limits, sides, strict=True)
+        )
+        self.panel.set_xlim(west, east)
+        self.panel.set_ylim(south, north)
 
     def draw(self, history: History, state: Any) -> None:
         """Move everything to where it is now."""
         empty = numpy.empty(0)
         for name, line in (("true", self.true), ("seen", self.seen), ("believed", self.believed)):
-            values = [history.get(f"{name}.{row}", empty) for row in range(len(self.drawn))]
-            line.set_data(*(values if self.plane else [numpy.arange(1, len(values[0]) + 1), values[0]]))
-        x, y = self.believed.get_data()
-        self.now.set_data(x[-1:], y[-1:])
+            x, y = self._places([history.get(f"{name}.{row}", empty) for row in range(len(self.drawn))])
+            line.set_data(x, y)
+        self.now.set_data(x[-1:], y[-1:])  # what is believed came last
         self.ellipse.set_visible(self.plane and len(x) > 0)
         if self.plane and len(x):
             P = numpy.array([[history[f"covariance.{i}{j}"][-1] for j in range(2)] for i in range(2)])
@@ -131,6 +146,10 @@ class EstimatePicture(Picture):
             self.ellipse.set_width(2.0 * large)
             self.ellipse.set_height(2.0 * small)
             self.ellipse.set_angle(float(numpy.degrees(numpy.arctan2(directions[1, 1], directions[0, 1]))))
+
+    def _places(self, values: Sequence[numpy.ndarray]) -> tuple[numpy.ndarray, numpy.ndarray]:
+        """Where values stand in the panel: in the plane, or over time."""
+        return (values[0], values[1]) if self.plane else (numpy.arange(1, len(values[0]) + 1), values[0])
 
 
 def _extent(values: numpy.ndarray) -> tuple[float, float]:

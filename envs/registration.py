@@ -8,8 +8,8 @@ from typing import Any, ClassVar, get_origin
 import gymnasium
 import numpy
 
-from .causes import MOST_CAUSES, RESERVED
 from .catalogue import USER_TASKS, catalogue, nearest, register
+from .causes import MOST_CAUSES, RESERVED
 from .failures import explain_errors
 from .model import Episode, Model
 from .task import Task

@@ -146,7 +146,8 @@ class Task(ABC):
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
     causes: tuple[Cause, ...] = (MISSED,)
-    """Circumstances by which an evaluation splits what estimates cost, see :mod:`.causes`; may be set for each instance."""
+    """Circumstances by which an evaluation splits what estimates cost, see :mod:`.causes`; each instance may have its
+    own."""
     start_measurements: ClassVar[int] = 10
     """How many measurements are the start of a track, which is one cause more."""
     reward: ClassVar[str] = "cost"

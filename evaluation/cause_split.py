@@ -1,8 +1,8 @@
 """Cost and consistency of a competitor split by cause: how much of them falls in turns, at the start, on outliers.
 
-Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and what remains: ``other``
-holds where no cause does. They may hold together, so shares need not add up to one. Whatever is compared is paired: both
-competitors have their means from the same resamples of the episodes.
+Causes are those that the environment declares (:mod:`.envs.causes`), the start of the track, and what remains:
+``other`` holds where no cause does. They may hold together, so shares need not add up to one. Whatever is compared is
+paired: both competitors have their means from the same resamples of the episodes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,9 +21,7 @@ CAUSE_METRICS = "cause_"
 VARIABLE = "causes"
 """Of an evaluation: which causes hold, see :func:`.envs.causes.cause_number`."""
 COUNT, COST, NEES, JUDGED = range(4)
-"""What is summed over the measurements in which a cause holds: one, the cost, the NEES over its dimension where there is
-one, and one where there is.
-"""
+"""What is summed where a cause holds: one, the cost, the NEES over its dimension, and one where there is a NEES."""
 
 
 class CauseMeasure(NamedTuple):
@@ -118,8 +116,8 @@ def split(
         bootstrap: over the episodes.
 
     Returns:
-        For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement under
-        it) and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, to be compared.
+        For every cause ``cause_measurement_share``, ``cause_cost_share``, ``cause_cost`` (mean cost of a measurement)
+        and ``cause_anees`` (mean NEES over its dimension), with intervals; and the costs, to be compared.
     """
     names = [EVERYTHING, *run["cause"].values.tolist(), START, OTHER]
     measures, present, costs = [], [], []
@@ -140,10 +138,10 @@ def split(
 
 
 def reason_weight(cost_share: numpy.ndarray, measurement_share: numpy.ndarray) -> numpy.ndarray:
-    """Weigh causes by how much of the cost falls under them, and how much dearer than elsewhere a measurement is there.
+    """Weigh causes by how much of the cost falls under them, and how much dearer a measurement is there.
 
-    The share of the cost times the logarithm of the mean cost under the cause over that of all measurements: of much cost
-    in few measurements it is large, of a cause that holds nearly always small.
+    The share of the cost times the logarithm of the mean cost under the cause over that of all measurements: much cost
+    in few measurements weighs most, a cause that holds nearly always little.
 
     Args:
         cost_share: of the whole cost, of any shape.

@@ -72,8 +72,8 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
           percentiles, ``_low`` and ``_high``, of policies whose action is a box; ``gain`` (policy, gain_name, time), of
           gains that a bank records, likewise;
         * ``mean_cost`` (policy): over episodes;
-        * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less that
-          of the paper's algorithm and of the best that is ranked, paired, with ``_low`` and ``_high``.
+        * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less
+          that of the paper's algorithm and of the best that is ranked, paired, with ``_low`` and ``_high``.
 
         Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
         256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every
@@ -95,7 +95,8 @@ class CompetitorCurves(NamedTuple):
     actions: list[str]
     gains: list[str]
     costs: numpy.ndarray | None = None
-    """Mean over episodes of the cost in each stretch, of the data and every resample, ``(1 + resamples, stretches)``."""
+    """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
+    None of bounds, and without truth."""
 
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:

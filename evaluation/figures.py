@@ -239,7 +239,9 @@ def draw_cost_difference(
     """
     look = looks(curves) if look is None else look
     length = stretches_of(curves.sizes["time"])[0].stop
-    windows = {name: tuple(1 + (end - 1) // length for end in ends) for name, ends in windows_of(curves).items()}
+    windows = {
+        name: tuple(1 + (end - 1) // length for end in ends) for name, ends in windows_of(curves).items()
+    }
     renamed = {"stretch": "time", "stretch_elapsed": "elapsed"}
     over = curves.drop_dims(["time", "window"])
     over = with_windows(over.rename({k: v for k, v in renamed.items() if k in over.coords}), windows)

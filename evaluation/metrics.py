@@ -14,8 +14,8 @@ import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
-from .cause_split import VARIABLE as CAUSES
 from .cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
+from .cause_split import VARIABLE as CAUSES
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
 from .statistics import ALL, Function, Key, Statistic, identity, reduce_run

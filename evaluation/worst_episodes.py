@@ -48,7 +48,9 @@ def select_worst(costs: numpy.ndarray, most: int = MOST_WORST) -> list[int]:
     return [int(i) for i in order[:most] if not numpy.isnan(costs[i])]
 
 
-def run_episodes(experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]) -> xarray.Dataset:
+def run_episodes(
+    experiment: Experiment, competitors: Mapping[str, Any], numbers: list[int]
+) -> xarray.Dataset:
     """Run some episodes of an experiment once more, and keep what a picture of each shows.
 
     Args:
@@ -126,12 +128,14 @@ def _share_of_all(sums: numpy.ndarray) -> numpy.ndarray:
 
 
 @in_print
-def draw_worst(tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2) -> Any:
+def draw_worst(
+    tracks: Sequence[xarray.Dataset], titles: Sequence[tuple[str, str]], name: str, *, columns: int = 2
+) -> Any:
     """Draw episodes below each other: where the target was and was believed to be, and how large the error was.
 
     Args:
-        tracks: of each, with ``truth``, ``seen`` where anything is, ``estimate`` and ``sigma`` (policy, component, time);
-            the attribute ``plane`` says whether the first two components are the axes of a plane.
+        tracks: of each, with ``truth``, ``seen`` where anything is, ``estimate`` and ``sigma`` over policy, component
+            and time; the attribute ``plane`` says whether the first two components are the axes of a plane.
         titles: of each, above its first axes and above its second.
         name: of the competitor whose they are; it is drawn first.
         columns: of a paper, as wide as which the figure is.
@@ -171,12 +175,16 @@ def _draw_positions(axis: Any, track: xarray.Dataset, colours: Mapping[str, str]
     if "truth" in track:
         axis.plot(*line(own["truth"]), color="0.75", linewidth=3.0)
     if "seen" in track:
-        axis.plot(*line(own["seen"]), color="0.5", linestyle="", marker="+", markersize=2.5, markeredgewidth=0.5)
+        axis.plot(
+            *line(own["seen"]), color="0.5", linestyle="", marker="+", markersize=2.5, markeredgewidth=0.5
+        )
     for one in reversed([str(n) for n in track["policy"].values]):
         axis.plot(*line(track["estimate"].sel(policy=one)), color=colours[one], linewidth=1.0)
     labels = [
         f"{component.replace('_', ' ')}, {unit}"
-        for component, unit in zip(track["component"].values.tolist(), track["unit"].values.tolist(), strict=True)
+        for component, unit in zip(
+            track["component"].values.tolist(), track["unit"].values.tolist(), strict=True
+        )
     ]
     axis.set_xlabel(labels[0] if plane else _clock_label(track))
     axis.set_ylabel(labels[1] if plane else labels[0])

@@ -14,7 +14,13 @@ from filtergym.evaluation.curves import BAND_RESAMPLES, cost_in_stretches, curve
 from filtergym.evaluation.worst_episodes import describe_worst, main_causes, run_episodes, select_worst
 
 import filtergym
-from filtergym.reports.reasons import explained_by_default, fill, largest_reasons, reason_sentences, reasons_of
+from filtergym.reports.reasons import (
+    explained_by_default,
+    fill,
+    largest_reasons,
+    reason_sentences,
+    reasons_of,
+)
 from filtergym.reports.worst import find_worst, worst_figures
 
 ENV = "filtergym/ManeuveringTarget-v0"
@@ -113,6 +119,7 @@ def test_opponents():
 def test_a_summary_splits_what_a_whole_evaluation_does(records):
     from filtergym.evaluation.parallel import Workers
     from filtergym.evaluation.summary import combine_summaries, summaries
+
     from filtergym.names import evaluation_requests
 
     problem = problem_of(ENV)
@@ -130,7 +137,7 @@ def test_every_environment_says_what_its_causes_are(env_id):
     dataset = filtergym.evaluate(env_id, [problem_of(env_id).baselines.score_paper], None, 6)
     phrases = phrases_of(dataset)
     assert len(phrases) > 5
-    held = {name: flags for name, flags in held_causes(dataset.isel(policy=0))}
+    held = dict(held_causes(dataset.isel(policy=0)))
     assert set(held) == {"all", *phrases}
     assert sum(flags.any() for flags in held.values()) > 4
     # They complete "most of its cost falls".
@@ -284,7 +291,7 @@ def test_causes_of_ones_own_are_checked():
         id = "mine/Twice-v0"
         causes = (MISSED, MISSED)
 
-    with pytest.raises(ValueError, match="causes of different names, .* got the name 'missed'"):
+    with pytest.raises(ValueError, match=r"causes of different names, .* got the name 'missed'"):
         filtergym.register_task(Twice)
 
     class Wrong(task_class(ENV)):

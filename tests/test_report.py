@@ -4,8 +4,8 @@ import base64
 import gzip
 import json
 import re
-from types import SimpleNamespace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import markupsafe
 import numpy as np
@@ -72,7 +72,7 @@ def hostile(result, text=HOSTILE):
         records=records,
         curves=curves,
         track=track.assign_attrs(seed=text),
-        causes={cause: text for cause in result.causes},
+        causes=dict.fromkeys(result.causes, text),
         explained=[renamed[name] for name in result.explained],
         worst=[
             one._replace(
@@ -80,7 +80,9 @@ def hostile(result, text=HOSTILE):
                 opponent=renamed[one.opponent],
                 seed=text,
                 causes=[text],
-                track=one.track.assign_coords(policy=[renamed[n] for n in one.track["policy"].values.tolist()]),
+                track=one.track.assign_coords(
+                    policy=[renamed[n] for n in one.track["policy"].values.tolist()]
+                ),
             )
             for one in result.worst
         ],
@@ -126,7 +128,9 @@ def test_results_are_read_as_they_were_written(result, tmp_path):
     assert settings == SETTINGS
     without = {"curves": None, "track": None, "worst": []}
     assert read._replace(**without) == result._replace(**without)
-    assert [one._replace(track=None) for one in read.worst] == [one._replace(track=None) for one in result.worst]
+    assert [one._replace(track=None) for one in read.worst] == [
+        one._replace(track=None) for one in result.worst
+    ]
     pairs = [(getattr(result, name), getattr(read, name)) for name in ("curves", "track")]
     pairs += [(one.track, other.track) for one, other in zip(result.worst, read.worst, strict=True)]
     for (before, after), tolerance in zip(pairs, (5e-4, 1e-3, 1e-3, 1e-3, 1e-3), strict=True):
@@ -162,7 +166,9 @@ def test_what_tells_most_is_shown(result):
         (lambda d: {**d, "results": [{**d["results"][0], "worst": [3]}]}, "worst episode needs its fields"),
         (lambda d: {**d, "results": [{**d["results"][0], "causes": {"turn": 3}}]}, "causes must be"),
         (
-            lambda d: {**d, "results": [{**d["results"][0], "worst": [{**d["results"][0]["worst"][0], "cost": 1e999}]}]},
+            lambda d: {
+                **d, "results": [{**(r := d["results"][0]), "worst": [{**r["worst"][0], "cost": 1e999}]}],
+            },
             "must be finite",
         ),
         (lambda d: {**d, "results": [{**d["results"][0], "curves": {"coords": {}}}]}, "expected coords"),
@@ -244,7 +250,9 @@ def test_consistency_in_a_word():
         (1.0, None, None): "no interval",
         (None, None, None): "says nothing",
     }
-    assert {ends: consistency_word(SimpleNamespace(value=ends[0], low=ends[1], high=ends[2])) for ends in words} == words
+    assert {
+        ends: consistency_word(SimpleNamespace(value=ends[0], low=ends[1], high=ends[2])) for ends in words
+    } == words
     assert consistency_word(None) == "says nothing"
 
 
@@ -258,12 +266,17 @@ def test_only_who_is_consistent_is_called_so(result):
         r._replace(value=1.1, low=1.05, high=1.2) if r.metric == "anees" and r.window == "all" else r
         for r in result.records
     ]
-    assert any("not consistent" in sentence and "1.1" in sentence for sentence in verdict([result._replace(records=told)]))
+    assert any(
+        "not consistent" in sentence and "1.1" in sentence
+        for sentence in verdict([result._replace(records=told)])
+    )
     held = [
         r._replace(value=1.1, low=0.9, high=1.2) if r.metric == "anees" and r.window == "all" else r
         for r in result.records
     ]
-    assert any("of every winner is consistent" in sentence for sentence in verdict([result._replace(records=held)]))
+    assert any(
+        "of every winner is consistent" in sentence for sentence in verdict([result._replace(records=held)])
+    )
 
 
 def test_verdict_follows_from_the_numbers(result):
@@ -296,7 +309,9 @@ def test_page_holds_what_the_file_says(result):
     # Why: the sentences, a row for every cause that holds, and seeds that show an episode again.
     for sentence in reason_sentences(result.records, result.causes, "imm"):
         assert str(markupsafe.escape(sentence.removeprefix("imm: "))) in html
-    assert html.count("<details class=\"why\"") == len({r.policy for r in result.records if r.metric == "cause_cost"})
+    assert html.count('<details class="why"') == len(
+        {r.policy for r in result.records if r.metric == "cause_cost"}
+    )
     assert "<td>in turns and other manoeuvres</td>" in html
     assert [one.policy for one in result.worst] == ["imm"] * 3
     assert all(f"<code>{one.seed}</code>" in html for one in result.worst)

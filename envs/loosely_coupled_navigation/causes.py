@@ -1,4 +1,4 @@
-"""What makes a fusion of LooselyCoupledNavigation costly: outages, jamming, spoofing, noise that nobody reports, outliers."""
+"""What makes a fusion of LooselyCoupledNavigation costly: outages, jamming, spoofing, unreported noise, outliers."""
 
 from collections.abc import Callable
 

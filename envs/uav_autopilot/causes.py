@@ -40,7 +40,9 @@ CAUSES = (
     Cause("command", f"in the {SETTLING:g} measurements after a command", _has_new_command),
     Cause("disturbance", f"where the disturbance is at least {RAISED:g} times the nominal one", _is_gusty),
     Cause(
-        "sensor noise", f"where a sensor's noise is at least {RAISED:g} times the nominal one", _has_noisy_sensor
+        "sensor noise",
+        f"where a sensor's noise is at least {RAISED:g} times the nominal one",
+        _has_noisy_sensor,
     ),
     Cause("calm", "where all noise is near its nominal level", _is_calm),
     MISSED._replace(name="dropout", phrase="in dropouts of a sensor"),

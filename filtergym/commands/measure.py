@@ -146,7 +146,8 @@ def evaluate_policies(
     why: Annotated[
         list[str] | None,
         typer.Option(
-            help="Whose cost is explained; repeat for several; default: the first --policy, else the paper's algorithm.",
+            help="Whose cost is explained; repeat for several; default: the first --policy, else the paper's "
+            "algorithm.",
             autocompletion=complete_policy,
         ),
     ] = None,

@@ -51,6 +51,7 @@ def headline_table(results: Sequence[Result]) -> Table:
             table.add_row(*row)
     table.caption = (
         "learned and classical steer the paper's filters, an estimator is a filter of its own, the reference knows the "
-        "truth. Covariance: consistent where the interval of ANEES holds one; slightly: off by less than a factor of two."
+        "truth. Covariance: consistent where the interval of ANEES holds one; slightly: off by less than a factor of "
+        "two."
     )
     return table

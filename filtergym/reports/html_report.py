@@ -284,7 +284,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
             {
                 "kind": "difference",
                 "title": "Mine minus theirs over time",
-                "text": "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero is better.",
+                "text": "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero "
+                "is better.",
                 "alternative": "The difference over the whole run stands in the table above.",
             }
         )
@@ -324,7 +325,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "kind": "worst",
                 "title": "The worst episodes",
                 "text": "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, "
-                "estimates, and their covariances at two standard deviations. The slider begins where the error is largest.",
+                "estimates, and their covariances at two standard deviations. The slider begins where "
+                "the error is largest.",
                 "alternative": "An animation of single episodes; the tables of the causes tell their seeds and costs.",
             }
         )

@@ -96,7 +96,9 @@ def reason_sentences(records: Sequence[Record], phrases: Mapping[str, str], name
         return []
     sentences = []
     for reason in largest_reasons(reasons):
-        first = f"{name}: {_percent(reason.share)} of its cost falls {phrases.get(reason.cause, reason.cause)}"
+        first = (
+            f"{name}: {_percent(reason.share)} of its cost falls {phrases.get(reason.cause, reason.cause)}"
+        )
         sentence = f"{first}, {_percent(reason.measurements)} of the measurements"
         if reason.ratio is not None:
             sentence += f"; there it costs {_times(reason.ratio)}"
