@@ -41,8 +41,8 @@ class Moment(NamedTuple):
     """Standard deviations that are stated for their errors, ``(C, N)``."""
 
     def knows(self, *names: str) -> bool:
-        """Whether the context tells all of these."""
-        return all(name in self.context for name in names)
+        """Whether the context tells all of these, and each of something: of no commands there are no times."""
+        return all(name in self.context and 0 not in self.context[name].shape for name in names)
 
 
 class Cause(NamedTuple):

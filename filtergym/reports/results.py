@@ -57,7 +57,7 @@ class WorstTrack(NamedTuple):
     opponent: str
     """With whom it is compared; empty: nobody."""
     seed: str
-    """Of the episode, in words: it has more digits than a number of JavaScript."""
+    """Of the episode, in words: it has more digits than a number of JavaScript. Of a recording its name there."""
     cost: float
     """Mean over the episode."""
     ratio: float | None

@@ -37,6 +37,7 @@ def why_section(result: Result) -> list[dict[str, Any]]:
                 ],
                 "rows": [_row(result, reason, bool(against)) for reason in reasons],
                 "worst": [_worst_row(result, one) for one in result.worst if one.policy == name],
+                "recorded": result.curves is not None and bool(result.curves.attrs.get("recorded")),
                 "opponent": opponents[0] if opponents else "",
             }
         )

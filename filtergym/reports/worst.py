@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy
+import xarray
 
 from ..baselines.problem import Problem
 from ..evaluation.dataset import groups_of
@@ -51,7 +52,7 @@ def find_worst(
                 WorstTrack(
                     name,
                     opponent,
-                    worst.seed,
+                    _label(dataset, i),
                     worst.cost,
                     ratio if math.isfinite(ratio) else None,
                     worst.causes,
@@ -59,6 +60,12 @@ def find_worst(
                 )
             )
     return found
+
+
+def _label(dataset: xarray.Dataset, number: int) -> str:
+    """Return what shows an episode again: its seed, or of a recording its name there."""
+    name = "flight" if dataset.attrs["recorded"] else "episode_seed"
+    return str(dataset[name].values[number])
 
 
 def opponent_in(records: Sequence[Record], name: str) -> str:
@@ -90,7 +97,7 @@ def _titles(one: WorstTrack, phrases: Mapping[str, str]) -> tuple[str, str]:
     """Seed and main cause, and cost, of an episode."""
     against = "" if one.ratio is None else f",\n{one.ratio:.3g} times {one.opponent}"
     cause = phrases.get(one.causes[0], one.causes[0]) if one.causes else "under no cause in particular"
-    return f"seed {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
+    return f"episode {one.seed}\nmostly {cause}", f"mean cost {one.cost:.3g}{against}"
 
 
 def _file_name(name: str) -> str:

@@ -359,7 +359,7 @@
       const data = new Data(track);
       draw = drawTrack(inner, { lines, track: data }, worstTime(data, policy));
     };
-    addChoices(figure, cell.worst.map(({ policy, seed, cost }) => `${policy}, seed ${seed}, mean cost ${cost}`), show);
+    addChoices(figure, cell.worst.map(({ policy, seed, cost }) => `${policy}, episode ${seed}, mean cost ${cost}`), show);
     show(0);
     return () => draw();
   }
