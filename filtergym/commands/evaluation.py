@@ -322,12 +322,12 @@ def write(
         outcome.store.clear()
     for table in tables:
         console.print(table)
-    for note in notes_of(outcome.dataset):
-        console.print(note, highlight=False, soft_wrap=True)
     phrases = phrases_of(outcome.dataset)
     for name in explained:
         for sentence in reason_sentences(outcome.records, phrases, name):
             console.print(fill(sentence, console.width), highlight=False)
+    for note in notes_of(outcome.dataset):
+        console.print(note, highlight=False, soft_wrap=True)
     if outputs.folder is not None:
         what = f"figures, records and {RESULTS}" if results else "figures and records"
         console.print(f"{what} in {outputs.folder}")
