@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy
 
+from .causes import Moment, cause_number
 from .draws import Draws
 from .filter import Filter, Input
 from .observation import Array, Blocks, Field, Reader
@@ -176,6 +177,22 @@ class Model:
         """What was drawn for the episode, and what of it holds now: arrays of floats ``(..., N)``."""
         context = self.task.world.context(episode.truth)
         return {name: self.task.xp.astype(values, self.task.xp.float64) for name, values in context.items()}
+
+    def moment(self, episode: Episode) -> Moment:
+        """What causes are computed from."""
+        world, measurement = self.task.world, episode.measurement
+        return Moment(
+            self.task.xp,
+            self.context(episode),
+            world.state(episode.truth),
+            measurement,
+            world.component_readings(measurement),
+            world.component_deviations(measurement),
+        )
+
+    def causes(self, episode: Episode) -> Array:
+        """Which causes of the task hold, ``(N,)``, see :func:`.causes.cause_number`."""
+        return cause_number(self.task.causes, self.moment(episode))
 
     def cost(self, episode: Episode) -> Array:
         """Step 5: what the estimate costs, uncapped, ``(N,)``."""

@@ -548,6 +548,14 @@ class RecordedWorld(World[Task, Replayed, Any]):
         """Return a measurement with NaN in place of what was not received, as the task's own world does."""
         return self.simulated.mask_missing(measurement)
 
+    def component_readings(self, measurement: Any) -> Array | None:
+        """What it says of the components, as in the task's own world."""
+        return self.simulated.component_readings(measurement)
+
+    def component_deviations(self, measurement: Any) -> Array | None:
+        """What is stated of the errors of that, likewise."""
+        return self.simulated.component_deviations(measurement)
+
     def all_observations(self) -> tuple[Array | None, Array | None]:
         """What the sensors say of the components in all measurements of all episodes, and its stated deviation,
         ``(C, measurements)``; None where it is no component.

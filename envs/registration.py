@@ -9,6 +9,7 @@ import gymnasium
 import numpy
 
 from .catalogue import USER_TASKS, catalogue, nearest, register
+from .causes import MOST_CAUSES, RESERVED
 from .failures import explain_errors
 from .model import Episode, Model
 from .task import Task
@@ -109,6 +110,18 @@ def _check_action(model: Model) -> None:
         )
 
 
+def _check_causes(model: Model) -> None:
+    """Raise ValueError for causes that a table could not tell apart."""
+    names = [cause.name for cause in model.task.causes]
+    twice = [name for name in names if names.count(name) > 1 or name in RESERVED]
+    if twice or len(names) > MOST_CAUSES:
+        what = f"the name {twice[0]!r}" if twice else f"{len(names)} of them"
+        raise ValueError(
+            f"{type(model.task).__name__} needs causes of different names, at most {MOST_CAUSES}, none of them "
+            f"{', '.join(RESERVED)}, got {what}"
+        )
+
+
 def _check_episodes(model: Model) -> None:
     """Fly some episodes for two measurements on NumPy, and compare what the task computes with what it declares.
 
@@ -183,6 +196,11 @@ def _check_episodes(model: Model) -> None:
         check(f"record {name!r}", values, (len(model.task.modes),) if hypotheses else (), finite=False)
     for name, values in ask("context", model.context, episode).items():
         check(f"context {name!r}", values)
+    _check_causes(model)
+    for cause in model.task.causes:
+        holds = ask(f"cause {cause.name!r}", cause.holds, model.moment(episode))
+        if holds is not None:
+            check(f"cause {cause.name!r}", holds, ())
     episode = measure(episode)  # with what the bank gives back
     before = dict([*_leaves("truth", start.truth), *_leaves("filter's state", start.filter)])
     for part in ("truth", "measurement", "filter's state"):

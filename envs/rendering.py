@@ -117,6 +117,8 @@ class Picture:
     """Where the strips begin, as a share of the figure's width: what is left of it belongs to the panels."""
     strip_columns = 0
     """Columns of strips; 0 for as many as their number asks for."""
+    steered = True
+    """Whether an action steers the filter, whose control the title then names."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -263,17 +265,25 @@ class EpisodePicture:
         scenario: its scenario's name, for the title.
         mode: "rgb_array" or "human".
         frames_per_second: how fast a window shows them at most.
+        picture: what is drawn; default: what is made for the model, or the general one.
 
     Raises:
         gymnasium.error.Error: for "human" where no window can be opened.
     """
 
-    def __init__(self, model: Model, scenario: str, mode: str, frames_per_second: float) -> None:
+    def __init__(
+        self,
+        model: Model,
+        scenario: str,
+        mode: str,
+        frames_per_second: float,
+        picture: Picture | None = None,
+    ) -> None:
         self.model, self.scenario, self.mode = model, scenario, mode
         self.frames_per_second = frames_per_second
         self.caption = ""
         """What the title says beside environment, scenario and control, such as the policy's name."""
-        self.picture = picture_of(model)
+        self.picture = picture_of(model) if picture is None else picture
         self.history: dict[str, list[float]] = {}
         self.observations: list[numpy.ndarray] = []
         self.count = 0
@@ -322,9 +332,17 @@ class EpisodePicture:
             **{f"action.{i}": value for i, value in enumerate(numpy.ravel(action))},
             **self.picture.records(state),
         }
+        self.observations.append(observation)
+        self.append(values)
+
+    def append(self, values: Mapping[str, float]) -> None:
+        """Add the values of a measurement to the history.
+
+        Args:
+            values: by the name of the series.
+        """
         for name, value in values.items():
             self.history.setdefault(name, []).append(float(value))
-        self.observations.append(observation)
         self.count += 1
 
     # --- drawing
@@ -390,7 +408,8 @@ class EpisodePicture:
     def title(self) -> str:
         """Environment, scenario, control and the number of the measurement acted on last."""
         name = self.model.task.id.rpartition("/")[2]
-        parts = [name, f"scenario {self.scenario}", f"control {self.model.control}"]
+        control = [f"control {self.model.control}"] if self.picture.steered else []
+        parts = [name, f"scenario {self.scenario}", *control]
         if self.caption:
             parts.append(self.caption)
         return " · ".join([*parts, f"{self.picture.clock} {self.count} of {self.model.task.horizon}"])

@@ -47,6 +47,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy
 
 from ..filters.array_namespace import lane_arrays, stack_nested
+from .causes import MISSED, Cause
 from .draws import Draws
 from .filter import Bank
 from .live_input import LiveInput
@@ -147,6 +148,11 @@ class Task(ABC):
     reward_unit: float = 1.0
     """What the paper's algorithm is charged on average in the default scenario: one in the reward. Where few lost
     tracks rule that mean, something between them and the median."""
+    causes: tuple[Cause, ...] = (MISSED,)
+    """Circumstances by which an evaluation splits what estimates cost, see :mod:`.causes`; each instance may have its
+    own."""
+    start_measurements: ClassVar[int] = 10
+    """How many measurements are the start of a track, which is one cause more."""
     reward: ClassVar[str] = "cost"
     """Kind of reward that agents get unless another one is asked for, see :mod:`.reward`."""
     paper_policy: PaperPolicy

@@ -1,17 +1,22 @@
-"""Animated pictures of an episode under a policy, for documentation."""
+"""Animated pictures of an episode, under whatever estimates, for documentation and to look at a bad one."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy
 from PIL import Image
 
+from ..envs.backend import make_model
+from ..envs.catalogue import find_scenario
 from ..envs.environment import TaskEnv
+from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.task import Task
 from .competitors import kind_of, make_competitor
 from .evaluate import control_of
 from .files import whole_file
+from .rollout import run_competitor
 from .stepping import SteppingPolicy
 
 SHADES = 7
@@ -21,7 +26,7 @@ SHADES = 7
 def episode_frames(
     task: type[Task],
     name: str,
-    policy: Any,
+    competitor: Any,
     scenario: Any = None,
     seed: int = 0,
     every: int = 2,
@@ -31,21 +36,35 @@ def episode_frames(
 
     Args:
         task: class of the environment's.
-        name: of the policy, for the title.
-        policy: what makes it for a model, or an object with a ``predict`` method.
+        name: of the competitor, for the title.
+        competitor: policy, estimator, smoother or reference, or what makes it.
         scenario: name of a scenario, or a trajectory.
         seed: of the episode, as in ``reset``.
         every: actions from one frame to the next; the last action is always shown.
         **keywords: parameters of the task.
 
     Raises:
-        ValueError: for unknown names, and for reference estimators and bounds, which do not act.
+        ValueError: for unknown names, and for bounds, which estimate nothing.
     """
-    every = check_integer("every", every, 1)
-    if kind_of(policy) != "policy":
-        raise ValueError(f"{name!r} is no policy: it does not act in the environment")
+    every, kind = check_integer("every", every, 1), kind_of(competitor)
+    if kind == "bound":
+        raise ValueError(f"{name!r} is a bound: it estimates nothing that could be drawn")
+    keywords = {**getattr(competitor, "task_keywords", {}), **keywords}
+    draw = _policy_frames if kind == "policy" else _estimate_frames
+    return draw(task, name, competitor, scenario, seed, every, keywords)
+
+
+def _policy_frames(
+    task: type[Task],
+    name: str,
+    policy: Any,
+    scenario: Any,
+    seed: int,
+    every: int,
+    keywords: Mapping[str, Any],
+) -> list[Image.Image]:
+    """Draw an episode as the environment does."""
     control = control_of(policy, "policy", None, task, name)
-    keywords = {**getattr(policy, "task_keywords", {}), **keywords}
     world = TaskEnv(task.id, control, scenario, render_mode="rgb_array", **keywords)
     assert world.picture is not None
     world.picture.caption = f"policy {name}"
@@ -61,6 +80,42 @@ def episode_frames(
             frames.append(Image.fromarray(_frame(world)))
     world.close()
     return frames
+
+
+def _estimate_frames(
+    task: type[Task],
+    name: str,
+    estimator: Any,
+    scenario: Any,
+    seed: int,
+    every: int,
+    keywords: Mapping[str, Any],
+) -> list[Image.Image]:
+    """Draw the estimates of a filter of its own, which is shown no observation and takes no action."""
+    # They bring matplotlib.
+    from ..envs.estimate_picture import EstimatePicture
+    from ..envs.rendering import EpisodePicture
+
+    kind, chosen = kind_of(estimator), find_scenario(task, scenario, keywords)
+    model = make_model(task, task.controls[0], scenario, **keywords)
+    uniforms = numpy.random.default_rng(seed).random((model.task.noise.uniforms, 1))
+    length = int(model.task.lengths(uniforms)[0])
+    found = run_competitor(model, estimator, kind, [seed], _picture_track)
+    track = {key: values[0, :length] for key, values in found.items()}
+    drawn = EstimatePicture(model, track)
+    picture = EpisodePicture(model, chosen.name, "rgb_array", 1.0, drawn)
+    picture.caption = f"{kind} {name}"
+    frames, step = [], every * model.task.decision_interval
+    for k in range(length):
+        picture.append(drawn.values(track, k))
+        if (k + 1) % step == 0 or k == length - 1:
+            frames.append(Image.fromarray(picture.frame(None)))
+    picture.close()
+    return frames
+
+
+def _picture_track(model: Model, episode: Episode) -> dict[str, Any]:
+    return model.picture_track(episode)
 
 
 def _frame(world: TaskEnv) -> Any:

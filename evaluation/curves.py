@@ -13,6 +13,7 @@ import numpy
 import xarray
 
 from .bootstrap import block_of, percentile_interval, ratio
+from .competitors import RANKED
 from .dataset import groups_of, windows_of, with_windows
 from .metrics import (
     bootstrap_of,
@@ -22,6 +23,7 @@ from .metrics import (
     consistency_metrics,
     mean_over_time,
     squared_errors,
+    sums_of_present,
 )
 from .statistics import ALL, Key, Statistic, reduce_run
 from .threads import one_thread
@@ -34,6 +36,9 @@ DISTRIBUTION_LIMIT = 2**21
 """Measurements whose distribution is told: all of them would have to be kept, and more change no picture."""
 PERCENTILES = (10.0, 90.0)
 """Of actions and gains over episodes."""
+
+MOST_STRETCHES = 100
+"""Stretches of an episode of which the mean cost is compared over time."""
 
 ENDINGS = ("", "_low", "_high")
 """Of the names of a curve and of the ends of its band."""
@@ -66,7 +71,9 @@ def curves_of(dataset: xarray.Dataset, resamples: int = BAND_RESAMPLES) -> xarra
         * ``action`` (policy, action_name, time): mean over episodes of the actions applied, with their 10 and 90 %
           percentiles, ``_low`` and ``_high``, of policies whose action is a box; ``gain`` (policy, gain_name, time), of
           gains that a bank records, likewise;
-        * ``mean_cost`` (policy): over episodes.
+        * ``mean_cost`` (policy): over episodes;
+        * ``cost_minus_paper`` and ``cost_minus_best`` (policy, stretch): mean cost over stretches of the episode less
+          that of the paper's algorithm and of the best that is ranked, paired, with ``_low`` and ``_high``.
 
         Errors exceeded, actions and gains are those of the first ``DISTRIBUTION_LIMIT`` measurements, or of the first
         256 episodes, whichever are more. Coordinates ``kind`` and ``control`` of every policy, ``unit`` of every
@@ -87,6 +94,9 @@ class CompetitorCurves(NamedTuple):
     curves: dict[str, numpy.ndarray]
     actions: list[str]
     gains: list[str]
+    costs: numpy.ndarray | None = None
+    """Mean over episodes of the cost in each stretch, in the data and every resample, ``(1 + resamples, stretches)``;
+    None of bounds, and without truth."""
 
 
 def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
@@ -97,7 +107,9 @@ def competitor_curves(results: Mapping[Key, Any]) -> CompetitorCurves:
         if kind == "curve":
             name, *labels[name] = words
             curves |= {name + ending: values for ending, values in endings.items()}
-    return CompetitorCurves(curves, labels.get("action", []), labels.get("gain", []))
+    return CompetitorCurves(
+        curves, labels.get("action", []), labels.get("gain", []), results.get(("stretches",))
+    )
 
 
 def select_quantities(dataset: xarray.Dataset) -> list[str]:
@@ -125,6 +137,7 @@ def curve_statistics(
         if str(run["kind"].values) != "bound":
             yield Statistic(("curve", "error_exceeded"), squares, _exceedance, sample=distributed)
             yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
+            yield Statistic(("stretches",), cost_in_stretches(run["cost"].values), resamples=resamples)
     for name in ("mode_probability", "true_class_probability"):
         if name in run:
             values = run[name].transpose("episode", ..., "time").values
@@ -193,6 +206,10 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
                     stacked[i] = values
             variables |= _present(key + ending, ("policy", *dims), stacked)
     variables |= _consistency_bands(found)
+    best = _cheapest(found, dataset)
+    bases = {"paper": dataset.attrs["paper"], "best": best}
+    differences = _cost_differences(found, dataset["policy"].values.tolist(), bases)
+    variables |= differences
     coords: dict[str, Any] = {
         name: dataset[name].variable
         for name in ("policy", "kind", "control", "time", "elapsed")
@@ -205,6 +222,8 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
     if "mode_probability" in variables:
         coords["mode"] = dataset["mode"].variable
     coords |= {name: listed for name, listed in names.items() if listed}
+    if differences:
+        coords |= _stretch_coords(dataset)
     attrs = {
         name: dataset.attrs[name]
         for name in (
@@ -219,8 +238,80 @@ def stack_curves(found: Sequence[CompetitorCurves], dataset: xarray.Dataset, epi
             "recorded",
         )
     }
-    curves = xarray.Dataset(variables, coords, {**attrs, "episodes": episodes})
+    attrs |= {"episodes": episodes} | ({"best": best} if best else {})
+    curves = xarray.Dataset(variables, coords, attrs)
     return with_windows(curves, windows_of(dataset))
+
+
+def stretches_of(times: int) -> list[slice]:
+    """Cut an episode into at most ``MOST_STRETCHES`` stretches of one length; the last may be shorter.
+
+    Args:
+        times: its measurements.
+    """
+    length = -(-times // MOST_STRETCHES)
+    return [slice(first, min(first + length, times)) for first in range(0, times, length)]
+
+
+def cost_in_stretches(cost: numpy.ndarray) -> numpy.ndarray:
+    """Mean cost of every episode in each stretch, NaN where it has none.
+
+    Args:
+        cost: ``(episodes, time)``; NaN where there is none.
+
+    Returns:
+        ``(episodes, stretches)``.
+    """
+    means = [ratio(sums_of_present(cost[:, stretch])) for stretch in stretches_of(cost.shape[1])]
+    return numpy.stack(means, axis=1)
+
+
+def _stretch_coords(dataset: xarray.Dataset) -> dict[str, Any]:
+    """Middle of every stretch, as the number of a measurement and, where they come regularly, in seconds."""
+    middles = {
+        name: [float(dataset[name].values[stretch].mean()) for stretch in stretches_of(dataset.sizes["time"])]
+        for name in ("time", "elapsed")
+        if name in dataset.coords
+    }
+    return {
+        "stretch": middles["time"],
+        **({"stretch_elapsed": ("stretch", middles["elapsed"])} if "elapsed" in middles else {}),
+    }
+
+
+def _cheapest(found: Sequence[CompetitorCurves], dataset: xarray.Dataset) -> str:
+    """Return the best that is ranked; empty where nobody is."""
+    named = zip(dataset["policy"].values.tolist(), dataset["kind"].values.tolist(), found, strict=True)
+    means = {
+        str(name): float(each.curves["mean_cost"])
+        for name, kind, each in named
+        if kind in RANKED and each.costs is not None
+    }
+    return min(means, key=means.__getitem__, default="")
+
+
+def _cost_differences(
+    found: Sequence[CompetitorCurves], names: Sequence[str], bases: Mapping[str, str]
+) -> dict[str, Series]:
+    """Mean cost over time less that of others, paired.
+
+    Args:
+        found: in the order of the names.
+        names: of the competitors.
+        bases: name of each other competitor, by the end of the variable's name.
+    """
+    variables: dict[str, Series] = {}
+    for key, base in bases.items():
+        theirs = found[names.index(base)].costs if base in names else None
+        if theirs is None or len(names) < 2:
+            continue
+        bands = numpy.full((3, len(found), theirs.shape[1]), numpy.nan)
+        for i, each in enumerate(found):
+            if each.costs is not None:
+                bands[:, i] = percentile_interval(each.costs - theirs)
+        for ending, values in zip(ENDINGS, bands, strict=True):
+            variables[f"cost_minus_{key}{ending}"] = (("policy", "stretch"), values)
+    return variables
 
 
 def gains_of(dataset: xarray.Dataset) -> list[str]:

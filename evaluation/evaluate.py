@@ -23,6 +23,7 @@ from ..envs.reward import charge
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
+from .cause_split import VARIABLE, cause_coords
 from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .innovations import with_innovations
@@ -95,6 +96,7 @@ def _measurement_report(model: Model, episode: Episode) -> dict[str, Any]:
         "error": error,
         "cost": model.cost(episode),
         "charge": charge(model, episode),
+        "causes": model.causes(episode),
         **_normalised_error(model, error, model.covariance(episode)),
         **model.records(episode),
     }
@@ -680,6 +682,11 @@ def _dataset(
     dataset = with_windows(dataset, windows)
     if "mode_probability" in dataset:
         dataset = dataset.assign_coords(mode=list(model.task.modes))
+    if VARIABLE in dataset:
+        causes = model.task.causes
+        dataset = dataset.assign_coords(
+            cause_coords([c.name for c in causes], [c.phrase for c in causes], model.task.start_measurements)
+        )
     if actions:
         dataset = dataset.assign_coords(action_name=list(dict.fromkeys(sum(actions.values(), ()))))
     return dataset

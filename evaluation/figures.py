@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from .dataset import windows_of
+from .curves import stretches_of
+from .dataset import windows_of, with_windows
 from .looks import GREY, distinguish_lines, group_equal_lines, join_names, looks, styles
 from .print_layout import (
     add_title,
@@ -229,6 +230,45 @@ def draw_error_over_time(
 
 
 @in_print
+def draw_cost_difference(
+    curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
+) -> Any:
+    """Mean cost over time less that of the paper's algorithm, and of the best, with paired 95 % bands.
+
+    Arguments as of :func:`draw_error_over_time`.
+    """
+    look = looks(curves) if look is None else look
+    length = stretches_of(curves.sizes["time"])[0].stop
+    windows = {
+        name: tuple(1 + (end - 1) // length for end in ends) for name, ends in windows_of(curves).items()
+    }
+    renamed = {"stretch": "time", "stretch_elapsed": "elapsed"}
+    over = curves.drop_dims(["time", "window"])
+    over = with_windows(over.rename({k: v for k, v in renamed.items() if k in over.coords}), windows)
+    bases = {"paper": curves.attrs["paper"], "best": curves.attrs.get("best", "")}
+    drawn: dict[str, Panel] = {}
+    for key, base in bases.items():
+        name = f"cost_minus_{key}"
+        if name in over:
+            bands = (over[f"{name}{ending}"] for ending in ("", "_low", "_high"))
+            drawn.setdefault(base, Panel(wrap_label(f"cost less that of {base}", columns), *bands))
+
+    def finish(axis: Any, panel: Panel) -> None:
+        axis.axhline(0.0, color="0.3", lw=0.6, zorder=1.2)
+        shown = [panel.values.sel(policy=name).values for name in look]
+        # One line, or a moment, must not squash all others.
+        sizes = numpy.concatenate([numpy.abs(line[numpy.isfinite(line)]) for line in shown])
+        reach = 1.5 * float(numpy.quantile(sizes, 0.99)) if len(sizes) else 1.0
+        there = numpy.concatenate([line[numpy.isfinite(line)] for line in shown])
+        lowest, highest = (float(there.min()), float(there.max())) if len(there) else (0.0, 0.0)
+        margin = 0.05 * (highest - lowest) or 1.0
+        axis.set_ylim(max(lowest - margin, -reach or -1.0), min(highest + margin, reach or 1.0))
+
+    title = f"{_title(curves)}; below zero is better, 95 % bands, paired"
+    return _over_time(over, list(drawn.values()), look, title, columns, finish)
+
+
+@in_print
 def draw_consistency(
     curves: xarray.Dataset, look: Mapping[str, Mapping[str, Any]] | None = None, *, columns: int = 2
 ) -> Any:
@@ -398,6 +438,8 @@ def evaluation_figures(
         yield "rmse_over_time", draw_error_over_time(curves, look, columns=columns)
     if "error_exceeded" in curves:
         yield "error_distribution", draw_error_distribution(curves, look, columns=columns)
+    if {"cost_minus_paper", "cost_minus_best"} & set(curves.data_vars):
+        yield "cost_difference", draw_cost_difference(curves, look, columns=columns)
     if {"anees", "anis"} & set(curves.data_vars):
         yield "consistency", draw_consistency(curves, look, columns=columns)
     if "true_class_probability" in curves:

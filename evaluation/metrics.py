@@ -14,6 +14,8 @@ import xarray
 from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
+from .cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
+from .cause_split import VARIABLE as CAUSES
 from .competitors import RANKED
 from .dataset import Losses, count_losses, groups_of, losses_in, seed_of, slices_of, windows_of, with_windows
 from .predictions import correlation, stretch_interval
@@ -157,6 +159,9 @@ def record_statistics(
         charge = run["charge"].values
         total = numpy.nansum(charge, axis=1) if "flight" in run.coords else charge.sum(axis=1)
         yield Statistic(("record", "return", "", "all", "1"), total, numpy.negative)
+    if CAUSES in run and not is_bound and judged:
+        nees = _over_dimension(run, "nees")[0] if "nees" in consistency_metrics(run) else None
+        yield Statistic(("causes",), cause_sums(run, nees))
     if "cost" in run and not is_bound:
         yield Statistic(("cost",), mean_over_time(run, run["cost"].values), sample=ALL)
     if "lost" in run and not numpy.isnan(run["lost"].values).all():
@@ -182,8 +187,8 @@ def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[St
     interval (Bar-Shalom, Li, Kirubarajan: Estimation with Applications to Tracking and Navigation, 2001, 5.4).
     """
     component = "state" if metric == "nees" else "measurement"
-    values, degrees = run[metric].values, consistency_degrees(run, metric)
-    normalised = numpy.where(degrees > 0.0, values / numpy.where(degrees > 0.0, degrees, 1.0), numpy.nan)
+    normalised, degrees = _over_dimension(run, metric)
+    values = run[metric].values
     there = ~numpy.isnan(normalised)
     low, high = chi_square_band(degrees)
     inside = numpy.where(there, (values >= low) & (values <= high), numpy.nan)
@@ -195,6 +200,13 @@ def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[St
             sums = numpy.stack([there[:, times].sum(axis=1), inverse[:, times].sum(axis=1)], axis=1)
             key = ("record", "anis_band", component, window, "1")
             yield Statistic(key, sums, functools.partial(_band, episodes=episodes), optional=True)
+
+
+def _over_dimension(run: xarray.Dataset, metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+    """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
+    degrees = consistency_degrees(run, metric)
+    some = numpy.where(degrees > 0.0, degrees, 1.0)
+    return numpy.where(degrees > 0.0, run[metric].values / some, numpy.nan), degrees
 
 
 def _band(means: numpy.ndarray, episodes: int) -> Estimate:
@@ -258,6 +270,8 @@ class Contender(NamedTuple):
     costs: numpy.ndarray | None
     """Mean cost of every episode; None of bounds, and without truth."""
     losses: Losses | None
+    causes: CauseCosts | None = None
+    """None of bounds, without truth, and of an evaluation that holds no causes."""
 
 
 def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
@@ -415,7 +429,27 @@ def contender_of(
             measures.append(Measure(metric, component, window, estimate, unit))
     further = [] if metrics is None else metrics.measures_of(results, bootstrap, run)
     name, kind, control = (str(run[word].values) for word in ("policy", "kind", "control"))
-    return Contender(name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)))
+    causes = None
+    if ("causes",) in results:
+        found, causes = split(results["causes",], run, bootstrap)
+        further += [Measure(m.metric, "", m.cause, m.estimate, "1") for m in found]
+    return Contender(
+        name, kind, control, measures, further, results.get(("cost",)), results.get(("losses",)), causes
+    )
+
+
+def _compare_causes(
+    contender: Contender, contenders: Sequence[Contender], bootstrap: Bootstrap
+) -> Iterator[Measure]:
+    """Cost under each cause over that of the opponent; a cause stands in the place of a window."""
+    split = {c.name: c.causes for c in contenders if c.causes is not None}
+    if contender.name not in split:
+        return
+    costs = {name: float(causes.of(EVERYTHING)[0]) for name, causes in split.items()}
+    opponent = opponent_of(contender.name, costs, [c.name for c in contenders if c.kind in RANKED])
+    if opponent:
+        for m in compare(split[contender.name], split[opponent], opponent, bootstrap):
+            yield Measure(m.metric, m.opponent, m.cause, m.estimate, "1")
 
 
 def records_of(
@@ -437,6 +471,7 @@ def records_of(
     records = []
     for c in contenders:
         measures = [*c.measures, *against.others(c.name), *against.behind_best(c.name), *c.further]
+        measures += _compare_causes(c, contenders, bootstrap)
         for m in measures:
             records.append(
                 Record(

@@ -76,6 +76,16 @@ def figure_with_axes(rows: int = 1, columns: int = 2, height: float | None = Non
     return figure, figure.subplots(rows, 1, squeeze=False)[:, 0]
 
 
+def figure_with_pairs(rows: int, columns: int = 2) -> Any:
+    """Return an empty figure and its axes, two beside each other in every row, ``(rows, 2)``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTHS[columns], {1: 1.6, 2: 2.3}[columns] * rows + 0.35), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, 2, squeeze=False)
+
+
 def add_title(figure: Any, title: str, handles: Sequence[Any] | None = None) -> Any:
     """Return the figure with its title, and a legend, of the first axes or of handles: beside it where there is room,
     else below.

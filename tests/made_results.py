@@ -3,13 +3,23 @@
 from filtergym.agents.named_policies import pretrained_agents
 from filtergym.baselines.problem import problem_of
 from filtergym.evaluation.curves import curves_of
+from filtergym.evaluation.dataset import keywords_of
 
 import filtergym
 from filtergym.reports.benchmark import result_of
+from filtergym.reports.worst import find_worst
 
 
 def results_of(id, names, scenario, episodes, **options):
     """Return the result of some competitors; shipped agents among them count as learned."""
     dataset = filtergym.evaluate(id, names, scenario, episodes, drawn_episodes=1, **options)
     records, curves = filtergym.tidy_records(dataset), curves_of(dataset)
-    return result_of(problem_of(id), dataset, records, curves, pretrained_agents(id))
+    problem = problem_of(id)
+    paper = dataset.attrs["paper"]
+    costs = {paper: dataset["cost"].sel(policy=paper).values.mean(axis=1)}
+    about = dataset.attrs
+    experiment = problem.experiment(
+        scenario, episodes, about["seed"], about["split"], keywords=keywords_of(dataset)
+    )
+    worst = find_worst(problem, experiment, costs, records, [paper])
+    return result_of(problem, dataset, records, curves, pretrained_agents(id), [paper], worst)

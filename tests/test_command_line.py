@@ -79,7 +79,7 @@ REFUSED = {
     "tune": (ENV, "--policy", "imm", "--budget", "0", "--out", "new"),
     "reproduce": ("imm-alpha-beta", "--episodes", "0", "--out", "new"),
     "advise": ("missing.csv", "--out", "new/mine.filter.json"),
-    "animate": (ENV, "--policy", "known-turn", "--out", "new"),
+    "animate": (ENV, "--policy", "known-input-bound", "--out", "new"),
     "train": (ENV, "--validate-every", "0", "--out", "new/run"),
     "search": (ENV, "--trials", "0", "--out", "new"),
     "export": ("missing", "--out", "new/agent.safetensors"),
@@ -181,14 +181,14 @@ def test_list_of_one_environment(run):
 def test_animate_draws_every_policy(tmp_path, run):
     result = run(
         "animate", "ManeuveringTarget", "--scenario", "paper", "--policy", "imm", "--policy", "ppo", "--every", "50",
-        "--out", "new",
+        "--policy", "known-turn", "--out", "new",
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     made = sorted(path.name for path in (tmp_path / "new").iterdir())
-    assert made == ["ManeuveringTarget-v0-imm.gif", "ManeuveringTarget-v0-ppo.gif"]
-    result = run("animate", ENV, "--policy", "known-turn")
+    assert made == [f"ManeuveringTarget-v0-{name}.gif" for name in ("imm", "known-turn", "ppo")]
+    result = run("animate", ENV, "--policy", "known-input-bound")
     assert result.returncode == 2
-    assert "it does not act" in result.stderr
+    assert "it estimates nothing" in result.stderr
 
 
 def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
@@ -210,8 +210,15 @@ def test_evaluate_writes_tidy_records_and_figures(tmp_path, run):
     assert report or "no report: reports need more packages" in result.stdout
     assert made == report | {
         "records.json", "records.csv", "table.tex", "results.nc", "results.json", "rmse_over_time.png",
-        "error_distribution.png", "consistency.png", "mode_probabilities.png",
+        "error_distribution.png", "consistency.png", "mode_probabilities.png", "cost_difference.png",
+        "worst_episodes.png",
     }  # fmt: skip
+    # Whose cost is explained is the first that is named; what belongs together stands in one line.
+    assert re.search(r"^imm: \d+ % of its cost falls ", result.stdout, re.MULTILINE)
+    assert not re.search(r"^adaptive: ", result.stdout, re.MULTILINE)
+    refused = run("evaluate", ENV, "--policy", "imm", "--why", "imn", "--episodes", "2")
+    assert refused.returncode == 2
+    assert "did you mean 'imm'" in refused.stderr
 
 
 def test_a_flight_from_a_file(tmp_path, run):

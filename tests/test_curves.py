@@ -205,7 +205,8 @@ def test_what_it_says_of_itself(dataset, curves, tmp_path):
     assert curves["kind"].values.tolist()[1:] == ["policy", "estimator", "reference", "bound"]
     np.testing.assert_array_equal(curves["elapsed"], dataset["elapsed"])
     same = ("environment", "scenario", "split", "seed", "paper", "reference", "cost", "truth", "recorded")
-    assert curves.attrs == {"episodes": 30, **{name: dataset.attrs[name] for name in same}}
+    best = {"best": "kalman-imm"}  # of those that are ranked
+    assert curves.attrs == {"episodes": 30, **best, **{name: dataset.attrs[name] for name in same}}
     expected = dataset["cost"].mean(["episode", "time"])
     np.testing.assert_allclose(curves["mean_cost"].values[:4], expected.values[:4])
     assert "episode" not in curves.dims

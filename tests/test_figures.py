@@ -128,7 +128,9 @@ def test_who_is_told_apart_may_be_asked_for(curves):
 @pytest.mark.parametrize("columns", [1, 2])
 def test_figures_are_as_wide_as_columns_and_legible(curves, columns):
     figures = dict(evaluation_figures(curves, columns))
-    assert list(figures) == ["rmse_over_time", "error_distribution", "consistency", "mode_probabilities"]
+    assert list(figures) == [
+        "rmse_over_time", "error_distribution", "cost_difference", "consistency", "mode_probabilities",
+    ]  # fmt: skip
     for figure in figures.values():
         assert figure.get_figwidth() == WIDTHS[columns]
         figure.draw_without_rendering()

@@ -7,14 +7,14 @@ import sys
 import gymnasium
 import numpy
 import pytest
-from filtergym.envs import rendering
+from filtergym.envs import estimate_picture, rendering
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.environment import TaskEnv
 from filtergym.envs.maneuvering_target.picture import ManeuveringTargetPicture, ellipse_axes
 from filtergym.envs.model import Model
 from filtergym.evaluation.animation import episode_frames, write_animation
 
-import filtergym  # noqa: F401  # registers the environments
+from filtergym import evaluate
 from filtergym.names import competitor
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -268,8 +268,41 @@ def test_animation_is_a_small_looping_file(tmp_path):
         assert image.n_frames == 6
         assert image.size == (960, 608)
         assert image.info["loop"] == 0
-    with pytest.raises(ValueError, match="does not act"):
-        episode_frames(task_class(ID), "known-turn", competitor(ID, "known-turn"))
+    with pytest.raises(ValueError, match="it estimates nothing"):
+        episode_frames(task_class(ID), "known-input-bound", competitor(ID, "known-input-bound"))
+
+
+@pytest.mark.parametrize(
+    ("id", "name"),
+    [
+        (ID, "kalman-imm-turn"),  # in a plane
+        (ID, "imm-smoother"),
+        ("filtergym/RadarEsmTracking-v0", "ideal"),  # over time
+        ("filtergym/UavAutopilot-v0", "gust-imm"),  # in a closed loop
+    ],
+)
+def test_estimators_smoothers_and_references_are_drawn(id, name, monkeypatch):
+    """What is drawn are the estimates of the same episode in an evaluation."""
+    drawn = []
+    monkeypatch.setattr(
+        estimate_picture.EstimatePicture,
+        "draw",
+        lambda self, history, state: drawn.append({key: values.copy() for key, values in history.items()}),
+    )
+    dataset = evaluate(id, [name], None, 2, horizon=7, tracks=True)
+    seed = int(dataset["episode_seed"].values[1])
+    frames = episode_frames(task_class(id), name, competitor(id, name), None, seed=seed, every=3, horizon=7)
+    assert len(frames) == 3  # measurements 3, 6, and the last
+    assert frames[0].size == (960, 608)
+    own = dataset.isel(policy=0, episode=1)
+    first = str(own["component"].values[0])
+    for key, expected in (
+        (f"error.{first}", own["error"].values[:, 0]),
+        ("believed.0", own["estimate"].values[:, 0]),
+        (f"sigma.{first}", numpy.sqrt(own["covariance"].values[:, 0, 0])),
+    ):
+        # The evaluation is compiled, where it can be; the picture is of NumPy.
+        numpy.testing.assert_allclose(drawn[-1][key], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_steps_that_nobody_looks_at_are_drawn_when_somebody_does(env_id, short):

@@ -5,7 +5,9 @@ import gzip
 import json
 import re
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
+import markupsafe
 import numpy as np
 import pytest
 from made_results import results_of
@@ -13,6 +15,7 @@ from made_results import results_of
 from filtergym.reports.headline import headline_table
 from filtergym.reports.html_report import report_html
 from filtergym.reports.ranking import best_of_origins, verdict
+from filtergym.reports.reasons import reason_sentences
 from filtergym.reports.results import (
     MOST_SHOWN,
     MOST_TIMES,
@@ -45,7 +48,7 @@ def hostile(result, text=HOSTILE):
     records = [
         r._replace(
             policy=renamed[r.policy], environment=text, scenario=text, control=text, unit=text, split=text,
-            component=r.component and r.component + text, kind=r.kind,
+            component=r.component and r.component + text, kind=r.kind, window=r.window + text * (r.window != "all"),
         )
         for r in result.records
     ]  # fmt: skip
@@ -53,7 +56,7 @@ def hostile(result, text=HOSTILE):
         data.assign_coords(policy=[renamed[name] for name in data["policy"].values.tolist()])
         for data in (result.curves, result.track)
     )
-    curves = curves.assign_coords(
+    curves = curves.assign_attrs(best=renamed[curves.attrs["best"]]).assign_coords(
         quantity=[f"{name}{text}" for name in curves["quantity"].values.tolist()],
         unit=("quantity", [text] * curves.sizes["quantity"]),
     )
@@ -69,6 +72,20 @@ def hostile(result, text=HOSTILE):
         records=records,
         curves=curves,
         track=track.assign_attrs(seed=text),
+        causes=dict.fromkeys(result.causes, text),
+        explained=[renamed[name] for name in result.explained],
+        worst=[
+            one._replace(
+                policy=renamed[one.policy],
+                opponent=renamed[one.opponent],
+                seed=text,
+                causes=[text],
+                track=one.track.assign_coords(
+                    policy=[renamed[n] for n in one.track["policy"].values.tolist()]
+                ),
+            )
+            for one in result.worst
+        ],
     )
 
 
@@ -109,9 +126,14 @@ def test_results_are_read_as_they_were_written(result, tmp_path):
     write_results(tmp_path / "results.json", [result], SETTINGS)
     [read], settings = read_results(tmp_path)
     assert settings == SETTINGS
-    assert read._replace(curves=None, track=None) == result._replace(curves=None, track=None)
-    for name, tolerance in (("curves", 5e-4), ("track", 1e-3)):
-        before, after = getattr(result, name), getattr(read, name)
+    without = {"curves": None, "track": None, "worst": []}
+    assert read._replace(**without) == result._replace(**without)
+    assert [one._replace(track=None) for one in read.worst] == [
+        one._replace(track=None) for one in result.worst
+    ]
+    pairs = [(getattr(result, name), getattr(read, name)) for name in ("curves", "track")]
+    pairs += [(one.track, other.track) for one, other in zip(result.worst, read.worst, strict=True)]
+    for (before, after), tolerance in zip(pairs, (5e-4, 1e-3, 1e-3, 1e-3, 1e-3), strict=True):
         assert set(before.variables) == set(after.variables)
         for key, values in before.data_vars.items():
             # Four significant digits, seven of positions.
@@ -141,6 +163,14 @@ def test_what_tells_most_is_shown(result):
         (lambda d: {**d, "results": [{**d["results"][0], "records": []}]}, "no records"),
         (lambda d: {**d, "results": [{**d["results"][0], "scenario": "x"}]}, "another environment or scenario"),
         (lambda d: {**d, "results": [{**d["results"][0], "learned": 3}]}, "learned must be"),
+        (lambda d: {**d, "results": [{**d["results"][0], "worst": [3]}]}, "worst episode needs its fields"),
+        (lambda d: {**d, "results": [{**d["results"][0], "causes": {"turn": 3}}]}, "causes must be"),
+        (
+            lambda d: {
+                **d, "results": [{**(r := d["results"][0]), "worst": [{**r["worst"][0], "cost": 1e999}]}],
+            },
+            "must be finite",
+        ),
         (lambda d: {**d, "results": [{**d["results"][0], "curves": {"coords": {}}}]}, "expected coords"),
         (
             lambda d: {**d, "results": [{**d["results"][0], "track": {"coords": {}, "variables": {}, "attrs": {}}}]},
@@ -208,9 +238,45 @@ def command_console():
 
 
 def test_consistency_in_a_word():
-    assert [consistency_word(x) for x in (0.4, 0.5, 2.0, 2.1, None)] == [
-        "cautious", "consistent", "consistent", "overconfident", "says nothing",
-    ]  # fmt: skip
+    """Consistent where the interval of the mean NEES holds one, however near or far the mean is."""
+    words = {
+        (0.9, 0.8, 1.01): "consistent",
+        (1.6, 0.9, 4.0): "consistent",
+        (1.02, 1.01, 1.03): "slightly overconfident",
+        (0.98, 0.97, 0.99): "slightly cautious",
+        (2.1, 2.0, 2.2): "overconfident",
+        (0.4, 0.3, 0.5): "cautious",
+        (1.0, 1.0, 1.0): "no interval",
+        (1.0, None, None): "no interval",
+        (None, None, None): "says nothing",
+    }
+    assert {
+        ends: consistency_word(SimpleNamespace(value=ends[0], low=ends[1], high=ends[2])) for ends in words
+    } == words
+    assert consistency_word(None) == "says nothing"
+
+
+def test_only_who_is_consistent_is_called_so(result):
+    """The word in the table, the headline and the verdict follows from the interval of the record."""
+    for record in result.records:
+        if (record.metric, record.window) == ("anees", "all"):
+            holds_one = record.low <= 1.0 <= record.high
+            assert (consistency_word(record) == "consistent") == holds_one
+    told = [
+        r._replace(value=1.1, low=1.05, high=1.2) if r.metric == "anees" and r.window == "all" else r
+        for r in result.records
+    ]
+    assert any(
+        "not consistent" in sentence and "1.1" in sentence
+        for sentence in verdict([result._replace(records=told)])
+    )
+    held = [
+        r._replace(value=1.1, low=0.9, high=1.2) if r.metric == "anees" and r.window == "all" else r
+        for r in result.records
+    ]
+    assert any(
+        "of every winner is consistent" in sentence for sentence in verdict([result._replace(records=held)])
+    )
 
 
 def test_verdict_follows_from_the_numbers(result):
@@ -240,8 +306,17 @@ def test_page_holds_what_the_file_says(result):
     for name in NAMES:
         assert f'data-sort="{name}"' in html
     assert "filtergym benchmark" in html
+    # Why: the sentences, a row for every cause that holds, and seeds that show an episode again.
+    for sentence in reason_sentences(result.records, result.causes, "imm"):
+        assert str(markupsafe.escape(sentence.removeprefix("imm: "))) in html
+    assert html.count('<details class="why"') == len(
+        {r.policy for r in result.records if r.metric == "cause_cost"}
+    )
+    assert "<td>in turns and other manoeuvres</td>" in html
+    assert [one.policy for one in result.worst] == ["imm"] * 3
+    assert all(f"<code>{one.seed}</code>" in html for one in result.worst)
     # Every figure says in words what it shows.
-    assert html.count('role="img"') == html.count('<div class="plot"') == 6
+    assert html.count('role="img"') == html.count('<div class="plot"') == 8
     assert not [address for address in page.addresses if not address.startswith("#")]
 
 

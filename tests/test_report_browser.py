@@ -8,7 +8,7 @@ from test_report import SETTINGS, hostile
 from filtergym.reports.html_report import report_html
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(browser.missing()), reason=browser.missing())]
-FIGURES = ["ranking", "rmse", "exceeded", "consistency", "steering", "track"]
+FIGURES = ["ranking", "rmse", "exceeded", "difference", "consistency", "steering", "track", "worst"]
 WAIT = 60.0
 """Seconds that nobody should need."""
 
@@ -55,7 +55,7 @@ def opened_whole(driver):
     )
     WebDriverWait(driver, WAIT).until(
         lambda d: d.execute_script(
-            "return [...document.querySelectorAll('details, figure[data-kind=dots]')]"
+            "return [...document.querySelectorAll('details.cell, figure[data-kind=dots]')]"
             ".every(x => x.dataset.drawn === 'done')"
         )
     )

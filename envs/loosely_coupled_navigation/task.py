@@ -15,6 +15,7 @@ from typing import Any
 from ..model import Model
 from ..task import Component, PaperPolicy, Task
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
+from .causes import CAUSES
 from .kalman_net import KalmanNetBank
 from .live import PositionInput
 from .logs import LOG_FORMAT
@@ -114,6 +115,8 @@ class LooselyCoupledNavigation(Task):
     trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS
     modes = SCHEMES
+    causes = CAUSES
+    start_measurements = 50
     cost_description = "squared error of position over the nominal variance of a measurement"
     reward_unit = 0.15
     paper_policy = PaperPolicy("gain", (0.0,))

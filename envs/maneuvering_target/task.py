@@ -17,6 +17,7 @@ from ..parameters import check, field_limits, freeze
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
 from .banks import FilterBank, GainBank, SteeredFilterBank
+from .causes import CAUSES
 from .kalman_net import KalmanNetBank
 from .live import PlotInput
 from .logs import FARTHEST_RANGE, LOG_FORMAT, has_regular_scans
@@ -124,6 +125,7 @@ class ManeuveringTarget(Task):
         Component("velocity_y", "m/s"),
     )
     groups = {"position": ("position_x", "position_y"), "velocity": ("velocity_x", "velocity_y")}
+    causes = CAUSES
     cost_description = "squared position error over the squared range sigma"
     reward_unit = 8.0
     # What a turn costs rules the noise of the reward, and the paper pays for it too.

@@ -15,6 +15,7 @@ from ..model import Episode, Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
 from .banks import ClassBank, one_hot
+from .causes import causes_of
 from .live import ScanInput
 from .logs import LOG_FORMAT
 from .parameters import RadarEsmTrackingParameters
@@ -140,6 +141,7 @@ class RadarEsmTracking(Task):
         p = self.parameters
         self.classes, self.types = len(p.manoeuvrability), len(p.recognition)
         self.modes = p.class_names
+        self.causes = causes_of(p.class_names)
         self.paper_policy = PaperPolicy("evidence", (0.0,) * self.classes)
         models, _ = self.design_models(p)
         self.models = class_fusion.Models(*(self.constant(matrix) for matrix in models))

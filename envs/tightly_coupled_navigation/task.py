@@ -25,6 +25,7 @@ from ..model import Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
 from .banks import HypothesisBank, NoiseBank, RobustBank
+from .causes import CAUSES
 from .live import ReceiverInput
 from .parameters import DEGREE, HYPOTHESES, SINGER, TightlyCoupledNavigationParameters
 from .scenarios import SCENARIOS
@@ -140,6 +141,8 @@ class TightlyCoupledNavigation(Task):
         "attitude": ("heading_error", "pitch_error", "roll_error"),
     }
     modes = HYPOTHESES
+    causes = CAUSES
+    start_measurements = 100
     cost_description = (
         "squared position error over (7.4 m)^2 plus squared velocity error over (0.25 m/s)^2, the errors of "
         "a single-epoch fix"

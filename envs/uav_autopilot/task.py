@@ -23,6 +23,7 @@ from ..model import Episode, Model
 from ..observation import Array
 from ..task import PaperPolicy, Task
 from .banks import GainBank, ModeBank, NoiseBank
+from .causes import CAUSES
 from .live import SensorInput
 from .parameters import COORDINATES, NOMINAL_SIGMAS, OUTPUT, UavAutopilotParameters
 from .plant import design
@@ -118,6 +119,8 @@ class UavAutopilot(Task):
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": ModeBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
+    causes = CAUSES
+    start_measurements = 20
     cost_description = (
         "quadratic cost of the loop, weighted tracking error and control squared, in units of the nominal "
         "variance of the output's sensor"

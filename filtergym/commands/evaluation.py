@@ -14,11 +14,12 @@ from ..agents.envelope import departure
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.backend import make_model
-from ..envs.catalogue import make_task, read_recording
+from ..envs.catalogue import make_task, nearest, read_recording
 from ..envs.flights import names_flights, read_flights
 from ..envs.recording import Recording
 from ..envs.recording_files import is_recording
 from ..evaluation.bootstrap import Estimate
+from ..evaluation.cause_split import phrases_of
 from ..evaluation.competitors import RandomPolicy
 from ..evaluation.curves import curves_of
 from ..evaluation.dataset import MOST_BYTES, notes_of, write_dataset
@@ -26,7 +27,7 @@ from ..evaluation.estimates import check_estimates, write_estimates
 from ..evaluation.evaluate import Experiment, run_experiment
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_files, writable_file, writable_folder, write_text
-from ..evaluation.metrics import flight_records
+from ..evaluation.metrics import flight_records, mean_cost
 from ..evaluation.parallel import Workers
 from ..evaluation.predictions import Predictions, mean_of
 from ..evaluation.print_layout import check_columns, check_formats, save
@@ -35,11 +36,13 @@ from ..evaluation.summary import combine_summaries, summaries
 from ..names import competitors_of, evaluation_requests, find_competitor, tidy_records
 from ..reports.benchmark import result_of
 from ..reports.export import latex_table, records_as_csv
+from ..reports.reasons import explained_by_default, fill, reason_sentences
 from ..reports.recording_tables import recording_tables
 from ..reports.records import write_records
-from ..reports.results import RESULTS, Result, settings_of, write_results
+from ..reports.results import RESULTS, Result, WorstTrack, settings_of, write_results
 from ..reports.tables import flights_table, results_tables
 from ..reports.work import work_of
+from ..reports.worst import worst_figures
 from .shown import REPORT, make_report
 from .terminal import command_line, console, pair, progress_bar
 
@@ -208,6 +211,8 @@ class Outcome(NamedTuple):
     """Why the whole result is not written; empty where it is."""
     store: Store
     """Keeps what is done until all is written."""
+    costs: Mapping[str, numpy.ndarray]
+    """Mean cost of every episode by name, of all whose cost is known."""
 
     @property
     def has_truth(self) -> bool:
@@ -221,6 +226,15 @@ class Outcome(NamedTuple):
         if each and self.dataset.attrs["recorded"]:
             each = self.dataset.sizes["episode"] <= MOST_RECORDINGS
         return flight_records(self.dataset) if each else []
+
+    def explained(self, names: Sequence[str], wanted: Sequence[str]) -> list[str]:
+        """Return whose cost is explained.
+
+        Args:
+            names: that the user wants evaluated.
+            wanted: names that the user wants explained; none: see :func:`.reports.reasons.explained_by_default`.
+        """
+        return list(wanted) or explained_by_default(self.records, names, self.dataset.attrs["paper"])
 
     def differences(self, problem: Problem) -> dict[str, Estimate]:
         """Log-likelihood per measurement less that of the best, by name."""
@@ -280,22 +294,48 @@ def run(
                 tracks = [name for name in dataset if name in TRACKS or str(name).startswith("measurement_")]
                 dataset = dataset.drop_vars(tracks)
             curves = None if outputs.folder is None else curves_of(dataset)
-            return Outcome(dataset, records, curves, refusal, store)
+            return Outcome(dataset, records, curves, refusal, store, _episode_costs(dataset))
         requests = evaluation_requests(problem, experiment, names, trust)
         work = [] if outputs.folder is None else [work_of(problem, one) for one in requests]
         found = dict(summaries(requests, workers, tick, store, work))
     records, summary_curves, dataset = combine_summaries([found[i] for i in range(len(found))])
-    return Outcome(dataset, records, summary_curves, refusal, store)
+    contenders = [one.contender for one in found.values()]
+    costs = {c.name: c.costs for c in contenders if c.costs is not None}
+    return Outcome(dataset, records, summary_curves, refusal, store, costs)
 
 
-def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[str]) -> None:
-    """Write what was asked for, print the tables, and say where the files are.
+def _episode_costs(dataset: xarray.Dataset) -> dict[str, numpy.ndarray]:
+    """Mean cost of every episode by name; of bounds and without truth there is none."""
+    if "cost" not in dataset:
+        return {}
+    costs = {str(name): mean_cost(dataset, name) for name in dataset["policy"].values.tolist()}
+    return {name: own for name, own in costs.items() if not numpy.isnan(own).all()}
+
+
+def check_explained(wanted: Sequence[str], names: Sequence[str]) -> None:
+    """Raise ValueError for a name to explain that is not evaluated."""
+    for name in wanted:
+        if name not in names:
+            raise nearest("competitor to explain", name, names)
+
+
+def write(
+    problem: Problem,
+    outcome: Outcome,
+    outputs: Outputs,
+    learned: list[str],
+    explained: Sequence[str],
+    worst: Sequence[WorstTrack] = (),
+) -> None:
+    """Write what was asked for, print the tables and the largest reasons, and say where the files are.
 
     Args:
         problem: that was evaluated.
         outcome: of :func:`run`.
         outputs: what is written.
         learned: names that are learned.
+        explained: names of those whose cost is explained.
+        worst: their worst episodes.
     """
     flights = outcome.flights
     tables, records = outcome.tables(problem, flights), [*outcome.records, *flights]
@@ -308,7 +348,11 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
     if outputs.folder is not None and outcome.curves is not None:
         if outcome.has_truth:
             settings = settings_of(command_line())
-            results = [result_of(problem, outcome.dataset, outcome.records, outcome.curves, learned)]
+            results = [
+                result_of(
+                    problem, outcome.dataset, outcome.records, outcome.curves, learned, explained, worst
+                )
+            ]
         whole = outcome.dataset.drop_dims(
             "drawn_episode", errors="ignore"
         )  # the track is for the report alone
@@ -324,11 +368,18 @@ def write(problem: Problem, outcome: Outcome, outputs: Outputs, learned: list[st
             for name, figure in evaluation_figures(outcome.curves, outputs.columns, learned=learned):
                 for suffix in outputs.formats:
                     save(figure, place / f"{name}.{suffix}")
+            for name, figure in worst_figures(worst, phrases_of(outcome.dataset), outputs.columns):
+                for suffix in outputs.formats:
+                    save(figure, place / f"{name}.{suffix}")
             if results:
                 write_results(place / RESULTS, results, settings)
         outcome.store.clear()
     for table in tables:
         console.print(table)
+    phrases = phrases_of(outcome.dataset)
+    for name in explained:
+        for sentence in reason_sentences(outcome.records, phrases, name):
+            console.print(fill(sentence, console.width), highlight=False)
     for note in notes_of(outcome.dataset):
         console.print(note, highlight=False, soft_wrap=True)
     if outputs.folder is not None:

@@ -24,9 +24,11 @@ from ..reports.headline import headline_table
 from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
+from ..reports.worst import find_worst
 from .evaluation import (
     FileOptions,
     Outputs,
+    check_explained,
     find_data,
     find_names,
     keeps_predictions,
@@ -146,6 +148,14 @@ def evaluate_policies(
     threads: Threads = 1,
     jobs: Jobs = 1,
     cluster: Cluster = None,
+    why: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Whose cost is explained; repeat for several; default: the first --policy, else the paper's "
+            "algorithm.",
+            autocompletion=complete_policy,
+        ),
+    ] = None,
     site: Annotated[
         str | None,
         typer.Option(
@@ -179,6 +189,7 @@ def evaluate_policies(
     outputs.check()
     problem, data = find_data(environment, scenario, recording, options, keywords)
     names = find_names(problem, data, policy)
+    check_explained(why or [], names)
     learned = [name for name in names if is_learned(problem, name)]
     check_names(problem.task, keywords)
     experiment = problem.experiment(
@@ -196,7 +207,13 @@ def evaluate_policies(
     )
     with Workers(jobs, cluster) as workers:
         outcome = run(problem, experiment, names, outputs, workers, trust)
-    write(problem, outcome, outputs, learned)
+    explained = outcome.explained(policy or [], why or [])
+    worst = (
+        []
+        if out is None
+        else find_worst(problem, experiment, outcome.costs, outcome.records, explained, trust)
+    )
+    write(problem, outcome, outputs, learned, explained, worst)
     say_departures(problem, data, learned, keywords, trust)
 
 
@@ -346,7 +363,12 @@ def benchmark(
 def animate(
     environment: Environment,
     policy: Annotated[
-        list[str], typer.Option(help="Policy; repeat for several.", autocompletion=complete_policy)
+        list[str],
+        typer.Option(
+            help="Policy, estimator, smoother or reference; repeat for several. Also a file, the folder of a training "
+            "run, or module:Class.",
+            autocompletion=complete_policy,
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the GIFs.")] = Path("results"),
     scenario: ScenarioName = None,
@@ -354,7 +376,7 @@ def animate(
     every: Annotated[int, typer.Option(help="Actions from one frame to the next.")] = 2,
     trust: Trust = False,
 ) -> None:
-    """Draw an episode under each policy as an animated GIF.
+    """Draw an episode under each policy, estimator, smoother or reference as an animated GIF.
 
     Example: filtergym animate filtergym/ManeuveringTarget-v0 --scenario paper --policy imm --out results
     """

@@ -13,6 +13,7 @@ import xarray
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import Problem, problem_of
 from ..envs.catalogue import catalogue
+from ..evaluation.cause_split import CAUSE_METRICS, phrases_of
 from ..evaluation.dataset import groups_of, notes_of
 from ..evaluation.files import writable_file
 from ..evaluation.metrics import Record
@@ -24,6 +25,7 @@ from ..names import evaluation_requests
 from .results import (
     RESULTS,
     Result,
+    WorstTrack,
     components_to_draw,
     select_competitors,
     settings_of,
@@ -125,6 +127,8 @@ def result_of(
     records: list[Record],
     curves: xarray.Dataset,
     learned: Sequence[str],
+    explained: Sequence[str] = (),
+    worst: Sequence[WorstTrack] = (),
 ) -> Result:
     """Turn an evaluation into what a file of results holds of it.
 
@@ -134,11 +138,14 @@ def result_of(
         records: of it, tidy.
         curves: of it; those of what is shown are kept.
         learned: names that stand for something learned, those of competitors among them.
+        explained: names of those whose cost is to be explained; default: the paper's algorithm.
+        worst: their worst episodes.
     """
     cls, scenario, knows = problem.task, dataset.attrs["scenario"], problem.knows
     paper, reference = dataset.attrs["paper"], dataset.attrs["reference"]
     names = dataset["policy"].values.tolist()
-    shown = select_competitors(records, paper, reference, learned)
+    explained = list(explained) or [name for name in [paper] if name in names]
+    shown = list(dict.fromkeys([*select_competitors(records, paper, reference, learned), *explained]))
     components, plane = components_to_draw(groups_of(dataset), dataset["component"].values.tolist())
     named = cls.scenarios.get(scenario)
     return Result(
@@ -152,9 +159,12 @@ def result_of(
         [name for name in names if name in learned],
         {name: knows[name] for name in names if name in knows},
         notes_of(dataset),
-        records,
+        [r for r in records if r.policy in shown or not r.metric.startswith(CAUSE_METRICS)],
         thin_curves(curves.sel(policy=shown)),
         track_of(dataset.sel(policy=shown), components, plane),
+        phrases_of(dataset),
+        explained,
+        list(worst),
     )
 
 

@@ -9,6 +9,9 @@ from .ranking import best_of_origins
 from .results import Result
 from .tables import consistency_word, with_interval
 
+SHORT = {"slightly overconfident": "slightly over", "slightly cautious": "slightly under"}
+"""Words on a covariance in a narrow column."""
+
 
 def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, str, str, str]]]]:
     """Return for each environment the best of every origin, lowest cost first.
@@ -30,7 +33,7 @@ def headline(results: Sequence[Result]) -> list[tuple[Result, list[tuple[str, st
             difference = by_name.get((name, "relative_cost_difference", ""))
             nees = by_name.get((name, "anees", "state"))
             cost = "0" if origin == "paper" else with_interval(difference, 100.0, negligible=0.005)
-            rows.append((origin, name, cost, consistency_word(None if nees is None else nees.value)))
+            rows.append((origin, name, cost, consistency_word(nees)))
         found.append((result, rows))
     return found
 
@@ -47,10 +50,11 @@ def headline_table(results: Sequence[Result]) -> Table:
         if i:
             table.add_row()
         table.add_row("", Text(f"{result.short} {result.scenario}", style="bold"))
-        for row in rows:
-            table.add_row(*row)
+        for *row, word in rows:
+            table.add_row(*row, SHORT.get(word, word))
     table.caption = (
         "learned and classical steer the paper's filters, an estimator is a filter of its own, the reference knows the "
-        "truth. Covariance: consistent within a factor of two of the errors."
+        "truth. Covariance: consistent where the interval of ANEES holds one; slightly over or under: overconfident "
+        "or cautious by less than a factor of two."
     )
     return table

@@ -17,6 +17,7 @@ from .tables import (
     score_text,
     with_interval,
 )
+from .why_section import why_section, worst_data
 
 WORDS = ("competitor", "covariance", "origin", "control")
 """Columns that hold no numbers."""
@@ -82,12 +83,14 @@ def _cell(result: Result, anchor: str, group: Sequence[Result]) -> dict[str, Any
         "header": header,
         "rows": rows,
         "smoothers": list(dict.fromkeys(r.policy for r in result.records if r.kind == "smoother")),
+        "why": why_section(result),
         "figures": _figures(result),
         "data": pack(
             {
                 "lines": _lines(result, group),
                 "paper": result.paper,
                 "ranking": _differences(result),
+                "worst": worst_data(result),
                 **serialise_datasets(result),
             }
         ),
@@ -126,7 +129,7 @@ def _table(result: Result) -> tuple[list[str], list[list[Entry]]]:
                 Entry(median, _number(median)),
                 Entry(wins, _number(wins)),
                 Entry("-" if value is None else f"{value:.3g}", value),
-                Entry(consistency_word(value), consistency_word(value)),
+                Entry(consistency_word(nees), consistency_word(nees)),
                 Entry(score_text(score).partition(" [")[0], None if score is None else score.value),
                 *(number(name, "rmse", component) for component in shown),
                 *(
@@ -239,6 +242,16 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "alternative": f"Largest RMSE at any time: {in_words('peak_rmse', component, order[:6])}.",
             },
         ]
+    if result.curves is not None and {"cost_minus_paper", "cost_minus_best"} & set(result.curves):
+        figures.append(
+            {
+                "kind": "difference",
+                "title": "Mine minus theirs over time",
+                "text": "Mean cost less that of another on the same episodes, with paired 95 % bands; below zero "
+                "is better.",
+                "alternative": "The difference over the whole run stands in the table above.",
+            }
+        )
     if result.curves is not None and {"anees", "anis"} & set(result.curves):
         figures.append(
             {
@@ -267,6 +280,17 @@ def _figures(result: Result) -> list[dict[str, str]]:
                 "text": f"The first episode (seed {result.track.attrs.get('seed', '?')}), not a chosen one: truth, "
                 "what was measured, estimates, and their covariances at two standard deviations. Move the slider.",
                 "alternative": "An animation of one episode; its numbers are in the table above, over all episodes.",
+            }
+        )
+    if any(one.track is not None for one in result.worst):
+        figures.append(
+            {
+                "kind": "worst",
+                "title": "The worst episodes",
+                "text": "Those that cost a competitor most, beside whom it is compared with: truth, what was measured, "
+                "estimates, and their covariances at two standard deviations. The slider begins where "
+                "the error is largest.",
+                "alternative": "An animation of single episodes; the tables of the causes tell their seeds and costs.",
             }
         )
     return figures

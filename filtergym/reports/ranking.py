@@ -7,7 +7,7 @@ from ..agents.named_policies import pretrained_agents
 from ..evaluation.competitors import RANKED
 from ..evaluation.metrics import Record
 from .results import Result
-from .tables import consistency_word, with_interval
+from .tables import INCONSISTENT_WORDS, consistency_word, with_interval
 
 NEGLIGIBLE = 5e-5
 """Relative difference of costs that is rounding, or as good as none."""
@@ -160,24 +160,24 @@ def verdict(results: Sequence[Result]) -> list[str]:
             + (f"; worst: {max(harmful)[1]}." if harmful else ".")
         )
     off = [
-        f"`{name}` in {result.short} ({_nees(result, name):.2g})"
+        f"`{name}` in {result.short} ({with_interval(nees)})"
         for result in judged
         for name in [ranking(result.records, result.learned)[0].name]
-        if consistency_word(_nees(result, name)) in ("overconfident", "cautious")
+        if (nees := _nees(result, name)) is not None and consistency_word(nees).endswith(INCONSISTENT_WORDS)
     ]
     if judged:
         sentences.append(
-            "The errors of every winner are as large as its covariance says, to a factor of two in the mean NEES."
+            "The covariance of every winner is consistent: the interval of its mean NEES over the dimension holds one."
             if not off
-            else f"Best, but with a covariance off by more than a factor of two in the mean NEES: {', '.join(off)}."
+            else f"Best, but with a covariance that is not consistent, mean NEES over the dimension: {', '.join(off)}."
         )
     return sentences
 
 
-def _nees(result: Result, name: str) -> float | None:
+def _nees(result: Result, name: str) -> Record | None:
     for record in result.records:
         if (record.policy, record.metric, record.component, record.window) == (name, "anees", "state", "all"):
-            return record.value
+            return record
     return None
 
 

@@ -49,6 +49,25 @@ class Settings(NamedTuple):
     """Of Python and the libraries."""
 
 
+class WorstTrack(NamedTuple):
+    """An episode that costs a competitor much, to be looked at."""
+
+    policy: str
+    """The competitor."""
+    opponent: str
+    """With whom it is compared; empty: nobody."""
+    seed: str
+    """Of the episode, in words: it has more digits than a number of JavaScript. Of a recording its name there."""
+    cost: float
+    """Mean over the episode."""
+    ratio: float | None
+    """Of the cost to the opponent's."""
+    causes: list[str]
+    """The main ones; empty: none."""
+    track: xarray.Dataset | None
+    """See :func:`track_of`."""
+
+
 class Result(NamedTuple):
     """One environment in one scenario."""
 
@@ -75,6 +94,12 @@ class Result(NamedTuple):
     """See :func:`.evaluation.curves.curves_of`, of the competitors that are shown."""
     track: xarray.Dataset | None
     """Of one episode, see :func:`track_of`."""
+    causes: dict[str, str] = {}  # noqa: RUF012  (nobody writes to it)
+    """When each cause of the records holds, by name."""
+    explained: list[str] = []  # noqa: RUF012
+    """Names of those whose cost was to be explained."""
+    worst: list[WorstTrack] = []  # noqa: RUF012
+    """Their worst episodes."""
 
     @property
     def short(self) -> str:
@@ -126,13 +151,16 @@ def thin_curves(curves: xarray.Dataset) -> xarray.Dataset:
     return fewer.isel(share=slice(None, None, 2)) if "share" in fewer.dims else fewer
 
 
-def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) -> xarray.Dataset | None:
-    """Return the first episode of an evaluation: what was true, measured and estimated.
+def track_of(
+    dataset: xarray.Dataset, components: Sequence[str], plane: bool, number: int = 0
+) -> xarray.Dataset | None:
+    """Return one episode of an evaluation: what was true, measured and estimated.
 
     Args:
         dataset: from an evaluation with ``drawn_episodes``; without there is no track.
         components: that are drawn.
         plane: whether the first two of them are the axes of a plane.
+        number: of the episode.
 
     Returns:
         ``truth`` and ``seen`` (policy, component, time), where they are known: in a closed loop every competitor flies
@@ -145,10 +173,10 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
     present = [
         name
         for name in dataset["policy"].values.tolist()
-        if not numpy.isnan(dataset["drawn_estimate"].sel(policy=name).values[0]).all()
+        if not numpy.isnan(dataset["drawn_estimate"].sel(policy=name).values[number]).all()
     ]
     kept = [name for name in dataset if str(name).startswith("drawn_")]
-    episode = dataset[kept].sel(policy=present).isel(drawn_episode=0)
+    episode = dataset[kept].sel(policy=present).isel(drawn_episode=number)
     which = [dataset["component"].values.tolist().index(name) for name in components]
     episode = episode.isel(component=which, other_component=which)
     there = numpy.flatnonzero(numpy.isfinite(episode["drawn_estimate"].values).any(axis=(0, 2)))
@@ -176,7 +204,7 @@ def track_of(dataset: xarray.Dataset, components: Sequence[str], plane: bool) ->
         "unit",
     }
     found = found.drop_vars(list(further))
-    found.attrs = {"plane": int(plane), "seed": str(dataset["episode_seed"].values.ravel()[0])}
+    found.attrs = {"plane": int(plane), "seed": str(dataset["episode_seed"].values.ravel()[number])}
     return found
 
 
@@ -205,15 +233,21 @@ def _as_json(result: Result) -> dict[str, Any]:
     return {
         **result._asdict(),
         "records": [record._asdict() for record in result.records],
+        "worst": [{**one._asdict(), "track": serialise_track(one.track)} for one in result.worst],
         **serialise_datasets(result),
     }
+
+
+def serialise_track(track: xarray.Dataset | None) -> dict[str, Any] | None:
+    """A track as JSON can say it."""
+    return None if track is None else dataset_as_json(track, TRACK_DIGITS, DIGITS)
 
 
 def serialise_datasets(result: Result) -> dict[str, Any]:
     """Curves and track as JSON can say them."""
     return {
         "curves": None if result.curves is None else dataset_as_json(result.curves, {}, DIGITS),
-        "track": None if result.track is None else dataset_as_json(result.track, TRACK_DIGITS, DIGITS),
+        "track": serialise_track(result.track),
     }
 
 
@@ -264,22 +298,36 @@ def _restore(fields: Any) -> Result:
         name: None if fields.get(name) is None else dataset_from_json(fields[name])
         for name in ("curves", "track")
     }
-    result = restore(Result, {**fields, "records": records, **datasets})
+    worst = [_restore_worst(entry) for entry in fields.get("worst", [])]
+    result = restore(Result, {**fields, "records": records, "worst": worst, **datasets})
     if not records:
         raise ValueError("a result holds no records")
     for part, found in datasets.items():
-        missing = (
-            []
-            if found is None
-            else [name for name in REQUIRED_DIMENSIONS[part] if name not in found.variables]
-        )
-        if missing:
-            raise ValueError(f"the {part} of a result lack {', '.join(missing)}")
+        _check_dataset(part, found)
     if result.curves is not None and "rmse" in result.curves and not result.curves.sizes.get("quantity"):
         raise ValueError("the curves of a result hold errors of nothing")
     if any((r.environment, r.scenario) != (result.environment, result.scenario) for r in records):
         raise ValueError("a result holds records of another environment or scenario")
     return result
+
+
+def _restore_worst(fields: Any) -> WorstTrack:
+    if not isinstance(fields, dict):
+        raise ValueError("a worst episode needs its fields")
+    track = None if fields.get("track") is None else dataset_from_json(fields["track"])
+    _check_dataset("track", track)
+    found = restore(WorstTrack, {**fields, "track": track})
+    if not all(math.isfinite(number) for number in (found.cost, found.ratio or 0.0)):
+        raise ValueError(f"the cost of a worst episode must be finite, got {found.cost} and {found.ratio}")
+    return found
+
+
+def _check_dataset(part: str, found: xarray.Dataset | None) -> None:
+    """Raise ValueError if curves or a track lack what a report cannot be made without."""
+    wanted = REQUIRED_DIMENSIONS[part] if found is not None else ()
+    missing = [name for name in wanted if found is None or name not in found.variables]
+    if missing:
+        raise ValueError(f"the {part} of a result lack {', '.join(missing)}")
 
 
 def check_numbers(record: Record) -> None:

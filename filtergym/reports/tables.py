@@ -17,6 +17,8 @@ from ..offline import DatasetSummary
 
 NARROW, WIDE = 24, 44
 """Columns of a name, where there are few and otherwise: longer ones go on below, from a hyphen on if they have one."""
+INCONSISTENT_WORDS = ("overconfident", "cautious")
+"""With which the words on a covariance end that is not consistent."""
 INCONSISTENT = "!"
 """Marks a covariance that is off by more than a factor of two."""
 
@@ -56,22 +58,35 @@ def against_paper(found: Mapping[Any, Any], name: str, scenario: tuple[str, ...]
     return [f"{percent:+,.{digits}f}", f"{100.0 * wins.value:.0f}"]
 
 
-def consistency_word(value: float | None) -> str:
-    """Say what a mean NEES over its dimension means; consistent is within a factor of two of one."""
-    if value is None:
+def consistency_word(record: Any) -> str:
+    """Say what a mean NEES over its dimension means: an estimator is consistent where its interval holds one.
+
+    Args:
+        record: with ``value``, ``low`` and ``high``; or None.
+
+    Returns:
+        One or two words; by less than a factor of two an inconsistent one is "slightly" overconfident or cautious.
+    """
+    if record is None or record.value is None:
         return "says nothing"
-    if value > 2.0:
-        return "overconfident"
-    return "cautious" if value < 0.5 else "consistent"
+    if record.low is None or record.low == record.high:
+        return "no interval"
+    if record.low <= 1.0 <= record.high:
+        return "consistent"
+    word = "overconfident" if record.value > 1.0 else "cautious"
+    return word if is_far_off(record.value) else f"slightly {word}"
+
+
+def is_far_off(value: float) -> bool:
+    """Say whether a mean NEES over its dimension is off by more than a factor of two."""
+    return not 0.5 <= value <= 2.0
 
 
 def consistency(record: Any) -> str:
-    """Mean NEES over the dimension, marked where it is inconsistent by more than a factor of two."""
+    """Mean NEES over the dimension, marked where it is off by more than a factor of two."""
     if record is None or record.value is None:
         return "-"
-    return f"{record.value:.3g}" + (
-        "" if consistency_word(record.value) == "consistent" else f" {INCONSISTENT}"
-    )
+    return f"{record.value:.3g}" + (f" {INCONSISTENT}" if is_far_off(record.value) else "")
 
 
 def score_text(record: Any) -> str:

@@ -16,6 +16,7 @@
       const length = shape.slice(indices.length).reduce((product, n) => product * n, 1);
       return numbers.slice(start * length, (start + 1) * length);
     }
+    get stretches() { return this.numbers(this.has("stretch_elapsed") ? "stretch_elapsed" : "stretch"); }
     get time() { return this.has("elapsed") ? this.numbers("elapsed") : this.numbers("time"); }
     get clock() { return this.has("elapsed") ? "time, s" : "measurement"; }
   }
@@ -89,7 +90,7 @@
 
   // --- what each figure offers: choices, each a function that returns traces and layout
 
-  function overTime(cell, variable, indices, title, changes = {}) {
+  function overTime(cell, variable, indices, title, changes = {}, [x, numbers] = [cell.curves.time, cell.curves.numbers("time")]) {
     const { curves, lines } = cell;
     const names = curves.words("policy");
     const of = (line) => {
@@ -107,7 +108,7 @@
         if (last[i] - first[i] + 1 < 0.85 * all) shapes.push({ type: "rect", xref: "x", yref: "paper", x0: at(first[i]), x1: at(last[i]), y0: 0, y1: 1, line: { width: 0 }, fillcolor: css("--soft"), opacity: i % 2 ? 0.1 : 0.06, layer: "below", label: { text: words(name), textposition: "top center", font: { size: 10, color: css("--soft") } } });
       });
     }
-    const log = changes.type === "log", drawn = traces(lines, curves.time, of, curves.numbers("time"), log);
+    const log = changes.type === "log", drawn = traces(lines, x, of, numbers, log);
     if (log) {
       const [bottom, top] = ends(lines, of, true), margin = 0.06 * (top - bottom);
       changes = { ...changes, range: [bottom - margin, top + margin] };
@@ -130,6 +131,9 @@
       const range = [Math.log10(Math.min(...sizes) || 1), Math.log10(largest || 1) + 0.05];
       return [drawn, layout({ xaxis: { title: { text: `error of ${words(name)}, ${plain(curves.words("unit")[i])}` }, ...logarithmic, range }, yaxis: { title: { text: "share of measurements above" }, type: "log", exponentformat: "power", dtick: 1 } })];
     }]),
+    difference: (cell) => [["paper", cell.paper], ["best", cell.curves.attrs.get("best")]]
+      .filter(([key, name], i) => cell.curves.has(`cost_minus_${key}`) && !(i && name === cell.paper))
+      .map(([key, name]) => [`less ${name}`, () => overTime(cell, `cost_minus_${key}`, [], `mean cost less that of ${plain(name)}`, {}, [cell.curves.stretches, cell.curves.numbers("stretch").map((number) => Math.round(number))])]),
     consistency: (cell) => ["anees", "anis"].filter((name) => cell.curves.has(name)).map((name) => [name.slice(1).toUpperCase(), () => {
       const { curves } = cell;
       const names = curves.words("policy");
@@ -205,7 +209,16 @@
     return [low - margin, high + margin];
   }
 
-  function drawTrack(figure, cell) {
+  // Where somebody's error is largest.
+  function worstTime(track, name) {
+    if (!track.has("truth")) return 0;
+    const at = track.words("policy").indexOf(name);
+    const errors = track.words("component").map((_, i) => minus(track.row("estimate", at, i), track.row("truth", at, i)));
+    const sizes = track.time.map((_, n) => errors.reduce((sum, error) => sum + (error[n] || 0) ** 2, 0));
+    return sizes.indexOf(Math.max(...sizes));
+  }
+
+  function drawTrack(figure, cell, begin = Math.floor(cell.track.time.length / 2)) {
     const { track, lines } = cell;
     const names = track.words("policy"), components = track.words("component"), units = track.words("unit");
     const plane = Number(track.attrs.get("plane")) === 1, time = track.time;
@@ -213,7 +226,7 @@
     const box = figure.querySelector(".plot");
     const panels = box.appendChild(Object.assign(document.createElement("div"), { className: "panels" }));
     const [left, right] = [0, 1].map(() => panels.appendChild(document.createElement("div")));
-    const slider = Object.assign(document.createElement("input"), { type: "range", min: 0, max: time.length - 1, value: Math.floor(time.length / 2), step: 1 });
+    const slider = Object.assign(document.createElement("input"), { type: "range", min: 0, max: time.length - 1, value: begin, step: 1 });
     slider.setAttribute("aria-label", "time");
     const output = document.createElement("output");
     const bar = box.appendChild(Object.assign(document.createElement("div"), { className: "slider" }));
@@ -298,8 +311,28 @@
     box.append(select);
   }
 
+  // One of the worst episodes at a time, with those two in colour whom it is about.
+  function drawWorst(figure, cell) {
+    const box = figure.querySelector(".plot");
+    let draw = () => {};
+    const show = (i) => {
+      const { policy, opponent, track } = cell.worst[i];
+      const inner = Object.assign(document.createElement("div"), { className: "inner" });
+      inner.append(...["choices", "plot"].map((className) => Object.assign(document.createElement("div"), { className })));
+      box.replaceChildren(inner);
+      const known = (name) => cell.lines.find((line) => line.name === name) || { name, origin: "classical", colour: null };
+      const lines = [policy, opponent].filter((name) => name).map(known).map((line, i) => isGrey(line) ? { ...line, colour: i } : line);
+      const data = new Data(track);
+      draw = drawTrack(inner, { lines, track: data }, worstTime(data, policy));
+    };
+    addChoices(figure, cell.worst.map(({ policy, seed, cost }) => `${policy}, episode ${seed}, mean cost ${cost}`), show);
+    show(0);
+    return () => draw();
+  }
+
   function drawFigure(figure, cell) {
     const kind = figure.dataset.kind, box = figure.querySelector(".plot");
+    if (kind === "worst") return redraw.push(drawWorst(figure, cell));
     if (kind === "track") return redraw.push(drawTrack(figure, cell));
     const choices = kind === "dots" ? [["", () => dotted(cell.scenarios, cell.lines, cell.paper)]] : FIGURES[kind](cell);
     let current = 0;

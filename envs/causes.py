@@ -1,0 +1,141 @@
+"""Causes of an estimate's cost: circumstances of a measurement that an author declares, such as a turn.
+
+A cause holds at a measurement or does not, and several may hold at once. Each is computed from what is at hand there, a
+:class:`Moment`, and is traced with the steps of the task. A cause that cannot be known, such as that of a context which
+a recording has not, holds nowhere, and an evaluation leaves it out.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from .observation import Array
+
+LARGE_ERROR = 4.0
+"""Stated standard deviations beyond which the error of a reading is an outlier: of white normal errors that state them
+rightly, one of 16,000."""
+
+
+MOST_CAUSES = 50
+"""Of a task: which of them hold is one number."""
+RESERVED = ("all", "start", "other")
+"""Names that an evaluation gives to causes of its own."""
+
+
+class Moment(NamedTuple):
+    """What causes are computed from, at one measurement of N episodes."""
+
+    xp: ModuleType
+    """Array namespace."""
+    context: Mapping[str, Array]
+    """What the world tells of the episode, see :meth:`.World.context`; of a recording none of it."""
+    state: Array
+    """True values of the task's components, ``(C, N)``; NaN where a recording does not know them."""
+    measurement: Any
+    """The world's NamedTuple."""
+    readings: Array | None
+    """Of the components, ``(C, N)``, NaN where they say nothing; None where a measurement is of no component."""
+    deviations: Array | None
+    """Standard deviations that are stated for their errors, ``(C, N)``."""
+
+    def knows(self, *names: str) -> bool:
+        """Whether the context tells all of these, and each of something: of no commands there are no times."""
+        return all(name in self.context and 0 not in self.context[name].shape for name in names)
+
+
+class Cause(NamedTuple):
+    """A circumstance that may cost an estimate something."""
+
+    name: str
+    """One word or a few, of the rows of a table: ``turn``."""
+    phrase: str
+    """What completes "most of its cost falls", with its preposition: ``in turns``."""
+    holds: Callable[[Moment], Array | None]
+    """From a moment to booleans, ``(N,)``; None where it cannot be known."""
+
+
+def bins(
+    name: str, unit: str, phrase: str, edges: tuple[float, ...], value: Callable[[Moment], Array | None]
+) -> tuple[Cause, ...]:
+    """Return a cause for each interval of a quantity: below the first edge, between two, and from the last on.
+
+    Args:
+        name: of the quantity, such as ``range``.
+        unit: of the edges.
+        phrase: before the interval in words, such as ``at ranges``.
+        edges: ascending.
+        value: of the quantity in that unit, ``(N,)``; None where it is not known.
+    """
+    words = [f"below {edges[0]:g} {unit}"]
+    words += [f"of {low:g} to {high:g} {unit}" for low, high in itertools.pairwise(edges)]
+    words += [f"from {edges[-1]:g} {unit} on"]
+    ends = itertools.pairwise([-math.inf, *edges, math.inf])
+    return tuple(
+        Cause(f"{name} {interval}", f"{phrase} {interval}", _is_between(low, high, value))
+        for interval, (low, high) in zip(words, ends, strict=True)
+    )
+
+
+def _is_between(
+    low: float, high: float, value: Callable[[Moment], Array | None]
+) -> Callable[[Moment], Array | None]:
+    def holds(moment: Moment) -> Array | None:
+        found = value(moment)
+        return None if found is None else (found >= low) & (found < high)
+
+    return holds
+
+
+def context_flag(name: str) -> Callable[[Moment], Array | None]:
+    """Return what holds where a number of the context is above zero.
+
+    Args:
+        name: of it, ``(N,)``.
+    """
+
+    def holds(moment: Moment) -> Array | None:
+        return moment.context[name] > 0.0 if moment.knows(name) else None
+
+    return holds
+
+
+def _is_missed(moment: Moment) -> Array | None:
+    """Whether something that is available at other times is not, ``(N,)``."""
+    available = getattr(moment.measurement, "available", None)
+    if available is None:
+        return None
+    missing = available < 0.5
+    axes = tuple(range(len(missing.shape) - 1))
+    found: Array = moment.xp.any(missing, axis=axes) if axes else missing
+    return found
+
+
+def _is_outlier(moment: Moment) -> Array | None:
+    """Whether the error of a reading is beyond ``LARGE_ERROR`` stated deviations, ``(N,)``."""
+    if moment.readings is None or moment.deviations is None:
+        return None
+    error = moment.xp.abs(moment.readings - moment.state)
+    found: Array = moment.xp.any(error > LARGE_ERROR * moment.deviations, axis=0)
+    return found
+
+
+MISSED = Cause("missed", "where a measurement is missed", _is_missed)
+OUTLIER = Cause("outlier", f"on outliers beyond {LARGE_ERROR:g} stated sigma", _is_outlier)
+
+
+def cause_number(causes: tuple[Cause, ...], moment: Moment) -> Array:
+    """Return which causes hold, as one number: the sum of 2 to the power of the place of each, ``(N,)``.
+
+    Args:
+        causes: of the task, at most ``MOST_CAUSES``.
+        moment: at a measurement.
+    """
+    xp, total = moment.xp, 0.0 * moment.state[0]
+    total = xp.where(total == total, total, 0.0)  # the truth of a recording may be NaN
+    for place, cause in enumerate(causes):
+        held = cause.holds(moment)
+        if held is not None:
+            total = total + xp.where(held, 2.0**place, 0.0)
+    return total
