@@ -275,8 +275,10 @@ def drop_last(part: Any) -> Any:
 
 
 def _map_arrays(function: Callable[..., Array], *parts: Any) -> Any:
-    """Apply a function to the arrays of nested tuples."""
+    """Apply a function to the arrays of nested tuples; None holds none."""
     first = parts[0]
+    if first is None:
+        return None
     if isinstance(first, tuple):
         answers = [_map_arrays(function, *each) for each in zip(*parts, strict=True)]
         return type(first)(*answers) if hasattr(first, "_fields") else tuple(answers)
@@ -284,6 +286,8 @@ def _map_arrays(function: Callable[..., Array], *parts: Any) -> Any:
 
 
 def _arrays_of(part: Any) -> list[Array]:
+    if part is None:
+        return []
     return [array for each in part for array in _arrays_of(each)] if isinstance(part, tuple) else [part]
 
 
