@@ -42,6 +42,8 @@ class TunedPolicy:
     make: Callable[[Any], Any]
     content: str
     """All that it is made of, in words: what is equal in these is compiled once."""
+    anchored: bool = False
+    """As of :class:`.Tunable`: it takes what only recordings hold."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, TunedPolicy) and other.content == self.content
@@ -146,7 +148,8 @@ def make_tuned_policy(name: str, tunable: Tunable, values: Mapping[str, float]) 
         values: by name.
     """
     keywords, make = tunable.apply(values)
-    return TunedPolicy(keywords, tunable.control, make, f"{name} {sorted(values.items())!r}")
+    content = f"{name} {sorted(values.items())!r}"
+    return TunedPolicy(keywords, tunable.control, make, content, tunable.anchored)
 
 
 def round_value(value: float) -> float:

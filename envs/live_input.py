@@ -25,9 +25,11 @@ class Feed:
 
     Args:
         regular: whether every measurement comes, one sampling interval after the one before.
+        second_sensor: whether a measurement has the fields that only recordings hold.
     """
 
     regular: bool = False
+    second_sensor: bool = False
     truth: ClassVar[None] = None
     has_whole_truth: ClassVar[bool] = False
 
@@ -40,8 +42,23 @@ class Feed:
         return ()
 
     def world(self, task: "Task") -> Any:
-        """Return the task's own world, which nobody asks."""
-        return task.World(task)
+        """Return the task's own world, whose numbers nobody looks at."""
+        return _WithRecordedFields(task) if self.second_sensor else task.World(task)
+
+
+class _WithRecordedFields:
+    """A task's own world, whose measurements have the fields that only recordings hold."""
+
+    def __init__(self, task: "Task") -> None:
+        self._world: Any = task.World(task)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._world, name)
+
+    def advance(self, *arguments: Any) -> tuple[Any, Any]:
+        """Measure, with zeros in these fields."""
+        truth, measurement = self._world.advance(*arguments)
+        return truth, self._world.add_recorded_fields(measurement)
 
 
 class LiveInput:
@@ -79,7 +96,7 @@ class LiveInput:
             return {
                 name: f"shape {array.shape[:-1]}"
                 for name, array in part._asdict().items()
-                if name not in left_out
+                if name not in left_out and array is not None
             }
 
         return shapes(self.measurement, [self.counter]), shapes(self.initial, ["mean", "covariance"])
@@ -143,6 +160,8 @@ class LiveInput:
         """
         found = {}
         for name, array in like._asdict().items():
+            if array is None:
+                continue
             values = self.read(given, name, array.shape[:-1])
             if not numpy.isfinite(values).all():
                 raise ValueError(f"{self.task.id} needs {name} {what}, finite, got {_listed(given)}")

@@ -134,6 +134,8 @@ class OnlineFilter:
         self.name, self.tracks, self.watch = name, tracks, watch
         self.task = model.task
         initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
+        if self.task.recording.second_sensor:
+            measurement = self.task.world.add_recorded_fields(measurement)
         self.input = self.task.live_input(self.task, initial, measurement, tracks)
         self._policy: SteppingPolicy | None = None
         if kind == "policy":

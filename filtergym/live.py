@@ -23,6 +23,7 @@ def online(
     *,
     tracks: int = 1,
     regular: bool = False,
+    second_sensor: bool = False,
     backend: str = "auto",
     trust: bool = False,
     **keywords: Any,
@@ -39,6 +40,8 @@ def online(
         scenario: whose parameters are taken; default: the environment's.
         tracks: how many are followed side by side.
         regular: every measurement comes, one sampling interval after the one before; some filters are then simpler.
+        second_sensor: a measurement holds what only recordings do, such as odometry; what ``advise`` has fitted to one
+            takes it anyway.
         backend: what computes, "auto", "compiled" or "numpy".
         trust: load a model's zip, which can execute code.
         **keywords: parameters of the task.
@@ -53,7 +56,9 @@ def online(
     kind = kind_of(maker)
     keywords = {**getattr(maker, "task_keywords", {}), **keywords}
     chosen = dataclasses.replace(
-        find_scenario(problem.task, scenario, keywords), flights=(), recording=Feed(regular)
+        find_scenario(problem.task, scenario, keywords),
+        flights=(),
+        recording=Feed(regular, second_sensor or getattr(maker, "anchored", False)),
     )
     own = control_of(maker, kind, control, problem.task, name)
     model = make_model(problem.task, own, chosen, backend=backend, **keywords)

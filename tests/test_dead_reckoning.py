@@ -17,7 +17,7 @@ from filtergym.envs.recording import Recording, join_recordings
 from filtergym.evaluation.likelihood import Span, cut_windows
 from filtergym.filters import dead_reckoning
 
-from filtergym import evaluate, read_recording
+from filtergym import evaluate, online, read_recording
 from filtergym.reports.advice import advice_lines
 
 ID = "filtergym/ManeuveringTarget-v0"
@@ -301,8 +301,14 @@ def test_its_file_runs_on_such_logs_alone(advice, tmp_path):
     name = "dead-reckoning"
     write_fitted(path, PROBLEM, name, advice.fits[name], advice.intervals, "filtergym advise")
     read_fitted(path, PROBLEM)
-    found = evaluate(ID, [str(path)], read(drive(count=200), tmp_path))
+    recording, table = read(drive(count=200), tmp_path), pandas.read_csv(tmp_path / "drive.csv")
+    found = evaluate(ID, [str(path)], recording, tracks=True)
     assert np.isfinite(found["log_likelihood"].values).all()
+    live = online(ID, str(path), **recording.parameters)
+    live.start(*(recording.initial[part][0] for part in ("mean", "covariance")), time=table["time"][1])
+    for k, row in table[2:].reset_index(drop=True).iterrows():
+        estimate = live.update(**{key: value for key, value in row.items() if not key.startswith("truth")})
+        np.testing.assert_array_equal(estimate.mean, found["estimate"].values[0, 0, k])
     plain = read(drive(count=200).drop(columns=["odometry_x", "odometry_y"]), tmp_path)
     with pytest.raises(ValueError, match="dead reckoning needs a second sensor"):
         evaluate(ID, [str(path)], plain)

@@ -93,6 +93,7 @@ def first_tracks(part):
     return map_leaves(lambda array: array[..., :3], part)
 
 
+ODOMETRY = "odometry_speed", "odometry_heading"
 LOGS = {
     RADAR: (
         "time,x,y,sigma_x,sigma_y\n"
@@ -103,6 +104,13 @@ LOGS = {
     f"{RADAR} polar": (
         "time,range,azimuth\n0,20000,30\n4,20300,30.5\n8,20600,31.1\n12,20900,31.5\n16.5,21250,32\n",
         ("range", "azimuth"),
+        2,
+    ),
+    f"{RADAR} odometry": (
+        "time,x,y,sigma_x,sigma_y,odometry_speed,odometry_heading\n"
+        "0,1000,2000,30,20,20,80\n4,1200,2050,30,20,21,82\n8,1410,2090,30,25,20,85\n12,1600,2100,30,25,,\n"
+        "16,1810,2110,30,25,20,84\n20,2010,2160,20,20,20,80\n24,2200,2150,20,20,19,82\n",
+        ("x", "y", "sigma_x", "sigma_y", *ODOMETRY),
         2,
     ),
     ESM: (
@@ -127,10 +135,12 @@ def test_rows_that_come_one_by_one_make_the_measurements_of_their_log(case, tmp_
     path.write_text(text)
     recording = read_recording(path, id)
     rows = np.genfromtxt(path, delimiter=",", names=True)
-    filter = filtergym.online(id, import_problem(id).paper, **recording.parameters)
+    has_odometry = "odometry" in case
+    filter = filtergym.online(id, import_problem(id).paper, second_sensor=has_odometry, **recording.parameters)
     first = {name: rows[name][0] for name in names}
     mean, covariance = (recording.initial[name][0] for name in ("mean", "covariance"))
-    filter.start(mean, covariance, rows["time"][begun - 1], **(first if id == ESM else {}))
+    also = {name: rows[name][1] for name in ODOMETRY} if has_odometry else first if id == ESM else {}
+    filter.start(mean, covariance, rows["time"][begun - 1], **also)
     for k, row in enumerate(rows[begun:]):
         measurement, _ = filter.input.measure(
             filter._running().input, np.array([row["time"]]), {name: row[name] for name in names}

@@ -8,8 +8,9 @@ import numpy
 from ...filters import polar
 from ..live_input import LiveInput, Memory
 from .logs import COLUMNS
-from .world import Measurement
+from .world import Measurement, Odometry
 
+SECOND_SENSOR = ("odometry_x", "odometry_y", "odometry_speed", "odometry_heading")
 VALUES = ("x", "y", "range", "azimuth", "sigma_x", "sigma_y", "range_sigma", "azimuth_sigma")
 
 
@@ -19,13 +20,19 @@ class PlotInput(LiveInput):
     counter = "scan"
 
     def describe(self) -> tuple[Mapping[str, str], Mapping[str, str]]:
-        """Return columns of a log, and nothing beside mean and covariance."""
-        return {name: COLUMNS[name] for name in VALUES}, {}
+        """Return columns of a log; of a second sensor speed and heading at the start, too."""
+        if self.measurement.odometry is None:
+            return {name: COLUMNS[name] for name in VALUES}, {}
+        at_start = {name: COLUMNS[name] for name in SECOND_SENSOR[2:]}
+        return {name: COLUMNS[name] for name in (*VALUES, *SECOND_SENSOR)}, at_start
 
     def start(self, time: numpy.ndarray, given: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Start as if a scan had just seen the target."""
-        initial, memory = super().start(time, given)
-        return initial, {**memory, "last_plot": time}
+        initial, memory = super().start(
+            time, {name: given[name] for name in ("mean", "covariance") if name in given}
+        )
+        velocity = {} if self.measurement.odometry is None else {"velocity": self._velocity(given)}
+        return initial, {**memory, "last_plot": time, **velocity}
 
     def measure(self, memory: Memory, time: numpy.ndarray, values: Mapping[str, Any]) -> tuple[Any, Memory]:
         """Take a plot for what it is, and its variances at the measured position."""
@@ -42,7 +49,21 @@ class PlotInput(LiveInput):
             time - memory["last_plot"],
         )
         last_plot = numpy.where(there, time, memory["last_plot"])
-        return measurement, {"time": time, "count": scan, "last_plot": last_plot}
+        after = {"time": time, "count": scan, "last_plot": last_plot}
+        if self.measurement.odometry is None:
+            return measurement, after
+        velocity = self._velocity(values)
+        moved = numpy.stack([self.read(values, "odometry_x"), self.read(values, "odometry_y")])
+        between = 0.5 * measurement.interval * (memory["velocity"] + velocity)
+        moved = numpy.where(numpy.isfinite(moved), moved, between)
+        says = numpy.isfinite(moved).all(axis=0)
+        odometry = Odometry(numpy.where(says, moved, 0.0), says.astype(float))
+        return measurement._replace(odometry=odometry), {**after, "velocity": velocity}
+
+    def _velocity(self, values: Mapping[str, Any]) -> numpy.ndarray:
+        """Velocity by the second sensor, ``(2, N)``, m/s; NaN where it says none."""
+        heading = numpy.radians(self.read(values, "odometry_heading"))
+        return self.read(values, "odometry_speed") * numpy.stack([numpy.sin(heading), numpy.cos(heading)])
 
     def _position(self, values: Mapping[str, Any]) -> numpy.ndarray:
         if "range" not in values:
