@@ -136,7 +136,9 @@ def test_rows_that_come_one_by_one_make_the_measurements_of_their_log(case, tmp_
     recording = read_recording(path, id)
     rows = np.genfromtxt(path, delimiter=",", names=True)
     has_odometry = "odometry" in case
-    filter = filtergym.online(id, import_problem(id).paper, second_sensor=has_odometry, **recording.parameters)
+    filter = filtergym.online(
+        id, import_problem(id).paper, second_sensor=has_odometry, **recording.parameters
+    )
     first = {name: rows[name][0] for name in names}
     mean, covariance = (recording.initial[name][0] for name in ("mean", "covariance"))
     also = {name: rows[name][1] for name in ODOMETRY} if has_odometry else first if id == ESM else {}

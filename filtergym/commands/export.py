@@ -8,7 +8,7 @@ import typer
 from ..agents.export import export_run
 from ..baselines.fitted_filters import SUFFIX
 from ..baselines.problem import Problem, problem_of
-from ..envs.catalogue import check_names, nearest
+from ..envs.catalogue import check_names, nearest, read_recording
 from ..evaluation.files import whole_file, writable_file
 from ..names import find_competitor
 from .terminal import (
@@ -21,6 +21,7 @@ from .terminal import (
     console,
     import_environments,
     one_of,
+    pair,
     parse_settings,
 )
 
@@ -65,6 +66,17 @@ def export(
         bool, typer.Option("--float", help="Of C: float in place of double; refused where it is wrong.")
     ] = False,
     scenario: ScenarioName = None,
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            help="In place of a scenario: a log, NetCDF or a table (CSV), whose parameters the filter has and whose "
+            "measurements it is tried on. What was fitted to a second sensor needs one that has it."
+        ),
+    ] = None,
+    speeds: Annotated[
+        str,
+        typer.Option(help="Of recordings: speeds that are possible, m/s, from the lowest to the highest."),
+    ] = "1,1000",
     settings: Parameters = None,
     trust: Trust = False,
 ) -> None:
@@ -74,7 +86,7 @@ def export(
     the model. A folder with the model only takes --trust.
 
     C needs nothing but math.h, Python nothing but NumPy. What is written was run beside the filter itself, measurement
-    by measurement, over episodes of the scenario, which may be a recording.
+    by measurement, over episodes of the scenario, or over a log.
 
     Example: filtergym export runs/ppo, then filtergym evaluate ENV --policy runs/ppo/agent.safetensors
 
@@ -84,7 +96,8 @@ def export(
     """
     if to not in FORMS:
         raise nearest("form of an export", to, FORMS)
-    options = {"a filter's name": name, "--float": single, "--scenario": scenario, "--set": settings}
+    options: dict[str, Any] = {"a filter's name": name, "--float": single, "--scenario": scenario}
+    options |= {"--recording": recording, "--set": settings}
     allowed = {
         "safetensors": (),
         "onnx": ("a filter's name",),
@@ -104,8 +117,13 @@ def export(
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
     own = _own_name(problem, name)
+    data: Any = scenario
+    if recording is not None:
+        if scenario is not None:
+            raise ValueError("--recording takes the place of --scenario: leave one of them out")
+        data = read_recording(recording, problem.id, speeds=pair("--speeds", speeds), **keywords)
     if to == "c":
-        _export_c(problem, name, own, out, single, scenario, keywords, trust)
+        _export_c(problem, name, own, out, single, data, keywords, trust)
         return
     ending = ".py" if to == "python" else ".onnx"
     path = writable_file(out or Path(own.replace(":", "_") + ending))
@@ -116,7 +134,7 @@ def export(
     else:
         from ..exports.python_source import export_python
 
-        text = export_python(problem, name, scenario, trust=trust, **keywords)
+        text = export_python(problem, name, data, trust=trust, **keywords)
         with whole_file(path) as partial:
             partial.write_text(text, encoding="utf-8")
     console.print(f"saved in {path}", soft_wrap=True)
@@ -128,7 +146,7 @@ def _export_c(
     own: str,
     out: Path | None,
     single: bool,
-    scenario: str | None,
+    data: Any,
     keywords: dict[str, Any],
     trust: bool,
 ) -> None:
@@ -139,7 +157,7 @@ def _export_c(
     stem = file_stem(own)
     folder = out or Path(stem)
     precision = "float" if single else "double"
-    figures = export_c(problem, own, maker, folder, precision, scenario, keywords, command_line())
+    figures = export_c(problem, own, maker, folder, precision, data, keywords, command_line())
     for line in (
         f"saved in {folder}: {stem}.h, {stem}.c",
         f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "

@@ -11,6 +11,7 @@ from ..baselines.problem import Problem
 from ..baselines.table import ConstantMode
 from ..envs.catalogue import make_task
 from ..envs.model import Model
+from ..envs.recording import RecordedWorld
 from ..envs.task import Task
 from ..envs.world import World
 from ..evaluation.competitors import (
@@ -98,7 +99,8 @@ def find_exported(
 
 
 def _mask_of(world: World) -> Any:
-    """What puts NaN in place of what was not received."""
+    """What puts NaN in place of what was not received; of a recording the task's own world says it."""
+    world = world.simulated if isinstance(world, RecordedWorld) else world
     if type(world).mask_missing is World.mask_missing:
         return NotReceived(world.received_field)
     return world.mask_missing

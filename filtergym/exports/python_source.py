@@ -141,7 +141,8 @@ def _collect(exported: Exported) -> Definitions:
     definitions.instantiated.add(track)
     definitions.add(Key(track.__module__, track.__name__))
     for example in (exported.initial, exported.measurement):
-        definitions.add_class(type(example))
+        for cls in _classes_of(example):
+            definitions.add_class(cls)
     constants, size = Constants(definitions), -1
     while size != definitions.size:
         size = definitions.size
@@ -149,6 +150,13 @@ def _collect(exported: Exported) -> Definitions:
             constants.collect(value, part)
         definitions.add_members()
     return definitions
+
+
+def _classes_of(given: Any) -> list[type]:
+    """Return the classes of nested NamedTuples."""
+    if not isinstance(given, tuple):
+        return []
+    return [type(given), *(cls for part in given for cls in _classes_of(part))]
 
 
 def _write(problem: Problem, name: str, exported: Exported) -> str:
