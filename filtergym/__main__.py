@@ -11,7 +11,7 @@ import importlib
 import inspect
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,9 +27,9 @@ from .compiler.cache import SWITCH
 from .envs.catalogue import modules_from
 from .envs.failures import own_line
 
-Commands = dict[str, Callable[..., None] | str]
+Commands = Mapping[str, Callable[..., None] | str]
 """Functions by the names of their commands; or ``module:function`` of what is imported when it is called."""
-GROUPS: dict[str, Commands] = {
+GROUPS: Mapping[str, Commands] = {
     "Use an environment": {
         "list": "measure:list_environments",
         "animate": "measure:animate",
@@ -84,7 +84,7 @@ def _general(
 class Program(typer.core.TyperGroup):
     """Commands in groups, each imported when it is called: whoever asks for help need not wait for all libraries."""
 
-    groups: dict[str, Commands]
+    groups: Mapping[str, Commands]
     listing = False
     """Whether commands are only named, each with its first sentence."""
 
@@ -142,7 +142,7 @@ def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
     return typer.core.TyperCommand(name, help=words, rich_help_panel=group, rich_markup_mode=MARKUP)
 
 
-def program_of(groups: dict[str, Commands]) -> Any:
+def program_of(groups: Mapping[str, Commands]) -> Any:
     """Return commands as one program, whose help shows them in groups; called with arguments, it ends in SystemExit."""
     app = typer.Typer(
         cls=type("Program", (Program,), {"groups": groups}),

@@ -17,7 +17,9 @@ SNIPPETS = [
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer", "live", "index"])
+@pytest.mark.parametrize(
+    "snippet", SNIPPETS, ids=["filter designer", "RL researcher", "engineer", "live", "index"]
+)
 def test_snippet_runs(snippet, capsys):
     if "stable_baselines3" in snippet:
         pytest.importorskip("stable_baselines3")
