@@ -37,7 +37,7 @@ from filtergym.evaluation.steered_filter import steer
 from peer_imm import imm_steps_per_second
 
 from filtergym.exports.c_source import FLAGS, Writer, files_of
-from filtergym.exports.replay import Replay, mean_rows, replay, run_filter
+from filtergym.exports.replay import ExportRequest, Replay, mean_rows, replay, run_filter
 from filtergym.exports.traced_filter import (
     ANSWER,
     ESTIMATE,
@@ -194,7 +194,7 @@ def lines(
         maker = find_competitor(problem, name)
         line: dict[str, Any] = {"environment": problem.short_name, "competitor": name}
         try:
-            traced, given = replay(problem, name, maker, episodes=episodes, measurements=measurements)
+            traced, given = replay(ExportRequest(problem, name, maker), episodes, measurements)
         except ValueError as error:
             yield {**line, "refusal": str(error)}
             continue

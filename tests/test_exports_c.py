@@ -15,7 +15,7 @@ from filtergym.filters import kalman
 
 from filtergym.exports import c_source
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
-from filtergym.exports.replay import mean_rows, replay, run_filter
+from filtergym.exports.replay import ExportRequest, mean_rows, replay, run_filter
 from filtergym.names import find_competitor
 
 EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'
@@ -29,10 +29,10 @@ def run(command, monkeypatch, tmp_path):
     return command
 
 
-def replayed(environment, name, **options):
+def replayed(environment, name, keywords=None, scenario=None, **options):
     problem = problem_of(f"filtergym/{environment}-v0")
     maker = name if not isinstance(name, str) else find_competitor(problem, name)
-    return replay(problem, str(name), maker, **options)
+    return replay(ExportRequest(problem, str(name), maker, scenario, keywords or {}), **options)
 
 
 # --- programs
@@ -290,10 +290,11 @@ class Stranger:
 
 def test_a_strangers_words_cannot_get_into_the_text(tmp_path):
     problem = problem_of("filtergym/ManeuveringTarget-v0")
-    traced, given = replay(problem, EVIL, Stranger, episodes=1, measurements=5)
+    request = ExportRequest(problem, EVIL, Stranger, keywords={"range_sigma": 50.0})
+    traced, given = replay(request, episodes=1, measurements=5)
     named = given._replace(components=[(EVIL, EVIL), ("for", "*/"), ("", "\\"), ("1", "??/")])
     writer = Writer(EVIL, traced, c_source.DOUBLE, named.components)
-    writer.about = c_source._about(problem, EVIL, Stranger, writer, "double", {"range_sigma": EVIL}, EVIL)
+    writer.about = c_source._about(request._replace(keywords={"range_sigma": EVIL}), writer, "double", EVIL)
     files = files_of(writer, named, [EVIL])
     for file, text in files.items():
         assert text.isascii()
@@ -316,9 +317,8 @@ def test_an_export_says_what_it_is_also_without_a_compiler(tmp_path, monkeypatch
     problem = problem_of("filtergym/ManeuveringTarget-v0")
     maker = find_competitor(problem, "kalman-imm")
     folder = tmp_path / "new" / "imm"
-    figures = export_c(
-        problem, "kalman-imm", maker, folder, "float", keywords={"horizon": 20}, command="as typed"
-    )
+    request = ExportRequest(problem, "kalman-imm", maker, keywords={"horizon": 20})
+    figures = export_c(request, folder, "float", "as typed")
     assert figures.test == ""
     assert figures.replaced == (1e-300,)
     assert 1e-8 < figures.difference < 1e-3
@@ -347,7 +347,11 @@ def test_a_precision_in_which_a_filter_is_wrong_is_refused(tmp_path, monkeypatch
     with pytest.raises(
         ValueError, match=r"'fixed-low' in float is off by .*more than 1e-09.*export it in double"
     ):
-        export_c(problem, "fixed-low", find_competitor(problem, "fixed-low"), tmp_path / "new", "float")
+        export_c(
+            ExportRequest(problem, "fixed-low", find_competitor(problem, "fixed-low")),
+            tmp_path / "new",
+            "float",
+        )
     assert not (tmp_path / "new").exists()
 
 

@@ -1,7 +1,7 @@
 """The command that writes what leaves the package: agents as arrays, filters as programs."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,6 +24,9 @@ from .terminal import (
     pair,
     parse_settings,
 )
+
+if TYPE_CHECKING:
+    from ..exports.replay import ExportRequest
 
 FORMS = ("safetensors", "c", "python", "onnx")
 """What can be written."""
@@ -123,7 +126,10 @@ def export(
             raise ValueError("--recording takes the place of --scenario: leave one of them out")
         data = read_recording(recording, problem.id, speeds=pair("--speeds", speeds), **keywords)
     if to == "c":
-        _export_c(problem, name, own, out, single, data, keywords, trust)
+        from ..exports.replay import ExportRequest
+
+        maker = find_competitor(problem, name, trust)
+        _export_c(ExportRequest(problem, own, maker, data, keywords), out, "float" if single else "double")
         return
     ending = ".py" if to == "python" else ".onnx"
     path = writable_file(out or Path(own.replace(":", "_") + ending))
@@ -140,28 +146,17 @@ def export(
     console.print(f"saved in {path}", soft_wrap=True)
 
 
-def _export_c(
-    problem: Problem,
-    name: str,
-    own: str,
-    out: Path | None,
-    single: bool,
-    data: Any,
-    keywords: dict[str, Any],
-    trust: bool,
-) -> None:
+def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> None:
     """Write a filter as C99, and say what it costs."""
     from ..exports.c_source import export_c, file_stem
 
-    maker = find_competitor(problem, name, trust)
-    stem = file_stem(own)
+    stem = file_stem(request.name)
     folder = out or Path(stem)
-    precision = "float" if single else "double"
-    figures = export_c(problem, own, maker, folder, precision, data, keywords, command_line())
+    figures = export_c(request, folder, precision, command_line())
     for line in (
         f"saved in {folder}: {stem}.h, {stem}.c",
         f"{figures.operations:,} operations an update, {figures.state_bytes:,} bytes of state; largest difference to "
-        f"{own} {figures.difference:.1e} standard deviations",
+        f"{request.name} {figures.difference:.1e} standard deviations",
         f"compiled here: {figures.test}" if figures.test else "not compiled: no C compiler here",
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
     ):

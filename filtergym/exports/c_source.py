@@ -8,13 +8,12 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 
-from ..baselines.problem import Problem
 from ..compiler.c_source import (
     DOUBLE,
     FLOAT,
@@ -29,7 +28,7 @@ from ..compiler.c_source import (
 )
 from ..evaluation.files import whole_files
 from .c_network import memory_size, network_text
-from .replay import Replay, mean_rows, replay, run_filter
+from .replay import ExportRequest, Replay, mean_rows, replay, run_filter
 from .traced_filter import (
     ANSWER,
     LIKELIHOODS,
@@ -526,47 +525,34 @@ int main(void) {{
 """
 
 
-def export_c(
-    problem: Problem,
-    name: str,
-    maker: Any,
-    folder: Path,
-    precision: str = "double",
-    scenario: Any = None,
-    keywords: Mapping[str, Any] | None = None,
-    command: str = "",
-) -> Figures:
+def export_c(request: ExportRequest, folder: Path, precision: str = "double", command: str = "") -> Figures:
     """Write a competitor as C99 into a folder, after its programs were compared with the competitor itself.
 
     Args:
-        problem: whose competitor it is.
-        name: of it.
-        maker: of it.
+        request: the competitor.
         folder: for the files.
         precision: "double" or "float".
-        scenario: whose parameters it has, and whose episodes it is compared on; a recording, too.
-        keywords: parameters of the task.
         command: that made it, for the comment of the header.
 
     Raises:
         ValueError: for what cannot be exported, or answers something else in this precision.
     """
     scalar = {"double": DOUBLE, "float": FLOAT}[precision]
-    traced, replayed = replay(problem, name, maker, scenario, keywords, EPISODES, MEASUREMENTS)
+    traced, replayed = replay(request, EPISODES, MEASUREMENTS)
     difference = replayed.largest_difference(run_filter(traced, replayed, scalar.dtype)[:, mean_rows(traced)])
     if not difference <= WORST[precision]:
         raise ValueError(
-            f"{name!r} in {precision} is off by {difference:.1e} of the standard deviations that it reports, more than "
-            f"{WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
+            f"{request.name!r} in {precision} is off by {difference:.1e} of the standard deviations that it reports, "
+            f"more than {WORST[precision]:g}, within {len(replayed.measurements)} measurements: "
             + ("export it in double" if scalar is FLOAT else "please report it")
         )
     sensitivity = 0.0
     if traced.network is not None:
         steady = run_filter(traced, replayed, network_dtype=numpy.float64)
         sensitivity = replayed.largest_difference(steady[:, mean_rows(traced)])
-    writer = Writer(name, traced, scalar, replayed.components)
+    writer = Writer(request.name, traced, scalar, replayed.components)
     writer.limit = max(WORST[precision], 3.0 * sensitivity)
-    writer.about = _about(problem, name, maker, writer, precision, keywords, command)
+    writer.about = _about(request, writer, precision, command)
     figures = Figures(*writer.sizes, difference, sensitivity, writer.replaced)
     test = compile_and_test(writer, replayed)
     figures = figures._replace(test=test)
@@ -590,22 +576,14 @@ def files_of(writer: Writer, replayed: Replay, notes: Sequence[str] = ()) -> dic
     }
 
 
-def _about(
-    problem: Problem,
-    name: str,
-    maker: Any,
-    writer: Writer,
-    precision: str,
-    keywords: Mapping[str, Any] | None,
-    command: str,
-) -> list[str]:
+def _about(request: ExportRequest, writer: Writer, precision: str, command: str) -> list[str]:
     """Paragraphs that say what the filter is."""
-    own = writer.name
+    own, maker = writer.name, request.maker
     described = maker if isinstance(maker, type) else getattr(maker, "func", None) and maker
     first = (getattr(described, "__doc__", None) or "").strip().split("\n\n")[0].replace("`", "")
-    parameters = ", ".join(f"{key} = {value!r}" for key, value in (keywords or {}).items())
+    parameters = ", ".join(f"{key} = {value!r}" for key, value in request.keywords.items())
     return [
-        f"{name} of {problem.id}, in {precision}, for one track. {first}".strip(),
+        f"{request.name} of {request.problem.id}, in {precision}, for one track. {first}".strip(),
         *([f"With parameters of the task: {parameters}."] if parameters else []),
         f"Made by: {command}" if command else "Made by filtergym.",
         "",

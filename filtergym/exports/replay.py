@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Mapping
 from itertools import islice
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy
@@ -76,32 +77,37 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
     return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
 
 
+class ExportRequest(NamedTuple):
+    """What is to be written: a competitor, and the parameters that it gets."""
+
+    problem: Problem
+    """Whose competitor it is."""
+    name: str
+    maker: Any
+    """Of the competitor."""
+    scenario: Any = None
+    """Whose parameters it gets, and whose episodes it is compared on, of the test split; a recording, too."""
+    keywords: Mapping[str, Any] = MappingProxyType({})
+    """Parameters of the task."""
+
+
 def replay(
-    problem: Problem,
-    name: str,
-    maker: Any,
-    scenario: Any = None,
-    keywords: Mapping[str, Any] | None = None,
-    episodes: int = 8,
-    measurements: int | None = None,
+    request: ExportRequest, episodes: int = 8, measurements: int | None = None
 ) -> tuple[TracedFilter, Replay]:
     """Trace a competitor, and let it run over episodes as an evaluation does.
 
     Args:
-        problem: whose competitor it is.
-        name: of it, in errors.
-        maker: of it.
-        scenario: whose parameters the export has, and whose episodes are run, of the test split; a recording, too.
-        keywords: parameters of the task.
+        request: what is traced.
         episodes: how many run.
         measurements: of each, at most.
 
     Raises:
         ValueError: for what cannot be exported, or loses every episode.
     """
+    problem, name, maker, scenario, keywords = request
     kind = kind_of(maker)
     control = control_of(maker, kind, None, problem.task, name)
-    given = {**getattr(maker, "task_keywords", {}), **(keywords or {})}
+    given = {**getattr(maker, "task_keywords", {}), **keywords}
     plain = make_model(problem.task, control, scenario, **given)
     model = make_model(problem.task, control, scenario, backend="auto", **given)
     seeds = episode_seeds("test", 0, episodes)
