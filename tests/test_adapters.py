@@ -175,6 +175,8 @@ def test_every_example_is_tried():
         "mine",
         "inverted_pendulum",
         "flights",
+        "live_track",
+        "nclt_odometry",
         "plots",
     }
 

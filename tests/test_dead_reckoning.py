@@ -3,6 +3,8 @@
 import dataclasses
 import itertools
 import math
+import runpy
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -333,3 +335,27 @@ def test_it_is_fitted_only_where_there_is_a_second_sensor(tmp_path):
     plain = read(drive(count=60).drop(columns=["odometry_x", "odometry_y"]), tmp_path)
     assert "dead-reckoning" not in families_of(PROBLEM, plain)
     assert "dead-reckoning" in families_of(PROBLEM)
+
+
+def test_drives_of_the_public_data_become_logs_with_odometry(tmp_path):
+    torch = pytest.importorskip("torch")
+    example = runpy.run_path(str(Path(__file__).parent.parent / "docs" / "examples" / "nclt_odometry.py"))
+    table = drive(count=30)
+    speed, heading = (
+        np.hypot(table.odometry_x, table.odometry_y),
+        np.arctan2(table.odometry_y, table.odometry_x),
+    )
+    parts = {
+        "gps": table[["x", "y"]],
+        "ground_truth": table[["truth_position_x", "truth_position_y"]],
+        "wheel": np.stack([speed - 0.1, speed + 0.1, heading], axis=1),
+    }
+    drives = [
+        {name: torch.tensor(np.asarray(values)) for name, values in parts.items()} | {"data_date": "day"}
+    ]
+    for part in ("test", "val"):
+        torch.save(drives, tmp_path / f"{part}.pt")
+    example["write_drives"](tmp_path, tmp_path / "logs")
+    recording = read_recording(tmp_path / "logs" / "day.csv", ID, speeds=(0.0, 100.0))
+    moved = recording.measurements["odometry_displacement"][0]
+    np.testing.assert_allclose(moved, table[["odometry_x", "odometry_y"]].values[2:], atol=1e-5)

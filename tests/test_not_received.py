@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.catalogue import catalogue
+from filtergym.envs.task import named_arrays
 from filtergym.evaluation.dataset import notes_of
 from filtergym.evaluation.rollout import rollout
 from models import make_model
@@ -88,7 +89,7 @@ def test_what_is_not_received_is_nan(id, replayed):
     assert 0 < (~there).sum() < there.size
     np.testing.assert_array_equal(np.isnan(values), ~there)
     for m in watch.given:
-        others = [values for name, values in m._asdict().items() if name != field]
+        others = [values for name, values in named_arrays(m) if name != field]
         assert all(np.isfinite(values).all() for values in others)
 
 
