@@ -86,6 +86,8 @@ def test_page_for_an_audience_runs(name, tmp_path, command, capsys, monkeypatch)
     assert {language for language, _ in blocks} == {"python", "sh"}
     if "filtergym train" in text:
         pytest.importorskip("torch")
+    if "--report" in text:
+        pytest.importorskip("jinja2")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     for language, block in blocks:
