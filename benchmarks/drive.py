@@ -1,15 +1,13 @@
 """A real drive as recordings of LooselyCoupledNavigation: an INS let loose again and again, beside RTK.
 
     git clone https://github.com/rtklibexplorer/GNSS_IMU
-    pip install python-ins
+    pip install 'filtergym[ins]'
     python benchmarks/drive.py GNSS_IMU --out docs/data/drive.nc --figure docs/images/drive.png
 
 The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
 4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment.** While the car stands, roll and pitch are levelled, and the mean of the gyroscopes is their bias. The
-   heading is the course of the first motion less what was turned until then. From there an error-state filter with RTK
-   positions and velocities estimates position, velocity, attitude and the biases of gyroscopes and accelerometers.
+1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/strapdown.py`` has them.
 2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
    nothing later, and the position of RTK; then it runs free. Windows do not overlap.
 3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.

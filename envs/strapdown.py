@@ -34,6 +34,9 @@ LARGEST_TILT = 45.0
 """Of the vehicle at rest, degrees: beyond it the axes are other ones than forward, right and down."""
 LARGEST_RATE = 0.1
 """Mean rate at rest, rad/s; cheap gyroscopes have a bias of 0.02 rad/s."""
+SLOPES = (0.3, 3.0)
+"""Of turns and changes of speed by the fixes over those by the IMU, within which these go together; hills and a
+tilted IMU make 0.6 of 1."""
 LEVEL_SIGMA, HEADING_SIGMA = 2.0, 10.0
 """Of the attitude after the alignment, degrees."""
 STANDING_SIGMA = 0.05
@@ -176,6 +179,53 @@ def check_rest(rates: numpy.ndarray, force: numpy.ndarray) -> None:
         )
 
 
+def check_motion(alignment: Alignment, fixes: Any, moving: float, interval: float) -> None:
+    """Raise ValueError unless the IMU turns and speeds up as the fixes do.
+
+    Turns of the course and changes of speed from fix to fix are regressed on the integrals of the down rate and of the
+    forward acceleration; both slopes should be one.
+
+    Args:
+        alignment: of :func:`align`.
+        fixes: with velocities.
+        moving: speed from which the course is the heading, m/s.
+        interval: between the fixes that are compared, s.
+    """
+    increments = alignment.increments
+    fixes = fixes[fixes.VN.notna() & fixes.VE.notna() & (fixes.index >= increments.index[0])]
+    step = max(1, round(interval / float(numpy.median(numpy.diff(fixes.index)))))
+    fixes = fixes.iloc[::step]
+    speed = numpy.hypot(fixes.VN, fixes.VE).to_numpy()
+    course = numpy.unwrap(numpy.arctan2(fixes.VE, fixes.VN))
+    integrals = {
+        name: numpy.diff(numpy.interp(fixes.index, increments.index, increments[name].cumsum()))
+        for name in ("theta_z", "dv_x")
+    }
+    both = (speed[1:] > moving) & (speed[:-1] > moving)
+    compared = (
+        (integrals["theta_z"][both], numpy.diff(course)[both], "turn", "the unit of the rates"),
+        (integrals["dv_x"], numpy.diff(speed), "change of speed", "the unit of the accelerations"),
+    )
+    for integral, change, what, unit in compared:
+        slope, sigma = slope_of(integral, change)
+        if slope + 3.0 * sigma < SLOPES[0] or slope - 3.0 * sigma > SLOPES[1]:
+            raise ValueError(
+                f"where the IMU measures a {what} of 1 the fixes have one of {slope:.2g}: check {unit}, the mounting "
+                "(axes forward, right, down) and that both have one clock"
+            )
+
+
+def slope_of(x: numpy.ndarray, y: numpy.ndarray) -> tuple[float, float]:
+    """Slope of the straight line through points ``(n,)`` by least squares, and its standard deviation; infinite where
+    they have none.
+    """
+    if len(x) < 3 or numpy.ptp(x) == 0.0:
+        return 1.0, numpy.inf
+    x, y = x - x.mean(), y - y.mean()
+    slope = float(x @ y / (x @ x))
+    return slope, float(numpy.sqrt(((y - slope * x) ** 2).sum() / (len(x) - 2) / (x @ x)))
+
+
 def aid(
     alignment: Alignment,
     fixes: Any,
@@ -286,5 +336,5 @@ def free_windows(
 
 def tangent_plane(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
     """Coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes, ``(2, n)``, m."""
-    angles = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
-    return east_north(*angles, positions["alt"].to_numpy(), site)
+    latitude, longitude = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
+    return east_north(latitude, longitude, positions["alt"].to_numpy(), site)

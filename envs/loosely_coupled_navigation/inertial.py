@@ -24,6 +24,7 @@ from ..strapdown import (
     InertialErrors,
     aid,
     align,
+    check_motion,
     check_pyins,
     free_windows,
     tangent_plane,
@@ -48,9 +49,10 @@ LONGEST_TRUTH_GAP = 1.5
 """Between two rows of the truth within which it is interpolated, s."""
 DIFFERENCED_SIGMA = 0.3
 """Of a velocity made of positions, m/s: they are so far apart that it is this."""
+COMPARED = 2.0
+"""Between fixes whose turns and changes of speed are compared with those of the IMU, s."""
 LARGEST_INNOVATION = 10.0
-"""Root mean square of the aided INS's innovations over their deviation; where a setting is right it is about 1, with
-overconfident receivers 3."""
+"""Root mean square of the aided INS's innovations over their deviation; about 1 where everything is right."""
 
 
 def inertial_recording(
@@ -322,7 +324,7 @@ def fix_deviations(fixes: Any, sigma: float | None) -> numpy.ndarray:
 def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
     """Fixes with velocities made of positions so far apart that their deviation is ``DIFFERENCED_SIGMA``."""
     time = fixes.index.to_numpy()
-    half = numpy.median(deviations) / DIFFERENCED_SIGMA / 2.0**0.5
+    half = difference_half(deviations)
     after = numpy.clip(time + half, time[0], time[-1])
     before = numpy.clip(time - half, time[0], time[-1])
     site = tuple(numpy.radians(fixes.iloc[0][["lat", "lon"]].to_numpy(dtype=float)))
@@ -331,6 +333,11 @@ def differenced_velocities(fixes: Any, deviations: numpy.ndarray) -> Any:
         for values in tangent_plane(fixes, site)
     )
     return fixes.assign(VN=north, VE=east, VD=0.0)
+
+
+def difference_half(deviations: numpy.ndarray) -> float:
+    """Half of the time between positions whose difference is a velocity of ``DIFFERENCED_SIGMA``, s."""
+    return float(numpy.median(deviations)) / DIFFERENCED_SIGMA / 2.0**0.5
 
 
 def aided_inertial(
@@ -350,13 +357,15 @@ def aided_inertial(
     known = fixes if measured else differenced_velocities(fixes, deviations)
     noise = velocity_sigma if measured else DIFFERENCED_SIGMA
     # Of the noise alone the speed is above five of its deviations once in 270,000 fixes.
-    start = align(inertial, known, max(0.2, 5.0 * noise), max(2.0, 10.0 * noise))
+    moving = max(2.0, 10.0 * noise)
+    start = align(inertial, known, max(0.2, 5.0 * noise), moving)
+    check_motion(start, known, moving, COMPARED if measured else COMPARED + 2.0 * difference_half(deviations))
     navigation = aid(start, known, deviations, velocity_sigma if measured else None, lever, errors)
     innovation = numpy.sqrt((navigation.innovations["Position"].to_numpy() ** 2).mean())
     if not innovation < LARGEST_INNOVATION:
         raise ValueError(
             f"the INS does not follow the fixes: innovations are {innovation:.3g} of their deviations in the root mean "
-            "square; check the unit of the rates, the mounting, the delay between the clocks and sigma"
+            "square; check sigma, and the delay between the clocks"
         )
     return navigation
 
