@@ -13,6 +13,7 @@ from filtergym.envs.loosely_coupled_navigation.inertial import (
     geodetic_of_local,
     inertial_recording,
     interpolate,
+    measurements_beside,
     regular_times,
 )
 from filtergym.envs.recording import Recording
@@ -211,6 +212,15 @@ def test_missing_fixes_leave_gaps():
     np.testing.assert_allclose(times, [0.0, 0.5, 1.01, 1.5067, 2.0033, 2.5, 3.0], atol=1e-4)
     with pytest.raises(ValueError, match=r"fixes come every 0.5 s, but two are 0.7 s apart after row 1"):
         regular_times(np.array([0.0, 0.5, 1.2, 1.7, 2.2]), 9.0)
+
+
+def test_a_measurement_without_a_fix_is_not_available():
+    ins, fixes = np.arange(8.0).reshape(1, 4, 2) ** 2, np.array([[1.0, 2.0], [3.0, 4.0]])
+    found = measurements_beside(ins, fixes, np.array([0.5, 1.5]), np.array([[1, -1, 0]]))
+    assert found["available"].tolist() == [[1.0, 0.0, 1.0]]
+    assert found["fix"].tolist() == [[[3.0, 4.0], [0.0, 0.0], [1.0, 2.0]]]
+    assert found["reported_deviation"].tolist() == [[1.5, 1.0, 0.5]]
+    assert found["increment"].tolist() == [[[4.0, 8.0], [12.0, 16.0], [20.0, 24.0]]]
 
 
 def test_truth_is_unknown_in_gaps():

@@ -120,31 +120,23 @@ def inertial_recording(
         reference = interpolate(tangent_plane(true, origin).T, true.index.to_numpy(), times)
     T = float(numpy.median(numpy.diff(positions.index)))
     K = max(1, round(window / T))
-    first = int(numpy.searchsorted(times, navigation.trajectory.index[0] + settling))
-    starts = numpy.arange(first, len(times) - K - 1, K)
+    begin = int(numpy.searchsorted(times, navigation.trajectory.index[0] + settling))
+    starts = numpy.arange(begin, len(times) - K - 1, K)
     if not len(starts):
         raise ValueError(
             f"after the standstill and {settling:g} s to settle there are not {K * T + T:g} s left, as a window needs"
         )
+    # From the start of each window to the last observation.
     at = starts[:, None] + numpy.arange(K + 2)
     ins = free_windows(navigation, times[at], reference[starts], origin, lever)
-    there = rows >= 0
-    measured = tangent_plane(positions, origin).T[rows]
-    measured[~there] = 0.0
-    stated = numpy.where(there, deviations[rows], numpy.median(deviations))
-    number = numpy.broadcast_to(numpy.arange(1.0, K + 2.0), (len(starts), K + 1))
+    seconds = T * numpy.broadcast_to(numpy.arange(1.0, K + 2.0), (len(starts), K + 1))
     return Recording(
         environment=TASK.id,
-        measurements={
-            "number": number,
-            "ins": ins[:, 1:],
-            "increment": numpy.diff(ins, axis=1),
-            "fix": measured[at[:, 1:]],
-            "available": there[at[:, 1:]].astype(float),
-            "reported_deviation": stated[at[:, 1:]],
-        },
+        measurements=measurements_beside(
+            ins, tangent_plane(positions, origin).T, deviations, rows[at[:, 1:]]
+        ),
         initial={"mean": ins[:, 0], "covariance": numpy.zeros((len(starts), 2, 2))},
-        seconds=T * number,
+        seconds=seconds,
         lengths=numpy.full(len(starts), K),
         truth=None if truth is None else reference[at[:, 1:]],
         names=tuple(f"{times[start] - times[0]:.8g} s" for start in starts),
@@ -155,6 +147,28 @@ def inertial_recording(
         log_time=times[at[:, 1:]] if clock == "seconds" else None,
         typical={"receiver_intensity": float(numpy.median(deviations)) ** 2 * T},
     )
+
+
+def measurements_beside(
+    ins: numpy.ndarray, fixes: numpy.ndarray, deviations: numpy.ndarray, rows: numpy.ndarray
+) -> dict[str, numpy.ndarray]:
+    """The arrays of a ``Measurement`` by their names, ``(E, K, ...)``.
+
+    Args:
+        ins: positions of the INS from the start on, m, ``(E, 1 + K, 2)``.
+        fixes: positions of all fixes, m, ``(n, 2)``.
+        deviations: of them, m, ``(n,)``.
+        rows: the fix at each measurement, ``(E, K)``; -1: none.
+    """
+    there = rows >= 0
+    return {
+        "number": numpy.broadcast_to(numpy.arange(1.0, rows.shape[1] + 1.0), rows.shape),
+        "ins": ins[:, 1:],
+        "increment": numpy.diff(ins, axis=1),
+        "fix": numpy.where(there[..., None], fixes[rows], 0.0),
+        "available": there.astype(float),
+        "reported_deviation": numpy.where(there, deviations[rows], numpy.median(deviations)),
+    }
 
 
 # --- the files
