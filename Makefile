@@ -22,7 +22,7 @@ CORE_TESTS := $(addprefix tests/, test_golden_trajectories.py test_observation.p
 # What reads files beside the packages, so that an unpacked source distribution must hold them.
 SOURCE_TESTS := $(addprefix tests/, test_readme.py test_docs.py test_imports.py \
   test_example_environment.py test_observation.py test_reproduction.py)
-EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,adapters,onnx,offline,cluster
+EXTRAS := agents,fast,search,tensorboard,report,render,flights,logs,ins,adapters,onnx,offline,cluster
 # A link that leads nowhere, or a page that no other leads to, is an error.
 SITE := $(BIN)/python -m sphinx -E -W --keep-going -q -b html docs site
 DISTRIBUTIONS := build/distributions

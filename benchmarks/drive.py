@@ -1,15 +1,13 @@
 """A real drive as recordings of LooselyCoupledNavigation: an INS let loose again and again, beside RTK.
 
     git clone https://github.com/rtklibexplorer/GNSS_IMU
-    pip install python-ins
+    pip install 'filtergym[ins]'
     python benchmarks/drive.py GNSS_IMU --out docs/data/drive.nc --figure docs/images/drive.png
 
 The log (BSD-3-Clause, see ``docs/data/drive_licence.txt``): a car with a consumer IMU at 100 Hz and an RTK receiver at
 4 Hz, 549 s. What is made of it, with the strapdown algorithm and the Kalman filter of pyins (``python-ins``):
 
-1. **Alignment.** While the car stands, roll and pitch are levelled, and the mean of the gyroscopes is their bias. The
-   heading is the course of the first motion less what was turned until then. From there an error-state filter with RTK
-   positions and velocities estimates position, velocity, attitude and the biases of gyroscopes and accelerometers.
+1. **Alignment** and aiding by the positions and velocities of RTK, as ``envs/strapdown.py`` has them.
 2. **Windows.** At the start of each the INS takes over velocity, attitude and biases of that filter, which has seen
    nothing later, and the position of RTK; then it runs free. Windows do not overlap.
 3. **Truth** is the RTK position of the antenna, 1 to 2.5 cm by its own report, as it is.
@@ -31,8 +29,6 @@ Readings, of ``src/drive_config.py`` and ``src/convert_imu_file.py`` in the repo
 import argparse
 import json
 import struct
-import warnings
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -40,7 +36,7 @@ from typing import Any
 import numpy
 import xarray
 from filtergym.envs.loosely_coupled_navigation.task import TASK
-from filtergym.filters.geodesy import east_north
+from filtergym.envs.strapdown import GRAVITY, AidedInertial, aid, align, free_windows, tangent_plane
 
 SOURCE = "https://github.com/rtklibexplorer/GNSS_IMU, commit 8235ee6c5f349db529bf43ad556a3769b346b5a1, data/drive_0708"
 LICENCE = "BSD-3-Clause, Copyright (c) 2025, rtklibexplorer"
@@ -52,18 +48,8 @@ LEVER = (0.0, -0.05, 0.0)
 """From the IMU to the antenna, forward, right, down, m."""
 DELAY = 0.125
 """By which the logger's time tags of the IMU are late, s; the repository's."""
-GRAVITY = 9.80665
-"""Unit of the accelerometers, m/s^2."""
-GYROSCOPE_NOISE, ACCELEROMETER_NOISE = 0.05, 0.015
-"""Root densities of white noise, degrees/s^0.5 and m/s^1.5."""
-GYROSCOPE_BIAS, ACCELEROMETER_BIAS = 0.1, 0.2
-"""Standard deviations of the biases left after the standstill, degrees/s and m/s^2."""
-GYROSCOPE_WALK, ACCELEROMETER_WALK = 0.0001, 0.001
-"""Root densities of their random walks, degrees/s^1.5 and m/s^2.5; ours: they matter over minutes."""
 RTK_POSITION, RTK_VELOCITY = 0.02, 0.06
 """Standard deviations of its positions and velocities, of each axis, m and m/s; about what it reports."""
-STANDING, MOVING = 0.2, 2.0
-"""Speed up to which the car stands, and from which the course is the heading, m/s."""
 ALIGNMENT = 30.0
 """From the end of the standstill to the first window, s: some turns, after which the heading is known."""
 MEASUREMENTS = 80
@@ -80,20 +66,6 @@ PARAMETERS = {
 """Of the environment. Fixes come as often as RTK, with the deviation that the environment has by default, 1.41 m. The
 levels of the INS errors are what :func:`likeliest` finds, rounded: no constant and no white part can be seen, and of
 the coloured one ``coloured^2 / correlation_time`` is better known than each."""
-
-
-@dataclass(frozen=True)
-class Aligned:
-    """The INS aided by RTK, at every sample of the IMU."""
-
-    trajectory: Any
-    """Latitude, longitude (degrees), altitude, velocity and attitude; a table of pyins by time."""
-    biases: Any
-    """Of gyroscopes (rad/s) and accelerometers (m/s^2), columns as those of the increments; a table by time."""
-    increments: Any
-    """Rotation vectors (rad) and velocity increments (m/s), less the gyroscopes' bias of the standstill."""
-    innovations: Any
-    """By kind of measurement, tables of innovations over their standard deviations, by which readings are judged."""
 
 
 def read_inertial(file: Path) -> Any:
@@ -159,7 +131,7 @@ def read_fixes(file: Path) -> Any:
     return table
 
 
-def aligned(inertial: Any, fixes: Any) -> Aligned:
+def aligned(inertial: Any, fixes: Any) -> AidedInertial:
     """Align the INS at the standstill and aid it by RTK from there.
 
     Args:
@@ -169,86 +141,8 @@ def aligned(inertial: Any, fixes: Any) -> Aligned:
     Raises:
         ValueError: if the recording does not begin with a standstill of 5 s, or nothing moves after it.
     """
-    import pandas
-    from pyins import earth, filters, inertial_sensor, measurements, strapdown, transform, util
-
-    speed = numpy.hypot(fixes.VN, fixes.VE).to_numpy()
-    if not (speed > MOVING).any():
-        raise ValueError(f"the heading is the course of the first motion, but no speed is above {MOVING} m/s")
-    begin = fixes.index[int(numpy.argmax(speed > STANDING))] - 1.0
-    standing = inertial[inertial.index < begin]
-    if not len(standing) or standing.index[-1] - standing.index[0] < 5.0:
-        raise ValueError("the alignment needs a standstill of 5 s at the beginning")
-    bias = standing[util.GYRO_COLS].mean()
-    forward, right, down = standing[util.ACCEL_COLS].mean()
-    inertial = inertial[(inertial.index >= begin) & (inertial.index <= fixes.index[-1])].copy()
-
-    first = fixes.iloc[int(numpy.argmax(speed > MOVING))]
-    before = inertial.index < first.name
-    turned = numpy.trapezoid(inertial.gyro_z[before] - bias.gyro_z, inertial.index[before])
-    position = [numpy.interp(inertial.index[0], fixes.index, fixes[name]) for name in util.LLA_COLS]
-    attitude = numpy.degrees(
-        [
-            numpy.arctan2(-right, -down),
-            numpy.arctan2(forward, numpy.hypot(right, down)),
-            numpy.arctan2(first.VE, first.VN) - turned,
-        ]
-    )
-    start = pandas.Series([*position, 0.0, 0.0, 0.0, *attitude], util.TRAJECTORY_COLS, name=inertial.index[0])
-    # What a standing gyroscope measures is its bias and the rotation of the Earth.
-    bias -= transform.mat_from_rph(attitude).T @ earth.rate_n(position[0])
-    inertial[util.GYRO_COLS] -= bias
-    increments = strapdown.compute_increments_from_imu(inertial, "rate")
-    aiding = fixes[fixes.index > inertial.index[1]]
-    found = filters.run_feedback_filter(
-        start,
-        position_sd=0.05,
-        velocity_sd=0.05,
-        level_sd=2.0,
-        azimuth_sd=10.0,
-        increments=increments,
-        gyro_model=inertial_sensor.EstimationModel(
-            numpy.radians(GYROSCOPE_BIAS), numpy.radians(GYROSCOPE_NOISE), numpy.radians(GYROSCOPE_WALK)
-        ),
-        accel_model=inertial_sensor.EstimationModel(
-            ACCELEROMETER_BIAS, ACCELEROMETER_NOISE, ACCELEROMETER_WALK
-        ),
-        measurements=[
-            measurements.Position(aiding, RTK_POSITION, numpy.array(LEVER)),
-            measurements.NedVelocity(aiding, RTK_VELOCITY, numpy.array(LEVER)),
-        ],
-        time_step=0.25,
-    )
-    biases = pandas.DataFrame(
-        numpy.hstack([found.gyro, found.accel]), found.gyro.index, [*util.THETA_COLS, *util.DV_COLS]
-    )
-    return Aligned(found.trajectory, biases, increments, found.innovations)
-
-
-def free_inertial(navigation: Aligned, times: numpy.ndarray) -> Any:
-    """Return latitude, longitude (degrees) and altitude (m) of the antenna at times, s, where the INS comes from the
-    first of them on without RTK; columns of a table.
-    """
-    import pandas
-    from pyins import strapdown, transform, util
-
-    # From the last sample before the start, with the biases as the fix at the start leaves them.
-    number = int(numpy.searchsorted(navigation.trajectory.index, times[0], side="right")) - 1
-    start = navigation.trajectory.iloc[number]
-    bias = navigation.biases[navigation.biases.index <= start.name].iloc[-1]
-    increments = navigation.increments
-    increments = increments[(increments.index > start.name) & (increments.index < times[-1] + 0.1)].copy()
-    increments[bias.index] -= numpy.outer(increments.dt, bias)
-    track = strapdown.Integrator(start).integrate(increments)
-    antenna = transform.translate_trajectory(track, LEVER)[util.LLA_COLS]
-    columns = {name: numpy.interp(times, track.index, antenna[name]) for name in util.LLA_COLS}
-    return pandas.DataFrame(columns, times)
-
-
-def metres(positions: Any, site: tuple[float, float]) -> numpy.ndarray:
-    """Coordinates east and north of a site (rad) of a table of latitudes, longitudes and altitudes, ``(2, n)``, m."""
-    angles = numpy.radians(positions[["lat", "lon"]].to_numpy().T)
-    return east_north(*angles, positions["alt"].to_numpy(), site)
+    sigma = numpy.full(len(fixes), RTK_POSITION)
+    return aid(align(inertial, fixes), fixes, sigma, RTK_VELOCITY, LEVER)
 
 
 def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
@@ -266,8 +160,6 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     steps = numpy.diff(fixes.index)
     if abs(steps - T).max() > 0.01:
         raise ValueError(f"positions come every {T} s, but two are {abs(steps).max():.2f} s apart")
-    # pyins 1.0.1 uses a keyword that pandas 4 will not have.
-    warnings.filterwarnings("ignore", "The copy keyword is deprecated")
     navigation = aligned(inertial, fixes)
     clock = fixes.index.to_numpy() - fixes.index[0]
     first = int(numpy.searchsorted(fixes.index, navigation.trajectory.index[0] + ALIGNMENT))
@@ -276,15 +168,13 @@ def recordings(inertial: Any, fixes: Any, seed: int = 0) -> xarray.Dataset:
     if not starts:
         raise ValueError(f"after the alignment there are not {K * T:g} s left for a recording")
     site = tuple(numpy.radians(fixes.iloc[0][["lat", "lon"]].to_numpy(dtype=float)))
-    reference = metres(fixes, site).T
+    reference = tangent_plane(fixes, site).T
     truth = numpy.array([reference[start : start + K + 2] for start in starts])
-    ins = []
-    for start in starts:
-        track = metres(free_inertial(navigation, fixes.index.to_numpy()[start : start + K + 2]), site).T
-        ins.append(track + (reference[start] - track[0]))
+    windows = [fixes.index.to_numpy()[start : start + K + 2] for start in starts]
+    ins = free_windows(navigation, windows, truth[:, 0], site, LEVER)
     deviation = (PARAMETERS["receiver_intensity"] / T) ** 0.5
     noise = numpy.random.default_rng(seed).standard_normal(truth[:, 1:].shape)
-    return dataset(truth, numpy.array(ins), truth[:, 1:] + deviation * noise, deviation, clock[list(starts)])
+    return dataset(truth, ins, truth[:, 1:] + deviation * noise, deviation, clock[list(starts)])
 
 
 def dataset(
@@ -421,7 +311,7 @@ def figure(recorded: xarray.Dataset, fixes: Any, file: Path) -> None:
     from matplotlib import pyplot
 
     site = tuple(numpy.radians(fixes.iloc[0][["lat", "lon"]].to_numpy(dtype=float)))
-    drive = metres(fixes, site)
+    drive = tangent_plane(fixes, site)
     time = recorded["seconds"].to_numpy()[0]
     found = errors(recorded)
     picture, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4.5), layout="constrained")

@@ -72,6 +72,9 @@ nmea(Path('log.nmea'))
 rows = [(round(1e6 * t), *place, 2.0, 3) for t, place in zip(TIME, places().T)]
 ulog(Path('log.ulg'), NEW, rows)
 bag(Path('log.bag'))"""
+INERTIAL = """
+from filtergym.envs.loosely_coupled_navigation.inertial import inertial_recording
+inertial_recording('imu.csv', 'fixes.csv', settling=15.0, window=10.0)"""
 VIDEO = f"""
 import gymnasium, filtergym
 env = gymnasium.make({ID!r}, render_mode='rgb_array', horizon=5)
@@ -89,6 +92,13 @@ NEEDS = {
     "render": [Need(f"python -c {shlex.quote(VIDEO)}", refusal="moviepy is not installed")],
     "flights": [Need(f"{FLOWN} flight.parquet", FLIGHT), Need(f"{FLOWN} flight.nc", FLIGHT)],
     "logs": [Need(f"{RECORDED} log{suffix}", LOGS) for suffix in (".nmea", ".ulg", ".bag")],
+    "ins": [
+        Need(
+            f"python -c {shlex.quote(INERTIAL)}",
+            "from test_inertial_logs import write_log; write_log()",
+            refusal=r"filtergym\[ins\]",
+        )
+    ],
     "adapters": [
         Need(f"{EVALUATE} --policy {name}:Kalman", ESTIMATORS)
         for name in ("filterpy_filters", "stone_soup_kalman")

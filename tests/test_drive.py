@@ -2,7 +2,6 @@
 
 import importlib.util
 import json
-import math
 import struct
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
+from circular_drive import HEIGHT, LATITUDE, LONGITUDE, RATE, CircularDrive
+from filtergym.envs import strapdown
 from filtergym.envs.loosely_coupled_navigation.world import Measurement
-from filtergym.filters import geodesy
 from filtergym.filters import loosely_coupled as ins_gnss
 from models import make_model
 from scipy.spatial.transform import Rotation
@@ -23,59 +23,11 @@ spec = importlib.util.spec_from_file_location("drive", ROOT / "benchmarks" / "dr
 drive = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(drive)
 
-RATE = 40.0
-"""Of the synthetic IMU, Hz."""
 BEGIN = datetime(2025, 7, 8, 19, 34, 18, tzinfo=UTC).timestamp()
-LATITUDE, LONGITUDE, HEIGHT = math.radians(40.0), math.radians(-105.0), 1600.0
 
 
-def normal_gravity():
-    """At the synthetic drive, m/s^2: Somigliana's formula and the free-air gradient."""
-    sine = math.sin(LATITUDE) ** 2
-    e2 = geodesy.ECCENTRICITY_SQUARED
-    surface = 9.7803253359 * (1 + 0.00193185265241 * sine) / math.sqrt(1 - e2 * sine)
-    return surface * (1 - 2 * HEIGHT / geodesy.SEMI_MAJOR_AXIS)
-
-
-class Circle:
-    """A level drive: 10 s of standstill, 5 s of speeding up to the north, then a circle to the right."""
-
-    standstill, run, speed, turn = 10.0, 5.0, 10.0, 0.2
-
-    def __init__(self, seconds):
-        self.time = np.arange(0.0, seconds, 1.0 / RATE)
-        t = self.time
-        self.forward = np.where((t > self.standstill) & (t <= self.standstill + self.run), 2.0, 0.0)
-        v = 2.0 * np.clip(t - self.standstill, 0.0, self.run)
-        self.yaw_rate = np.where(t > self.standstill + self.run, self.turn, 0.0)
-        yaw = self.turn * np.clip(t - self.standstill - self.run, 0.0, None)
-        self.yaw = yaw
-        self.velocity = np.stack([v * np.cos(yaw), v * np.sin(yaw), 0.0 * v], axis=1)
-        straight = np.clip(t - self.standstill, 0.0, self.run)
-        radius = self.speed / self.turn
-        self.north = straight**2 + radius * np.sin(yaw)
-        self.east = radius * (1.0 - np.cos(yaw))
-        self.right = v * self.yaw_rate
-
-    def inertial(self):
-        """Rates, rad/s, and specific forces, m/s^2, of an ideal IMU on a rotating Earth, forward, right, down."""
-        north, east, _ = self.velocity.T
-        radius = geodesy.SEMI_MAJOR_AXIS
-        spin = geodesy.EARTH_RATE * np.array([math.cos(LATITUDE), 0.0, -math.sin(LATITUDE)])
-        carried = np.stack([east / radius, -north / radius, -east * math.tan(LATITUDE) / radius], axis=1)
-        level = Rotation.from_euler("z", self.yaw[:, None]).inv()
-        rates = level.apply(spin + carried) + np.outer(self.yaw_rate, [0.0, 0.0, 1.0])
-        body = np.stack([self.forward, self.right, np.full(len(self.time), -normal_gravity())], axis=1)
-        return rates, body + level.apply(np.cross(2.0 * spin + carried, self.velocity))
-
-    def position(self):
-        """Latitude, longitude in degrees, height in m."""
-        e2, sine = geodesy.ECCENTRICITY_SQUARED, math.sin(LATITUDE)
-        across = geodesy.SEMI_MAJOR_AXIS / math.sqrt(1 - e2 * sine**2)
-        along = across * (1 - e2) / (1 - e2 * sine**2)
-        latitude = LATITUDE + self.north / (along + HEIGHT)
-        longitude = LONGITUDE + self.east / ((across + HEIGHT) * np.cos(LATITUDE))
-        return np.degrees(latitude), np.degrees(longitude), np.full(len(self.time), HEIGHT)
+class Circle(CircularDrive):
+    """Written as the repository has its log."""
 
     def write(self, folder, rate_bias=(0.0, 0.0, 0.0), force_bias=(0.0, 0.0, 0.0), drop=None):
         """Write the log as the repository has it; biases of the vehicle's axes, rad/s and m/s^2."""
@@ -135,7 +87,9 @@ def test_log_is_read(tmp_path, pyins):
     fixes = drive.read_fixes(tmp_path / drive.FIXES)
     np.testing.assert_allclose(fixes.index - BEGIN, 0.25 * np.arange(120), atol=1e-5)
     np.testing.assert_allclose(
-        drive.metres(fixes, (LATITUDE, LONGITUDE)), np.stack([path.east, path.north])[:, ::10], atol=0.02
+        strapdown.tangent_plane(fixes, (LATITUDE, LONGITUDE)),
+        np.stack([path.east, path.north])[:, ::10],
+        atol=0.02,
     )
 
 
@@ -163,7 +117,8 @@ def test_ins_aligned_by_the_log_follows_the_circle(tmp_path, pyins, monkeypatch)
 def test_free_ins_of_a_constant_acceleration_error(pyins, error):
     """Without one it follows the circle; with one along the vehicle's down axis the height goes off by b t^2 / 2."""
     import pandas
-    from pyins import strapdown, util
+    from pyins import strapdown as pyins_strapdown
+    from pyins import util
 
     path = Circle(36.0)
     rates, forces = path.inertial()
@@ -172,17 +127,17 @@ def test_free_ins_of_a_constant_acceleration_error(pyins, error):
     position = np.stack(path.position(), axis=1)
     attitude = np.stack([0.0 * path.yaw, 0.0 * path.yaw, np.degrees(path.yaw)], axis=1)
     columns = np.hstack([position, path.velocity, attitude])
-    increments = strapdown.compute_increments_from_imu(inertial, "rate")
+    increments = pyins_strapdown.compute_increments_from_imu(inertial, "rate")
     # What the filter takes for a bias is subtracted.
     biases = pandas.DataFrame(np.zeros((1, 6)), [0.0], [*util.THETA_COLS, *util.DV_COLS])
     biases["dv_z"] = -error
-    known = drive.Aligned(
+    known = strapdown.AidedInertial(
         pandas.DataFrame(columns, path.time, util.TRAJECTORY_COLS), biases, increments, innovations={}
     )
     times = path.time[begin : begin + 801 : 10]
-    found = drive.free_inertial(known, times)
-    east, north = drive.metres(found, (LATITUDE, LONGITUDE))
-    expected = drive.metres(
+    found = strapdown.free_inertial(known, times)
+    east, north = strapdown.tangent_plane(found, (LATITUDE, LONGITUDE))
+    expected = strapdown.tangent_plane(
         pandas.DataFrame(position[begin : begin + 801 : 10], times, util.LLA_COLS), (LATITUDE, LONGITUDE)
     )
     np.testing.assert_allclose([east, north], expected, atol=0.1)
