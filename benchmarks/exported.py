@@ -37,7 +37,8 @@ from filtergym.evaluation.steered_filter import steer
 from peer_imm import imm_steps_per_second
 
 from filtergym.exports.c_source import FLAGS, Writer, files_of
-from filtergym.exports.replay import ExportRequest, Replay, mean_rows, replay, run_filter
+from filtergym.exports.replay import Replay, mean_rows, replay, run_filter
+from filtergym.exports.request import ExportRequest
 from filtergym.exports.traced_filter import (
     ANSWER,
     ESTIMATE,

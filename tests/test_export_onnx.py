@@ -9,6 +9,7 @@ from filtergym.baselines.problem import import_problem
 from filtergym.envs.backend import make_model
 
 from filtergym.exports.onnx_network import export_onnx, network_graph
+from filtergym.exports.request import request_export
 
 onnxruntime = pytest.importorskip("onnxruntime")
 pytest.importorskip("onnx")
@@ -60,7 +61,7 @@ def session_of(model_bytes):
 )
 def test_shipped_agents_act_as_they_do_here(env, name, tmp_path):
     problem, path = import_problem(env), tmp_path / "agent.onnx"
-    export_onnx(problem, name, path)
+    export_onnx(request_export(problem, name), path)
     stored = load_policy(problem.task, pretrained_path(env, name))
     stored = getattr(stored, "policy", stored)
     model, header = make_model(problem.task, stored.control), stored.header
@@ -120,7 +121,7 @@ def test_every_kind_of_network_acts_as_it_does_here(unit, output, activation, co
 
 def test_metadata_names_what_goes_in_and_out(tmp_path):
     path = tmp_path / "agent.onnx"
-    export_onnx(import_problem("filtergym/TightlyCoupledNavigation-v0"), "bptt", path)
+    export_onnx(request_export(import_problem("filtergym/TightlyCoupledNavigation-v0"), "bptt"), path)
     session = session_of(str(path))
     said = session.get_modelmeta().custom_metadata_map
     fields = json.loads(said["fields"])
@@ -134,5 +135,5 @@ def test_metadata_names_what_goes_in_and_out(tmp_path):
 
 def test_what_has_no_network_is_refused(tmp_path):
     with pytest.raises(ValueError, match="'imm' has no network of plain arrays: name a shipped agent"):
-        export_onnx(import_problem(RADAR), "imm", tmp_path / "agent.onnx")
+        export_onnx(request_export(import_problem(RADAR), "imm"), tmp_path / "agent.onnx")
     assert not list(tmp_path.iterdir())

@@ -16,6 +16,7 @@ from filtergym.evaluation.rollout import rollout, start_lanes
 
 from filtergym.exports.exported_filter import lane_of
 from filtergym.exports.python_source import clean, export_python
+from filtergym.exports.request import request_export
 from filtergym.names import find_competitor
 
 RADAR = "filtergym/ManeuveringTarget-v0"
@@ -104,9 +105,13 @@ def check_replay(text, lanes):
                 numpy.testing.assert_array_equal(estimate.statistics[key], value)
 
 
+def written_filter(env, name, *arguments, **options):
+    return export_python(request_export(import_problem(env), name, *arguments, **options))
+
+
 @pytest.fixture(scope="module")
 def written():
-    return {case: export_python(import_problem(case[0]), case[1]) for case in QUICK}
+    return {case: written_filter(case[0], case[1]) for case in QUICK}
 
 
 def test_files_say_the_same_bits_where_there_is_numpy_alone(written, tmp_path):
@@ -143,7 +148,7 @@ def test_every_ranked_competitor_says_the_same_bits(env):
     names = [*known.policies, *known.estimators, *problem.tuned_policies, *pretrained_agents(env)]
     for name in names:
         if name != "random":
-            check_replay(export_python(problem, name), replay(env, name, 3, 60))
+            check_replay(written_filter(env, name), replay(env, name, 3, 60))
 
 
 def test_only_numpy_and_python_are_imported(written):
@@ -205,7 +210,7 @@ def test_another_shape_is_refused(written):
 
 
 def test_parameters_of_the_scenario_and_ones_own_are_in_force():
-    text = export_python(import_problem(RADAR), "zero", "paper", gains=(0.2, 0.6))
+    text = written_filter(RADAR, "zero", "paper", gains=(0.2, 0.6))
     assert "regular: Any = True" in text
     assert "gain_alpha=numpy.array([[0.2], [0.6]])" in text
     check_replay(text, replay(RADAR, "zero", 1, 5, scenario="paper", gains=(0.2, 0.6)))
@@ -218,10 +223,10 @@ def test_a_fitted_filter_with_an_evil_name_is_text(tmp_path, monkeypatch):
     family = families_of(problem)["imm-turn"]
     values = {"environment": RADAR, "filter": "imm-turn", "values": dict(family.start)}
     Path(name).write_text(json.dumps(values))
-    text = export_python(problem, Path(name))
+    text = written_filter(RADAR, Path(name))
     module = module_of(text)
     assert not Path("injected").exists()
-    assert module.__doc__.splitlines()[0].startswith("a''' open('injected', 'w') /.filter.json: a filter of")
+    assert module.__doc__.splitlines()[0].startswith("a''' open('injected', 'w') /: a filter of")
     check_replay(text, replay(RADAR, Path(name), 1, 5))
 
 
@@ -261,7 +266,7 @@ class Own:
 def test_an_estimator_of_ones_own_is_written(tmp_path, monkeypatch):
     (tmp_path / "own_gain.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
-    text = export_python(import_problem(RADAR), "own_gain:Own")
+    text = written_filter(RADAR, "own_gain:Own")
     assert "# A scan that missed the target changes nothing." in text
     assert 'GAIN = 0.5\n"""Of the position."""' in text
     check_replay(text, replay(RADAR, "own_gain:Own", 1, 5))
@@ -295,7 +300,7 @@ def test_what_cannot_be_written_is_refused_in_one_sentence(name, reason, tmp_pat
     (tmp_path / "own_scipy.py").write_text(LACKING)
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ValueError, match=reason) as refusal:
-        export_python(import_problem(RADAR), name)
+        written_filter(RADAR, name)
     assert "\n" not in str(refusal.value)
 
 
@@ -303,7 +308,7 @@ def test_what_cannot_be_written_is_refused_in_one_sentence(name, reason, tmp_pat
 def test_a_users_environment_is_written(monkeypatch):
     monkeypatch.syspath_prepend(Path(__file__).parent.parent / "docs" / "examples")
     env = "inverted_pendulum:mine/InvertedPendulum-v0"
-    check_replay(export_python(import_problem(env), "matching"), replay(env, "matching", 1, 20))
+    check_replay(written_filter(env, "matching"), replay(env, "matching", 1, 20))
 
 
 TWICE = '''
@@ -350,7 +355,7 @@ class Own:
 def test_names_that_two_modules_have_are_told_apart(tmp_path, monkeypatch):
     (tmp_path / "own_twice.py").write_text(TWICE)
     monkeypatch.syspath_prepend(tmp_path)
-    text = export_python(import_problem(RADAR), "own_twice:Own")
+    text = written_filter(RADAR, "own_twice:Own")
     assert "def kalman_update(" in text
     assert "def own_twice_update(" in text
     assert 'Settings(gain=0.25, unread="no")' in text

@@ -15,7 +15,8 @@ from filtergym.filters import kalman
 
 from filtergym.exports import c_source
 from filtergym.exports.c_source import FLAGS, Writer, compile_and_test, export_c, files_of
-from filtergym.exports.replay import ExportRequest, mean_rows, replay, run_filter
+from filtergym.exports.replay import mean_rows, replay, run_filter
+from filtergym.exports.request import ExportRequest
 from filtergym.names import find_competitor
 
 EVIL = 'x */ #include "/etc/passwd" \n// \\ ??/ "; system("true"); /* µ\u202e'

@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..agents.export import export_run
-from ..baselines.fitted_filters import SUFFIX
-from ..baselines.problem import Problem, problem_of
+from ..baselines.problem import problem_of
 from ..envs.catalogue import check_names, nearest, read_recording
 from ..evaluation.files import whole_file, writable_file
-from ..names import find_competitor
 from .terminal import (
     Parameters,
     ScenarioName,
@@ -26,7 +24,7 @@ from .terminal import (
 )
 
 if TYPE_CHECKING:
-    from ..exports.replay import ExportRequest
+    from ..exports.request import ExportRequest
 
 FORMS = ("safetensors", "c", "python", "onnx")
 """What can be written."""
@@ -119,28 +117,27 @@ def export(
     problem = problem_of(environment)
     keywords = parse_settings(settings or [])
     check_names(problem.task, keywords)
-    own = _own_name(problem, name)
     data: Any = scenario
     if recording is not None:
         if scenario is not None:
             raise ValueError("--recording takes the place of --scenario: leave one of them out")
         data = read_recording(recording, problem.id, speeds=pair("--speeds", speeds), **keywords)
-    if to == "c":
-        from ..exports.replay import ExportRequest
+    from ..exports.request import request_export
 
-        maker = find_competitor(problem, name, trust)
-        _export_c(ExportRequest(problem, own, maker, data, keywords), out, "float" if single else "double")
+    request = request_export(problem, name, data, trust=trust, **keywords)
+    if to == "c":
+        _export_c(request, out, "float" if single else "double")
         return
     ending = ".py" if to == "python" else ".onnx"
-    path = writable_file(out or Path(own.replace(":", "_") + ending))
+    path = writable_file(out or Path(request.name.replace(":", "_") + ending))
     if to == "onnx":
         from ..exports.onnx_network import export_onnx
 
-        export_onnx(problem, name, path, trust=trust)
+        export_onnx(request, path)
     else:
         from ..exports.python_source import export_python
 
-        text = export_python(problem, name, data, trust=trust, **keywords)
+        text = export_python(request)
         with whole_file(path) as partial:
             partial.write_text(text, encoding="utf-8")
     console.print(f"saved in {path}", soft_wrap=True)
@@ -161,14 +158,6 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
         f"try it: cd {folder} && cc -std=c99 -O2 test.c {stem}.c -lm -o test && ./test",
     ):
         console.print(line, highlight=False, soft_wrap=True)
-
-
-def _own_name(problem: Problem, name: str) -> str:
-    """Name of a competitor; of a file its own, without folder and ending, and without that of the environment."""
-    for ending in (SUFFIX, ".safetensors", ".zip"):
-        if name.endswith(ending):
-            return Path(name).name.removesuffix(ending).removeprefix(f"{problem.short_name}.")
-    return Path(name).name if Path(name).is_dir() else name
 
 
 def _export_arrays(folder: Path, out: Path | None, trust: bool) -> None:

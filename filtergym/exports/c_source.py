@@ -28,7 +28,8 @@ from ..compiler.c_source import (
 )
 from ..evaluation.files import whole_files
 from .c_network import memory_size, network_text
-from .replay import ExportRequest, Replay, mean_rows, replay, run_filter
+from .replay import Replay, mean_rows, replay, run_filter
+from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
     LIKELIHOODS,

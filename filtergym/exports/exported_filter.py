@@ -1,13 +1,10 @@
 """A ranked competitor as the objects that it runs with, and what it is given."""
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
-from ..baselines.problem import Problem
 from ..baselines.table import ConstantMode
 from ..envs.catalogue import make_task
 from ..envs.model import Model
@@ -24,8 +21,8 @@ from ..evaluation.competitors import (
 )
 from ..evaluation.evaluate import control_of
 from ..filters.array_namespace import Array
-from ..names import find_competitor
 from .constants import ReadModel
+from .request import ExportRequest
 from .track import ConstantTrack, EstimatorTrack, NotReceived, SteeredTrack, Track
 
 OF_AN_ESTIMATOR = ("start", "update")
@@ -59,40 +56,31 @@ class Exported(NamedTuple):
     """Of the competitor."""
 
 
-def find_exported(
-    problem: Problem, name: str | Path, scenario: Any, trust: bool, keywords: Mapping[str, Any]
-) -> Exported:
+def find_exported(request: ExportRequest) -> Exported:
     """Make a competitor for a task, and take it apart.
-
-    Args:
-        problem: of the competitor.
-        name: as of :func:`~filtergym.names.competitor`.
-        scenario: of the task.
-        trust: import what can execute code.
-        keywords: parameters of the task.
 
     Raises:
         ValueError: for what is not ranked, or draws its actions.
     """
-    maker = find_competitor(problem, name, trust)
+    problem, name, maker, scenario, keywords = request
     kind = kind_of(maker)
     if kind not in RANKED:
         raise ValueError(
-            f"{str(name)!r} is of kind {kind}: only policies and estimators run on measurements alone"
+            f"{name!r} is of kind {kind}: only policies and estimators run on measurements alone"
         )
     task = make_task(problem.task, scenario, **{**getattr(maker, "task_keywords", {}), **keywords})
     if isinstance(maker, EstimatorMaker):  # a bank with a network, whatever it is from outside
         model = ReadModel(task, maker.bank)
         parts = _steered_parts(model, maker.policy(model))
     elif kind == "estimator":
-        model = ReadModel(task, control_of(maker, kind, None, problem.task, str(name)))
-        own = check_competitor(str(name), make_competitor(maker, task), kind)
+        model = ReadModel(task, control_of(maker, kind, None, problem.task, name))
+        own = check_competitor(name, make_competitor(maker, task), kind)
         parts = Parts(EstimatorTrack, {"filter": own, "mask": _mask_of(task.world)}, OF_AN_ESTIMATOR)
     else:
-        model = ReadModel(task, control_of(maker, kind, None, problem.task, str(name)))
-        policy = check_competitor(str(name), make_competitor(maker, model), kind)
+        model = ReadModel(task, control_of(maker, kind, None, problem.task, name))
+        policy = check_competitor(name, make_competitor(maker, model), kind)
         if isinstance(policy, RandomPolicy):
-            raise ValueError(f"{str(name)!r} draws its actions: there is nothing to write out")
+            raise ValueError(f"{name!r} draws its actions: there is nothing to write out")
         parts = _steered_parts(model, policy)
     initial, measurement = _first_measurement(model)
     return Exported(task, parts, measurement, initial, model, maker)

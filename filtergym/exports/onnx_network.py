@@ -13,11 +13,10 @@ import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
 from ..agents.learned_policy import OBSERVATION_LIMIT, StoredPolicy
-from ..baselines.problem import Problem
 from ..envs.backend import make_model
 from ..envs.model import Model
 from ..evaluation.files import whole_file
-from ..names import find_competitor
+from .request import ExportRequest
 
 OPSET, IR_VERSION = 17, 8
 """Of 2022: runtimes from then on read it."""
@@ -113,20 +112,20 @@ def _action(graph: _Graph, x: str, output: str, space: Any) -> None:
     graph.node("Add", [graph.node("Mul", [graph.node("Tanh", [x]), half]), middle], "action")
 
 
-def _network(problem: Problem, name: str | Path, trust: bool) -> tuple[StoredPolicy, Model]:
+def _network(request: ExportRequest) -> tuple[StoredPolicy, Model]:
     """Return the arrays of an agent, and the model that it acts in.
 
     Raises:
         ValueError: for what has no plain arrays, or does not fit the environment.
     """
-    maker = find_competitor(problem, name, trust)
+    maker = request.maker
     stored = maker.policy if isinstance(maker, EstimatorMaker) else maker
     if not isinstance(stored, StoredPolicy):
         raise ValueError(
-            f"{str(name)!r} has no network of plain arrays: name a shipped agent or a .safetensors file, which "
+            f"{request.name!r} has no network of plain arrays: name a shipped agent or a .safetensors file, which "
             "filtergym export writes of a training run"
         )
-    model = make_model(problem.task, stored.control)
+    model = make_model(request.problem.task, stored.control)
     stored(model)  # refuses what does not fit
     return stored, model
 
@@ -218,18 +217,16 @@ def network_graph(stored: StoredPolicy, model: Model) -> Any:
     return made
 
 
-def export_onnx(problem: Problem, name: str | Path, path: Path, *, trust: bool = False) -> None:
+def export_onnx(request: ExportRequest, path: Path) -> None:
     """Write the network of an agent as ONNX.
 
     Args:
-        problem: of the agent.
-        name: of a shipped agent, or its file, as of :func:`~filtergym.names.competitor`.
+        request: of an agent, shipped or in a file.
         path: of the file.
-        trust: load what can execute code.
 
     Raises:
         ValueError: for what has no network of plain arrays, a file that cannot be written, or without the package.
     """
-    made = network_graph(*_network(problem, name, trust))
+    made = network_graph(*_network(request))
     with whole_file(path) as partial:
         partial.write_bytes(made.SerializeToString())

@@ -9,20 +9,18 @@ import ast
 import itertools
 import textwrap
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy
 
 from .. import __version__
-from ..baselines.fitted_filters import SUFFIX
-from ..baselines.problem import Problem
 from ..envs.model import Episode, Model
 from ..evaluation.rollout import rollout, start_lanes
 from .constants import Constants, ConstantsText, call_text, word
 from .definition_text import WIDTH, DefinitionText
 from .definitions import Definitions, ExportError, External, Key, class_statement
 from .exported_filter import Exported, find_exported, lane_of
+from .request import ExportRequest
 
 CHECKED = 25
 """Measurements on which a written filter is tried."""
@@ -63,39 +61,18 @@ def clean(text: str) -> str:
     return " ".join(printable.replace("\\", "/").replace('"', "'").split())
 
 
-def shown_name(name: str | Path) -> str:
-    """Return the name of a competitor without the folders of a file."""
-    text = str(name)
-    is_file = isinstance(name, Path) or text.endswith((SUFFIX, ".safetensors"))
-    return Path(text).name if is_file else text
-
-
-def export_python(
-    problem: Problem,
-    name: str | Path,
-    scenario: Any = None,
-    *,
-    trust: bool = False,
-    **keywords: Any,
-) -> str:
+def export_python(request: ExportRequest) -> str:
     """Return the text of a Python file that is a filter.
-
-    Args:
-        problem: of the filter.
-        name: of a policy or an estimator, as of :func:`~filtergym.names.competitor`.
-        scenario: whose parameters it is made for; default: the environment's training distribution.
-        trust: import what can execute code.
-        **keywords: parameters of the task.
 
     Raises:
         ValueError: for what is not ranked, draws numbers, or takes more than NumPy.
     """
-    exported = find_exported(problem, name, scenario, trust, keywords)
+    exported = find_exported(request)
     try:
-        text = _write(problem, str(name), exported)
-        _check_text(text, exported, str(name))
+        text = _write(request, exported)
+        _check_text(text, exported, request.name)
     except ExportError as error:
-        raise ValueError(f"{str(name)!r} cannot be written as one Python file: {error}") from None
+        raise ValueError(f"{request.name!r} cannot be written as one Python file: {error}") from None
     return text
 
 
@@ -159,7 +136,7 @@ def _classes_of(given: Any) -> list[type]:
     return [type(given), *(cls for part in given for cls in _classes_of(part))]
 
 
-def _write(problem: Problem, name: str, exported: Exported) -> str:
+def _write(request: ExportRequest, exported: Exported) -> str:
     """Put the sections of the file together."""
     definitions, arguments = _collect(exported), exported.parts.arguments
     text = DefinitionText(definitions, RESERVED)
@@ -172,7 +149,7 @@ def _write(problem: Problem, name: str, exported: Exported) -> str:
     used = {node.id for node in ast.walk(whole) if isinstance(node, ast.Name)} | {"Any", "NamedTuple"}
     engine = [template for template_name, template in TEMPLATES.items() if template_name in used]
     imports = [found for found in definitions.externals if found.name in used]
-    head = [_docstring(problem, name, exported), "from __future__ import annotations", _imports(imports)]
+    head = [_docstring(request, exported), "from __future__ import annotations", _imports(imports)]
     sections = [
         "\n\n".join(head),
         'Array = Any\n"""A NumPy array."""',
@@ -261,14 +238,14 @@ def _wrapped(text: str, indent: str, hanging: str = "") -> str:
     )
 
 
-def _docstring(problem: Problem, name: str, exported: Exported) -> str:
+def _docstring(request: ExportRequest, exported: Exported) -> str:
     task, C = exported.task, len(exported.task.components)
     components = ", ".join(f"{clean(c.name)} ({clean(c.unit)})" for c in task.components)
     fields = list(_arguments(exported.measurement))
     more = "".join(f", {field}" for field in list(_arguments(exported.initial))[2:])
     call = f"    estimate = filter.update({', '.join(f'{field}=...' for field in fields)})"
     lines = [
-        f'"""{clean(shown_name(name))}: a filter of {clean(problem.id)}, as one file that needs NumPy only.',
+        f'"""{clean(request.name)}: a filter of {clean(request.problem.id)}, as one file that needs NumPy only.',
         "",
         _wrapped(
             f"Written by filtergym {__version__} for Python 3.11 and NumPy 2, or later. The equations are those of "

@@ -2,15 +2,12 @@
 
 import copy
 import math
-from collections.abc import Mapping
 from itertools import islice
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy
 
 from ..agents.learned_policy import LearnedPolicy
-from ..baselines.problem import Problem
 from ..compiler.functions import leaves
 from ..compiler.interpretation import interpret
 from ..envs.backend import make_model
@@ -19,6 +16,7 @@ from ..evaluation.competitors import kind_of
 from ..evaluation.evaluate import control_of
 from ..evaluation.rollout import rollout, start_lanes
 from ..evaluation.seeds import episode_seeds
+from .request import ExportRequest
 from .traced_filter import (
     ANSWER,
     MEASUREMENT,
@@ -75,20 +73,6 @@ def _rows(part: Any, count: int) -> numpy.ndarray:
     """Numbers of nested tuples of arrays ``(..., N)`` row by row, of the first lanes, ``(rows, count)``."""
     arrays = [numpy.asarray(array, dtype=float) for array in leaves(part)]
     return numpy.concatenate([array.reshape(-1, array.shape[-1])[:, :count] for array in arrays])
-
-
-class ExportRequest(NamedTuple):
-    """What is to be written: a competitor, and the parameters that it gets."""
-
-    problem: Problem
-    """Whose competitor it is."""
-    name: str
-    maker: Any
-    """Of the competitor."""
-    scenario: Any = None
-    """Whose parameters it gets, and whose episodes it is compared on, of the test split; a recording, too."""
-    keywords: Mapping[str, Any] = MappingProxyType({})
-    """Parameters of the task."""
 
 
 def replay(
