@@ -350,7 +350,10 @@ def _warnings(advice: Advice) -> Iterator[str]:
         if interval.open_low and interval.open_high
     ]
     if wide:
-        yield f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would."
+        yield (
+            f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would, or is too "
+            "short."
+        )
 
 
 def _agents(advice: Advice, learned: Sequence[str]) -> Iterator[str]:
