@@ -351,8 +351,8 @@ def _warnings(advice: Advice) -> Iterator[str]:
     ]
     if wide:
         yield (
-            f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would, or is too "
-            "short."
+            f"Nothing in this recording tells the size of: {', '.join(wide)}. It lacks the motion that would, or is "
+            "too short."
         )
 
 
