@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..filters import noise_adaptation as adaptation
-from ..filters.array_namespace import Array, namespace
+from ..filters.array_namespace import Array
 
 LEAST = 0.1
 """Smallest estimate over the stated variance; ours: a third of the stated deviation, below which nothing is gained."""
@@ -110,11 +110,3 @@ RULES: Mapping[str, tuple[type[MeasurementNoise], str]] = {
     "variational-bayes": (VariationalBayes, "by variational Bayes (Särkkä and Nummenmaa 2009)"),
 }
 """Rules by their names in tables, and how they estimate the noise."""
-
-
-def select_memory(which: Array, one: Any, other: Any) -> Any:
-    """Entries of one memory where ``which``, ``(N,)``, is true, and of another elsewhere."""
-    if isinstance(one, tuple):
-        parts = [select_memory(which, a, b) for a, b in zip(one, other, strict=True)]
-        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
-    return namespace(which).where(which, one, other)

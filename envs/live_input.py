@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy
 
-from ..compiler.functions import leaves, map_arrays
-
 if TYPE_CHECKING:
     from .task import Task
 
@@ -105,10 +103,13 @@ class LiveInput:
         """Return a value as an array ``(*shape, N)``; NaN where it did not come.
 
         Raises:
-            ValueError: for another shape.
+            ValueError: for what is no number, or another shape.
         """
         value: Any = values.get(name)
-        array = numpy.asarray(numpy.nan if value is None else value, dtype=float)
+        try:
+            array = numpy.asarray(numpy.nan if value is None else value, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} must be numbers, got {value!r:.80}") from None
         if array.shape == shape:
             array = array[..., None]
         elif value is None:
@@ -203,15 +204,3 @@ class LiveInput:
 
 def _listed(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value!r:.40}" for name, value in values.items()) or "nothing"
-
-
-def merge_tracks(old: Any, new: Any, chosen: numpy.ndarray) -> Any:
-    """Nested tuples of arrays ``(..., N)`` in which some tracks are those of others.
-
-    Args:
-        old: all tracks.
-        new: likewise.
-        chosen: which are taken from ``new``, booleans, ``(N,)``.
-    """
-    arrays = iter(leaves(new))
-    return map_arrays(lambda array: numpy.where(chosen, next(arrays), array), old)

@@ -12,9 +12,10 @@ import numpy
 
 from ..compiler.functions import map_arrays, round_up_lanes
 from ..envs.compiled import filter_stepper
-from ..envs.live_input import merge_tracks
 from ..envs.model import Episode, Model
+from ..envs.parameters import check_integer
 from ..envs.recording import measure_examples
+from ..filters.array_namespace import select_nested
 from .competitors import Kind, check_competitor, make_competitor
 from .dataset import FAULTS
 from .filters import put_in_loop
@@ -129,8 +130,7 @@ class OnlineFilter:
             raise ValueError(
                 f"{name!r} is of kind {kind} and cannot run online: choose a policy or an estimator"
             )
-        if tracks < 1:
-            raise ValueError(f"tracks must be at least one, got {tracks!r}")
+        tracks = check_integer("tracks", tracks, 1)
         self.name, self.tracks, self.watch = name, tracks, watch
         self.task = model.task
         initial, measurement, _ = measure_examples(type(self.task)(self.task.parameters))
@@ -210,6 +210,7 @@ class OnlineFilter:
             raise ValueError(
                 f"time must increase: the last measurement was at {_plain(last)} s, got {time!r}"
             )
+        self.input.check_names(values, self.input.values)
         measurement, memory = self.input.measure(before.input, at, values)
         after = before._replace(input=memory, measurements=before.measurements + 1)
         stepper = self._stepper
@@ -352,8 +353,8 @@ class OnlineFilter:
             raise ValueError(f"tracks are numbers from 0 to {self.tracks - 1}, got {tracks!r}") from None
         old = self._running()
         return old._replace(
-            filter=merge_tracks(self._stepper.state, begun.filter, chosen[self._pad]),
-            input=merge_tracks(old.input, begun.input, chosen),
+            filter=select_nested(chosen[self._pad], begun.filter, self._stepper.state),
+            input=select_nested(chosen, begun.input, old.input),
             fresh=chosen | old.fresh,
         )
 

@@ -130,13 +130,18 @@ def _command(name: str, command: Callable[..., None] | str) -> Any:
     return typer.main.get_command(app)
 
 
+@functools.cache
+def _docstrings(module: str) -> dict[str, str | None]:
+    """Return the docstrings of a module of commands, by the names of its functions, and import nothing."""
+    text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
+    return {n.name: ast.get_docstring(n) for n in ast.parse(text).body if isinstance(n, ast.FunctionDef)}
+
+
 def _listed(name: str, command: Callable[..., None] | str, group: str) -> Any:
     """Return a command that has nothing but its help, read from the text of its module."""
     if isinstance(command, str):
         module, _, function = command.partition(":")
-        text = (Path(__file__).parent / "commands" / f"{module}.py").read_text(encoding="utf-8")
-        [own] = [n for n in ast.parse(text).body if isinstance(n, ast.FunctionDef) and n.name == function]
-        words = ast.get_docstring(own)
+        words = _docstrings(module)[function]
     else:
         words = inspect.getdoc(command)
     return typer.core.TyperCommand(name, help=words, rich_help_panel=group, rich_markup_mode=MARKUP)

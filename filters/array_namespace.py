@@ -44,3 +44,17 @@ def stack_nested(values: Any, zero: Array, xp: Any) -> Array:
     if isinstance(values, list | tuple):
         return xp.stack([stack_nested(value, zero, xp) for value in values])
     return values + zero
+
+
+def select_nested(which: Array, one: Any, other: Any) -> Any:
+    """Entries of one nested tuple or dictionary of arrays ``(..., N)`` where ``which``, ``(N,)``, is true, and of
+    another elsewhere; None holds none.
+    """
+    if one is None:
+        return None
+    if isinstance(one, dict):
+        return {name: select_nested(which, part, other[name]) for name, part in one.items()}
+    if isinstance(one, tuple):
+        parts = [select_nested(which, a, b) for a, b in zip(one, other, strict=True)]
+        return type(one)(*parts) if hasattr(one, "_fields") else tuple(parts)
+    return namespace(which).where(which, one, other)

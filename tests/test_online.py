@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from filtergym.envs.backend import make_model
 from filtergym.envs.catalogue import read_recording
+from filtergym.envs.live_input import LiveInput
 from filtergym.envs.task import named_arrays
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of
@@ -277,6 +278,7 @@ def test_the_example_of_the_page_prints_what_the_page_says(capsys):
             lambda f: f.update(-1.0, x=1.0, y=2.0),
             "time must increase: the last measurement was at 0.0 s",
         ),
+        (lambda f: f.update(x="east", y=2.0), "x must be numbers, got 'east'"),
         (lambda f: f.update(x=[1.0, 2.0], y=2.0), r"x must have shape \(\), got \(2,\)"),
     ],
 )
@@ -299,6 +301,15 @@ def test_what_is_wrong_is_said(call, sentence):
 def test_what_cannot_run_ahead_is_refused(name, sentence):
     with pytest.raises(ValueError, match=sentence):
         filtergym.online(RADAR, name)
+
+
+def test_a_misspelt_value_is_told_where_an_environment_takes_its_arrays_by_name(monkeypatch):
+    monkeypatch.setattr(import_problem(UAV).task, "live_input", LiveInput)
+    filter = filtergym.online(UAV, "kalman")
+    states = len(filter.names)
+    filter.start(np.zeros(states), np.eye(states), command=0.0)
+    with pytest.raises(ValueError, match=r"unknown value 'readings': .* takes reading \(shape \(3,\)\)"):
+        filter.update(readings=np.zeros(3), command=0.0, control=0.0)
 
 
 def test_what_an_environment_needs_is_said():

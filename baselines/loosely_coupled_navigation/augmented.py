@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 from ...envs.loosely_coupled_navigation.parameters import LooselyCoupledNavigationParameters
 from ...filters import loosely_coupled as ins_gnss
-from ...filters.array_namespace import Array, namespace
+from ...filters.array_namespace import Array, namespace, select_nested
 from ...filters.ordered_sums import ordered_sum
-from ..measurement_noise import RULES, MeasurementNoise, select_memory
+from ..measurement_noise import RULES, MeasurementNoise
 from ..table import Tunable, Variant, tunable
 
 WINDOW = 25.0
@@ -96,7 +96,7 @@ class AugmentedFilter:
             available: one where there is a measurement, ``(N,)``.
         """
         xp = namespace(innovation)
-        noise = select_memory(reported != memory.reported, self.noise.start(reported), memory.noise)
+        noise = select_nested(reported != memory.reported, self.noise.start(reported), memory.noise)
         size = xp.sqrt(ordered_sum(innovation * innovation) / innovation.shape[0])
         R, noise = self.noise.update(noise, size, memory.covariance.position, reported, available)
         K, P = ins_gnss.update_augmented(memory.covariance, R, available)

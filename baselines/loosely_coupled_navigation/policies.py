@@ -18,7 +18,8 @@ from ...evaluation.dataset import keywords_of
 from ...evaluation.metrics import Measure, sums_of_present
 from ...evaluation.own_metrics import MetricInputs, OwnMetrics
 from ...filters import loosely_coupled as ins_gnss
-from ..measurement_noise import MeasurementNoise, select_memory
+from ...filters.array_namespace import select_nested
+from ..measurement_noise import MeasurementNoise
 from ..table import Baselines, ConstantMode, PaperAction, Variant, tunable
 from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
@@ -203,7 +204,7 @@ class AugmentedGain(TimeVarying):
         none = numpy.zeros((p.axes, len(observation)))
         memory = _Offset(none, self.filter.start(none))
         if state is not None:
-            memory = select_memory(start, memory, state)
+            memory = select_nested(start, memory, state)
         reported = self.reported_variance(observation)[:, 0]
         available = numpy.where(self.available(observation)[:, 0] > 0.5, 1.0, 0.0)
         innovation = self.innovation(observation).T

@@ -41,7 +41,6 @@ class ScanInput(LiveInput):
         return self._scan(scan, values), {"time": time, "count": scan}
 
     def _scan(self, scan: numpy.ndarray, values: Mapping[str, Any]) -> Measurement:
-        self.check_names(values, self.values)
         types = self.task.types  # type: ignore[attr-defined]
         radar = self.read_all(values, ("range", "range_rate"), "at every scan")
         decision = self.read(values, "decision")

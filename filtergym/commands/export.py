@@ -8,7 +8,7 @@ import typer
 from ..agents.export import export_run
 from ..baselines.problem import problem_of
 from ..envs.catalogue import check_names, nearest, read_recording
-from ..evaluation.files import whole_file, writable_file
+from ..evaluation.files import whole_file, writable_file, writable_folder
 from .terminal import (
     Parameters,
     ScenarioName,
@@ -149,6 +149,7 @@ def _export_c(request: "ExportRequest", out: Path | None, precision: str) -> Non
 
     stem = file_stem(request.name)
     folder = out or Path(stem)
+    writable_folder(folder)  # what it refuses is said before anything is compared
     figures = export_c(request, folder, precision, command_line())
     for line in (
         f"saved in {folder}: {stem}.h, {stem}.c",
