@@ -1,162 +1,142 @@
-"""How fast the environments step, beside what the machine could do and beside a peer.
+"""How fast things are that users wait for, beside peers in the same run.
 
-    python benchmarks/throughput.py [--environment ID] [--size N] [--seconds S] [--json FILE]
+    python benchmarks/throughput.py [SECTION ...] [--environment ID] [--size N] [--seconds S] [--large] [--json FILE]
 
-**What is timed.** First what users get: the public ``step`` of ``gymnasium.make_vec(ID, num_envs=N)``, with nothing
-but its defaults (a step is one action: ten measurements in TightlyCoupledNavigation). Then the kernel, with every
-control and backend: the ``step`` of the environment that ``gymnasium.make`` makes (wrappers included) and of the vector
-environments of ``gymnasium.make_vec``: action check, filters, reward ``cost``, observation. Every step of it is one
-measurement (``decision_interval`` 1) of the environment's first scenario, the paper's, where no scan is missed. A step
-carries its share of a reset: that of all environments, over the length of an episode. One thread. Actions are random
-and drawn beforehand, in float32 as the space has them.
+Sections, all of them by default:
 
-A row is the median over rounds of a reset and 128 steps (fewer where episodes are shorter), repeated until the row's
-share of ``--seconds`` is spent. What is dear is found out by three steps: where a single round would take more than
-six shares, the size is left out, and so are the larger ones. A size that is asked for by ``--size`` is measured
-whatever it costs.
+``environments``
+    The public ``step`` of ``gymnasium.make_vec(ID, num_envs=N)`` and of ``gymnasium.make(ID)`` (N = 1, with Gymnasium's
+    wrappers), with nothing but defaults and its share of a reset: millions of measurements a second. A step of
+    TightlyCoupledNavigation is ten measurements. Beside them Gymnasium's own CartPole in its native vector form, which
+    has four additions where these have a filter.
+``steps``
+    One step of 4096 episodes: the environment's own text compiled, by NumPy, by ``jax.jit`` where JAX is installed, and
+    filterpy's filters in a loop; beside them the time that the step's arithmetic alone takes in compiled code that does
+    nothing else (the floor).
+``evaluations``
+    ``filtergym.evaluate`` of ten competitors over 2000 episodes, with ``--large`` over 100,000.
+``scaling``
+    Time and peak memory of processes that evaluate one, two and four times as many episodes, competitors and
+    measurements, and step as many environments.
 
-Where other jobs share the processor, the rate by the clock on the wall drops below the rate by the time that the
-process was given; both are shown, and floors and ratios use the latter for both sides.
-
-**Floor.** Of what calls an array library: the elementwise operations of one public step, counted as torch dispatches
-them (additions, products, comparisons, selections: one each; square roots, exponentials, logarithms, angles: one
-function each; a matrix product: two per term), times the measured cost of one in NumPy on operands in the
-first-level cache: ``multiply`` for operations, ``exp`` for functions (the cheapest of them). Code that fuses
-operations in registers can pass this floor; code that calls the array library for each operation cannot. Of compiled
-steps: the operations and functions that are left in the programs of a step, times the cost of one in compiled
-programs that do nothing but add and multiply in registers, or nothing but exponentials. Neither counts the noise,
-resets, or what Python does around a step, which is all that matters at N = 1.
-
-**Peer.** See ``peer_imm.py``; the ratio is that of the rates in the same run.
-
-**Two versions** are compared by running this file with the Python of each, at the same time if others use the
-machine, and by dividing the rates in the two files that ``--json`` writes.
+One thread. Times are of the processor: what others on the machine take is left out, but not what they do to its
+caches, so take ratios. A figure is the median over rounds. Two versions are compared by running this file with the
+Python of each at the same time, and by dividing the figures in the files that ``--json`` writes.
 """
 
 import argparse
 import itertools
 import json
 import os
-import platform
+import resource
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy loads its BLAS
 
 import gymnasium
 import numpy
+import pandas
 import peer_imm
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Specialised
-from filtergym.compiler.program import Graph
+from filtergym.compiler.program import FUNCTIONS, Graph
 from filtergym.envs.backend import make_model
 from filtergym.envs.catalogue import catalogue
-from filtergym.envs.compiled import AVAILABLE
 from filtergym.envs.reward import cost_reward
 
 import filtergym
 
-try:
-    import torch
-    from torch.utils._python_dispatch import TorchDispatchMode
-except ImportError:
-    torch = None  # type: ignore[assignment]
-    TorchDispatchMode = object  # type: ignore[assignment, misc]
-
-STEPS = 128
-"""Steps of a round, at most: whole blocks of noise of the long episodes."""
-SIZES = (1, 256, 4096)
-DEFAULT_SIZES = (1, 16, 256, 4096)
-KERNEL: dict[str, Any] = {"decision_interval": 1, "reward": "cost"}
-"""With the first scenario: neither missed scans nor the steps of the paper's filter beside those of the agent, which
-the default scenario and reward of an environment may add.
-"""
-DEAR = 6.0
-"""Shares of the time that one round may take."""
-
-FUNCTIONS = {"sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "atan2", "atan", "asin", "acos"}
-FUNCTIONS |= {"tanh"}
-MOVES = {"cat", "stack", "clone", "copy_", "_to_copy", "zeros_like", "ones_like", "full_like", "new_zeros"}
-MOVES |= {"eye", "arange", "zeros", "ones", "full", "empty", "scalar_tensor", "index", "_local_scalar_dense"}
-PRODUCTS = {"mm", "bmm", "addmm", "baddbmm", "dot", "mv"}
+SIZES = (1, 16, 256, 4096, 65536)
+STEPS = 100
+"""Steps of a round, at most."""
+PEER = "CartPole-v1"
+EPISODES, MANY_EPISODES = 2000, 100_000
+COMPETITORS = (
+    "imm", "adaptive", "fixed-best", "kalman-imm", "kalman-imm-turn", "unscented-turn", "sage-husa",
+    "variational-bayes", "known-turn", "bptt",
+)  # fmt: skip
+Record = dict[str, Any]
 
 
-class Backend(NamedTuple):
-    """What an environment is made with."""
-
-    name: str
-    keywords: dict[str, Any]
-
-
-class Costs(NamedTuple):
-    """Seconds per number."""
-
-    operation: float
-    function: float
+def processor_seconds(call: Callable[[], object]) -> float:
+    """Time that this process was given for a call."""
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
 
 
-class Row(NamedTuple):
-    """One measured cell."""
-
-    environment: str
-    control: str
-    backend: str
-    size: int
-    """Number of sub-environments."""
-    rounds: int
-    step_seconds: float
-    """One call of ``step``, by the clock on the wall."""
-    rate: float
-    """Environment steps per second by the clock on the wall."""
-    processor_rate: float
-    """The same by the time that the process was given."""
-    floor: float | None
-    """Environment steps per second."""
-    times_peer: float | None
+def median_seconds(call: Callable[[], object], share: float, fewest: int = 3) -> float:
+    """Median time of a call over rounds that take ``share`` seconds together."""
+    call()  # compiles; warms caches and clocks
+    times: list[float] = []
+    while len(times) < fewest or sum(times) < share:
+        times.append(processor_seconds(call))
+    return statistics.median(times)
 
 
-class _Counter(TorchDispatchMode):
-    """Counts elementwise operations, functions and terms of matrix products as torch carries them out."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.operations = self.functions = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        name = func.overloadpacket.__name__
-        first = result[0] if isinstance(result, tuple | list) else result
-        if func.is_view or name in MOVES or not isinstance(first, torch.Tensor):
-            return result
-        if name in PRODUCTS:
-            factor = next(a for a in args if isinstance(a, torch.Tensor) and a.ndim > 1)
-            self.operations += 2 * first.numel() * factor.shape[-1]
-        elif name in FUNCTIONS:
-            self.functions += first.numel()
-        else:
-            self.operations += first.numel()
-        return result
+# --- environments
 
 
-def elementwise_costs() -> Costs:
-    """Costs of ``multiply`` and of ``exp`` on operands in the first-level cache."""
-    a, b = numpy.linspace(-1.0, 1.0, 1024), numpy.empty(1024)
+def step_seconds(env: Any, share: float) -> float:
+    """Median time of a step, with its share of a reset of all environments."""
+    env.action_space.seed(0)
+    actions = itertools.cycle([env.action_space.sample() for _ in range(8)])
+    length = getattr(env.unwrapped, "last_decision", 500)
+    count = min(STEPS, length)
 
-    def cost(operation: numpy.ufunc, *operands: numpy.ndarray) -> float:
-        def thousand() -> None:
-            for _ in range(1000):
-                operation(*operands, out=b)
+    def steps() -> None:
+        for _ in range(count):
+            env.step(next(actions))
 
-        return statistics.median(seconds(thousand)[1] for _ in range(21)) / (1000 * len(b))
+    env.reset(seed=0)
+    resets = [processor_seconds(env.reset) for _ in range(3)]
+    rounds = []
+    while len(rounds) < 3 or sum(rounds) < share:
+        rounds.append(processor_seconds(steps))
+        if sum(rounds) > 3.0 * share:
+            break
+    env.close()
+    return statistics.median(rounds) / count + statistics.median(resets) / length
 
-    return Costs(cost(numpy.multiply, a, a), cost(numpy.exp, a))
+
+def measure_environments(ids: list[str], sizes: list[int], share: float) -> Iterator[Record]:
+    """Step environments as users make them."""
+    for id in [*ids, PEER]:
+        interval = make_model(catalogue()[id]).task.decision_interval if id in catalogue() else 1
+        row: Record = {"environment": id.removeprefix("filtergym/")}
+        alone: Any = gymnasium.make(id, disable_env_checker=True)
+        row["one step, µs"] = 1e6 * step_seconds(_ResettingEnv(alone), share)
+        for size in sizes:
+            if id == "filtergym/TightlyCoupledNavigation-v0" and size > 4096:
+                continue  # gigabytes
+            native = {} if id in catalogue() else {"vectorization_mode": "vector_entry_point"}
+            seconds = step_seconds(gymnasium.make_vec(id, num_envs=size, **native), share)
+            row[f"N = {size}"] = 1e-6 * size * interval / seconds
+        yield row
 
 
-def compiled_costs() -> Costs:
-    """Costs of an addition or product, and of an exponential, in compiled programs that do nothing else."""
+class _ResettingEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A single environment that begins its next episode by itself."""
+
+    def step(self, action: Any) -> Any:
+        """Step, and reset where the episode is over."""
+        answer = self.env.step(action)
+        if answer[2] or answer[3]:
+            self.env.reset()
+        return answer
+
+
+# --- steps
+
+
+def compiled_costs() -> tuple[float, float]:
+    """Seconds of an addition or product, and of an exponential, in compiled programs that do nothing else."""
     chains, links, x = 16, 64, numpy.linspace(-1.0, 1.0, 16 * 8).reshape(16, 8)
 
     def arithmetic(x: Any) -> Any:
@@ -171,322 +151,173 @@ def compiled_costs() -> Costs:
         special = Specialised(function, Graph(), [x])
         call = special.bound([x], [numpy.empty((special.outputs[0].rows, 8))])
 
-        def thousand() -> None:
-            for _ in range(1000):
-                call(0, 8)
+        def thousand(width: int) -> Callable[[], None]:
+            def run() -> None:
+                for _ in range(1000):
+                    call(0, width)
 
-        def thousand_of_nothing() -> None:
-            for _ in range(1000):
-                call(0, 0)
+            return run
 
-        taken, empty = (
-            statistics.median(seconds(many)[1] for _ in range(21)) for many in (thousand, thousand_of_nothing)
-        )
-        return (taken - empty) / (1000 * 8 * count)
+        taken = median_seconds(thousand(8), 0.1) - median_seconds(thousand(0), 0.1)
+        return taken / (1000 * 8 * count)
 
-    return Costs(cost(arithmetic, chains * links), cost(exponentials, chains * 4))
+    return cost(arithmetic, chains * links), cost(exponentials, chains * 4)
 
 
-def compiled_floor(id: str, control: str, costs: Costs) -> float | None:
-    """Steps per second if a step took only the arithmetic of its programs."""
-    model: Any = make_model(catalogue()[id], control, backend="auto")
-    if model.backend != "compiled":
-        return None
+def floor_seconds(model: Any) -> float:
+    """Seconds of the arithmetic that is left in the programs of a compiled step of one episode."""
     parts = model.programs.later
-    halves = [parts.act, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
-    names = [step.operation for special in halves for step in special.program.steps]
-    functions = sum(name in FUNCTIONS or name == "pow" for name in names)
-    operations = sum(name not in ("input", "constant") for name in names) - functions
-    return 1.0 / (operations * costs.operation + functions * costs.function)
+    programs = [parts.update, parts.advance, parts.predict, model.programs.report_program(cost_reward)]
+    names = [step.operation for special in programs for step in special.program.steps]
+    functions = sum(name in FUNCTIONS for name in names)
+    operation, function = compiled_costs()
+    return (
+        sum(name not in ("input", "constant") for name in names) - functions
+    ) * operation + functions * function
 
 
-def arithmetic_floor(id: str, control: str, costs: Costs) -> float | None:
-    """Steps per second if a step took only its elementwise operations."""
-    if torch is None:
-        return None
-    lanes, counter = 64, _Counter()
-    env = gymnasium.make_vec(id, num_envs=lanes, control=control, decision_interval=1, backend="torch")
-    env.action_space.seed(0)
-    action = torch.as_tensor(env.action_space.sample())
-    with torch.no_grad():
-        env.reset(seed=0)
-        env.step(action)
-        with counter:
-            env.step(action)
-    env.close()
-    return lanes / (counter.operations * costs.operation + counter.functions * costs.function)
+def measure_steps(ids: list[str], share: float, size: int = 4096) -> Iterator[Record]:
+    """Step by the compiled backend, by NumPy, by JAX, and by filterpy."""
+    try:
+        import jax  # noqa: F401
+        import peer_jax
+    except ImportError:
+        peer_jax = None  # type: ignore[assignment]
+        print("without JAX: pip install jax")
+    for id in ids:
+        for control in catalogue()[id].controls:
+            row: Record = {"environment": id.removeprefix("filtergym/"), "control": control}
+            keywords: Record = {"control": control, "reward": "cost", "decision_interval": 1}
+            few = 256 if id == "filtergym/TightlyCoupledNavigation-v0" else size
+            for backend in ("compiled", "numpy"):
+                env = gymnasium.make_vec(id, num_envs=few, backend=backend, **keywords)
+                row[f"{backend}, ns"] = 1e9 * step_seconds(env, share) / few
+            if peer_jax is not None and few == size:
+                try:
+                    step = peer_jax.jitted_step(id, control, few, decision_interval=1)
+                    row["jax.jit, ns"] = 1e9 * median_seconds(step, share) / few
+                except (TypeError, NotImplementedError):  # what jax.numpy lacks
+                    pass
+            if id == peer_imm.PEER_OF and control != "gain":
+                row["filterpy, ns"] = 1e9 / peer_imm.imm_steps_per_second(500)
+            row["floor, ns"] = 1e9 * floor_seconds(make_model(catalogue()[id], control, backend="compiled"))
+            yield row
 
 
-def seconds(call: Callable[[], object]) -> tuple[float, float]:
-    """Time of a call by the clock on the wall, and time that the process was given for it."""
-    begin, begin_processor = time.perf_counter(), time.process_time()
-    call()
-    return time.perf_counter() - begin, time.process_time() - begin_processor
+# --- evaluations
 
 
-class Episodes(NamedTuple):
-    """What is timed."""
-
-    start: Callable[[], object]
-    steps: Callable[[int], object]
-    """Takes a number of steps."""
-    length: int
-    """Steps of an episode, the one that resets included."""
-
-
-def paper_scenario(id: str) -> str:
-    """Return the name of the first scenario of an environment."""
-    return next(iter(catalogue()[id].scenarios))
-
-
-def single(id: str, control: str, backend: dict[str, Any]) -> Episodes:
-    """Episodes of ``gymnasium.make``."""
-    env: Any = gymnasium.make(id, control=control, scenario=paper_scenario(id), **KERNEL, **backend)
-    env.action_space.seed(0)
-    action = env.action_space.sample()
-
-    def steps(count: int) -> None:
-        for _ in range(count):
-            env.step(action)
-
-    env.reset(seed=0)
-    return Episodes(env.reset, steps, env.unwrapped.fleet.decisions_per_episode)
+def measure_evaluations(id: str, episodes: int, share: float) -> Iterator[Record]:
+    """Evaluate competitors one by one, then all together."""
+    horizon = make_model(catalogue()[id]).task.horizon
+    few = min(episodes, EPISODES)
+    for name in COMPETITORS:
+        seconds = median_seconds(lambda name=name: filtergym.evaluate(id, name, episodes=few), share)  # type: ignore[misc]
+        yield {
+            "competitor": name,
+            "episodes": few,
+            "seconds": seconds,
+            "ns a measurement": 1e9 * seconds / few / horizon,
+        }
+    seconds = processor_seconds(lambda: filtergym.evaluate(id, COMPETITORS, episodes=episodes))
+    per = 1e9 * seconds / (len(COMPETITORS) * episodes * horizon)
+    yield {"competitor": "all ten", "episodes": episodes, "seconds": seconds, "ns a measurement": per}
 
 
-def vector(id: str, control: str, size: int, backend: dict[str, Any]) -> Episodes:
-    """Return the same of ``gymnasium.make_vec``; without a control, with nothing but its defaults."""
-    keywords = {"control": control, "scenario": paper_scenario(id), **KERNEL, **backend} if control else {}
-    env: Any = gymnasium.make_vec(id, num_envs=size, **keywords)
-    env.action_space.seed(0)
-    actions = [env.action_space.sample() for _ in range(8)]
-    if backend.get("backend") == "torch":
-        actions = [torch.as_tensor(action, device=backend["device"]) for action in actions]
+# --- scaling
 
-    def steps(count: int) -> None:
-        for action in itertools.islice(itertools.cycle(actions), count):
-            observation, reward, *_ = env.step(action)
-        float(observation[0, 0] + reward[0])  # waits for a device that runs behind
-
-    env.reset(seed=0)  # later resets go on with the same generators, as an autoreset does
-    return Episodes(env.reset, steps, env.unwrapped.last_decision + 1)
+_EVALUATE = "filtergym.evaluate({id!r}, {names!r}, episodes={episodes}, horizon={horizon})"
+_STEP = (
+    "env = gymnasium.make_vec({id!r}, num_envs={size}); env.reset(seed=0); a = env.action_space.sample()\n"
+    "for _ in range(200): env.step(a)"
+)
 
 
-def measure(episodes: Episodes, share: float, dearest: float) -> tuple[list[tuple[float, float]], float]:
-    """Times of a step in several rounds, and what a round was expected to take, all in seconds.
-
-    Args:
-        episodes: to time.
-        share: time for all rounds; there is at least one.
-        dearest: expected time of a round from which on none is made.
-    """
-    count = min(STEPS, episodes.length - 1)
-    episodes.start()
-    episodes.steps(2)  # compile; warm caches and clocks
-    expected = seconds(episodes.start)[0] + count * seconds(lambda: episodes.steps(1))[0]
-    rounds: list[tuple[float, float]] = []
-    begin = time.perf_counter()
-    while expected <= dearest and (not rounds or time.perf_counter() - begin < share):
-        reset, steps = seconds(episodes.start), seconds(lambda: episodes.steps(count))
-        times = [s / count + r / episodes.length for r, s in zip(reset, steps, strict=True)]
-        rounds.append((times[0], times[1]))
-    return rounds, expected
-
-
-def _millions(rate: float | None) -> str:
-    return "-" if rate is None else f"{rate / 1e6:.3g}"
-
-
-def _line(*columns: str) -> None:
-    widths = (28, 9, 13, 6, 9, 9, 13, 8, 7, 7)
-    aligned = (
-        f"{text:<{width}}" if i < 3 else f"{text:>{width}}"
-        for i, (text, width) in enumerate(zip(columns, widths, strict=True))
+def run_apart(code: str) -> tuple[float, float]:
+    """Processor seconds and peak memory in MB of the last of two runs of some code in a process of its own."""
+    # Not getrusage: what it says of a process begins with the memory of the one that started it.
+    program = (
+        "import re, pathlib, time, gymnasium, numpy, filtergym\ndef run():\n    "
+        + code.replace("\n", "\n    ")
+        + "\nrun()\nbegin = time.process_time()\nrun()\n"
+        "peak = re.search('VmHWM:.*?(\\d+)', pathlib.Path('/proc/self/status').read_text()).group(1)\n"
+        "print(time.process_time() - begin, peak)"
     )
-    print(" ".join(aligned), flush=True)
+    answer = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
+    return float(answer[0]), float(answer[1]) / 1024
 
 
-def _show(row: Row) -> None:
-    _line(
-        row.environment.removeprefix("filtergym/"),
-        row.control,
-        row.backend,
-        str(row.size),
-        f"{1e6 * row.step_seconds:.0f}",
-        _millions(row.rate),
-        _millions(row.processor_rate),
-        _millions(row.floor),
-        "-" if row.floor is None else f"{row.processor_rate / row.floor:.0%}",
-        "-" if row.times_peer is None else f"{row.times_peer:.0f}",
-    )
+def measure_scaling(id: str) -> Iterator[Record]:
+    """Do one, two and four times as much."""
+    names = [name for name in COMPETITORS if name != "bptt"][:8]
+    usual: Record = {"id": id, "names": names[:2], "episodes": 2000, "horizon": 100}
+    kinds: dict[str, Callable[[int], str]] = {
+        "episodes": lambda k: _EVALUATE.format(**{**usual, "episodes": 2000 * k}),
+        "competitors": lambda k: _EVALUATE.format(**{**usual, "names": names[: 2 * k]}),
+        "measurements": lambda k: _EVALUATE.format(**{**usual, "horizon": 100 * k}),
+        "environments": lambda k: _STEP.format(id=id, size=4096 * k),
+    }
+    for what, code in kinds.items():
+        found = {k: run_apart(code(k)) for k in (1, 2, 4)}
+        row: Record = {"more": what, **{f"seconds x {k}": seconds for k, (seconds, _) in found.items()}}
+        row |= {f"MB x {k}": memory for k, (_, memory) in found.items()}
+        yield {**row, "time 4 : 2": found[4][0] / found[2][0], "memory 4 : 2": found[4][1] / found[2][1]}
 
 
-def defaults(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[Row]:
-    """Measure ``gymnasium.make_vec`` with nothing but its defaults; the fastest of three alternated medians counts.
-
-    A cell of which one round takes longer than its share is measured once.
-    """
-    cells = [(id, size) for id in ids for size in sorted(sizes or DEFAULT_SIZES)]
-    share = total / (3 * len(cells))
-    taken: dict[tuple[str, int], list[tuple[float, float]]] = {cell: [] for cell in cells}
-    dear = set()
-    for id, size in 3 * cells:
-        if (id, size) not in dear:
-            rounds, expected = measure(vector(id, "", size, {}), share, float("inf"))
-            wall, processor = (statistics.median(times) for times in zip(*rounds, strict=True))
-            taken[id, size].append((wall, processor))
-            dear |= {(id, size)} if expected > share else set()
-    for (id, size), times in taken.items():
-        wall, processor = (min(kind) for kind in zip(*times, strict=True))
-        yield Row(id, "", "defaults", size, len(times), wall, size / wall, size / processor, None, None)
+def show(title: str, rows: Iterator[Record], kept: dict[str, list[Record]]) -> None:
+    """Collect the rows of a section and print them as a Markdown table."""
+    kept[title] = []
+    for row in rows:
+        kept[title].append(row)
+        print(f"  {title}: {next(iter(row.values()))} ...", file=sys.stderr, flush=True)
+    table = pandas.DataFrame(kept[title])
+    texts = [[_cell(value) for value in line] for line in table.to_numpy(dtype=object).tolist()]
+    print(f"\n{title}\n\n| {' | '.join(table.columns)} |\n|{'---|' * len(table.columns)}")
+    print("\n".join(f"| {' | '.join(line)} |" for line in texts), flush=True)
 
 
-def markdown_of_defaults(rows: list[Row]) -> Iterator[str]:
-    """Table of a page: what users get."""
-    mine = [row for row in rows if not row.control]
-    sizes = sorted({row.size for row in mine})
-    yield f"| environment | {' | '.join(f'N = {size}' for size in sizes)} |"
-    yield "|" + "---|" * (len(sizes) + 1)
-    for id in dict.fromkeys(row.environment for row in mine):
-        rates = (f"{row.processor_rate / 1e6:.3g}" for row in mine if row.environment == id)
-        yield f"| {id.removeprefix('filtergym/')} | {' | '.join(rates)} |"
-
-
-def measured(ids: list[str], sizes: list[int] | None, total: float) -> Iterator[Row]:
-    """Measure every environment and control; rows come as they are measured."""
-    backends = [Backend("numpy", {"backend": "numpy"})]
-    if AVAILABLE:
-        backends.insert(0, Backend("compiled", {"backend": "compiled"}))
-    on_arrays = len(backends)
-    if torch is not None:
-        torch.set_num_threads(1)
-        devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
-        backends += [Backend(f"torch {d}", {"backend": "torch", "device": d}) for d in devices]
-    cells = [(id, control) for id in ids for control in catalogue()[id].controls]
-    share = total / (len(cells) * (on_arrays + len(backends) * len(sizes or SIZES)))
-    dearest = DEAR * share if sizes is None else float("inf")
-    costs = elementwise_costs()
-    native = compiled_costs() if AVAILABLE else costs
-    peer_runs: list[float] = []
-    for id, control in cells:
-        floors = {"compiled": compiled_floor(id, control, native)}
-        array_floor = arithmetic_floor(id, control, costs)
-        has_peer = id == peer_imm.PEER_OF and control != "gain"
-        if has_peer:  # before every control, so that the peer meets the same disturbances
-            peer_runs += [peer_imm.imm_steps_per_second(500) for _ in range(3)]
-
-        def row(
-            backend: str,
-            size: int,
-            rounds: list[tuple[float, float]],
-            id: str = id,
-            control: str = control,
-            floors: dict[str, float | None] = floors,
-            array_floor: float | None = array_floor,
-            peer: float | None = statistics.median(peer_runs) if has_peer else None,
-        ) -> Row:
-            wall, processor = (statistics.median(times) for times in zip(*rounds, strict=True))
-            floor = floors.get(backend.removeprefix("make "), array_floor)
-            if "cuda" in backend:  # the time of the processor is not that of the device
-                processor, floor = wall, None
-            rate = size / processor
-            times_peer = rate / peer if peer else None
-            return Row(id, control, backend, size, len(rounds), wall, size / wall, rate, floor, times_peer)
-
-        for backend in backends[:on_arrays]:
-            rounds, _ = measure(single(id, control, backend.keywords), share, float("inf"))
-            yield row(f"make {backend.name}", 1, rounds)
-        for backend in backends:
-            for size in sorted(sizes or SIZES):
-                rounds, expected = measure(vector(id, control, size, backend.keywords), share, dearest)
-                if not rounds:
-                    short = id.removeprefix("filtergym/")
-                    print(
-                        f"{short} {control} {backend.name}: N = {size} is left out, a round takes "
-                        f"{expected:.0f} s; ask for it with --size",
-                        flush=True,
-                    )
-                    break
-                yield row(backend.name, size, rounds)
-    for name, found in (("NumPy", costs), ("compiled", native)):
-        print(
-            f"{name}: {1e9 * found.operation:.3g} ns per operation, {1e9 * found.function:.3g} ns per exp, in cache."
-        )
-    if peer_runs:
-        rate = statistics.median(peer_runs)
-        print(f"Peer, filterpy IMMEstimator in a loop: {rate:.0f} steps per second of processor time.")
-
-
-def markdown(rows: list[Row]) -> Iterator[str]:
-    """Table of a page: a line for each environment, control and backend."""
-    sizes = sorted({row.size for row in rows})
-    head = ["environment", "control", "backend", "one step of `gymnasium.make`, µs"]
-    head += [*(f"N = {size}" for size in sizes), "share of the floor", "times the peer"]
-    yield f"| {' | '.join(head)} |"
-    yield "|" + "---|" * len(head)
-    kinds = dict.fromkeys((r.environment, r.control, r.backend.removeprefix("make ")) for r in rows)
-    for environment, control, backend in kinds:
-        mine = [r for r in rows if (r.environment, r.control) == (environment, control)]
-        alone = [f"{1e6 * r.step_seconds:.0f}" for r in mine if r.backend == f"make {backend}"]
-        vectors = {r.size: r for r in mine if r.backend == backend}
-        largest = vectors[max(vectors)]
-        share = "" if largest.floor is None else f"{largest.processor_rate / largest.floor:.0%}"
-        peer = "" if largest.times_peer is None else f"{largest.times_peer:.0f}"
-        rates = [f"{vectors[size].processor_rate / 1e6:.3g}" if size in vectors else "" for size in sizes]
-        name = environment.removeprefix("filtergym/")
-        yield f"| {' | '.join([name, control, backend, *(alone or ['']), *rates, share, peer])} |"
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return "" if numpy.isnan(value) else f"{value:.3g}" if value < 1e5 else f"{value:,.0f}"
+    return str(value)
 
 
 def main() -> None:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description="Throughput of the environments.")
+    sections = ("environments", "steps", "evaluations", "scaling")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("section", nargs="*", choices=[*sections, []], help="what to time (default: all)")
     parser.add_argument("--environment", action="append", metavar="ID", help="only this one; may be repeated")
     parser.add_argument("--size", action="append", type=int, metavar="N", help="only this N; may be repeated")
-    parser.add_argument(
-        "--seconds", type=float, default=120.0, help="time for all rounds together (default 120)"
-    )
-    parser.add_argument("--defaults", action="store_true", help="only what users get, not the kernel")
+    parser.add_argument("--seconds", type=float, default=0.5, help="for the rounds of a figure (default 0.5)")
+    parser.add_argument("--large", action="store_true", help=f"evaluate {MANY_EPISODES:,} episodes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the rows to this file")
-    parser.add_argument("--markdown", action="store_true", help="end with a table of rates for a page")
-    arguments = parser.parse_args()
-    ids = arguments.environment or list(catalogue())
-    unknown = [id for id in ids if id not in catalogue()]
-    if unknown:
+    chosen = parser.parse_args()
+    ids = chosen.environment or list(catalogue())
+    if unknown := [id for id in ids if id not in catalogue()]:
         parser.error(f"unknown environment {unknown[0]!r}: choose from {', '.join(catalogue())}")
-    if any(size < 1 for size in arguments.size or ()):
-        parser.error("--size must be at least 1")
-    if not arguments.seconds > 0.0:
-        parser.error("--seconds must be positive")
+    if any(size < 1 for size in chosen.size or ()) or not chosen.seconds > 0.0:
+        parser.error("--size and --seconds must be positive")
     filtergym.register()
-    begin, rows = time.perf_counter(), []
-    print("One thread; rates in millions of environment steps per second.")
-    _line(
-        "environment",
-        "control",
-        "backend",
-        "N",
-        "step, µs",
-        "rate",
-        "by processor",
-        "floor",
-        "share",
-        "× peer",
-    )
-    share = arguments.seconds / (1 if arguments.defaults else 4)
-    found = defaults(ids, arguments.size, share)
-    kernel = iter(()) if arguments.defaults else measured(ids, arguments.size, arguments.seconds - share)
-    for row in itertools.chain(found, kernel):
-        _show(row)
-        rows.append(row)
-    print(f"Measured in {time.perf_counter() - begin:.0f} s.")
-    if arguments.markdown:
-        print(*markdown_of_defaults(rows), "", sep="\n")
-        if not arguments.defaults:
-            print(*markdown([row for row in rows if row.control]), sep="\n")
-    if arguments.json:
-        versions = {"python": platform.python_version(), "numpy": numpy.__version__}
-        versions |= {} if torch is None else {"torch": torch.__version__}
-        document = {"versions": versions, "rows": [row._asdict() for row in rows]}
-        arguments.json.write_text(json.dumps(document, indent=1) + "\n")
+    kept: dict[str, list[Record]] = {}
+    wanted = chosen.section or sections
+    if "environments" in wanted:
+        show("environments", measure_environments(ids, chosen.size or list(SIZES), chosen.seconds), kept)
+    if "steps" in wanted:
+        show("steps", measure_steps(ids, chosen.seconds), kept)
+    if "evaluations" in wanted:
+        episodes = MANY_EPISODES if chosen.large else EPISODES
+        show("evaluations", measure_evaluations(peer_imm.PEER_OF, episodes, chosen.seconds), kept)
+    if "scaling" in wanted:
+        show("scaling", measure_scaling(peer_imm.PEER_OF), kept)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"\nNumPy {numpy.__version__}, Gymnasium {gymnasium.__version__}; peak memory {memory:.0f} MB")
+    if chosen.json:
+        chosen.json.write_text(json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,50 @@
+"""Peer of the compiled steps: the text of an environment's own step on ``jax.numpy``, under ``jax.jit``.
+
+It computes what a compiled step computes (world, filter, reward, observation), in float64, from noise that is given.
+JAX is no dependency of the project: ``pip install jax``.
+"""
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+import numpy
+from filtergym.compiler.functions import map_arrays
+from filtergym.envs.catalogue import import_task, make_task
+from filtergym.envs.compiled import step_episodes
+from filtergym.envs.lanes import Lanes
+from filtergym.envs.model import Model
+
+
+def jitted_step(id: str, control: str, size: int, **keywords: Any) -> Callable[[], None]:
+    """Return one step of ``size`` episodes under ``jax.jit``, compiled already; it waits for its results.
+
+    Raises:
+        ImportError: without JAX.
+    """
+    import jax
+    import jax.numpy
+
+    jax.config.update("jax_enable_x64", True)
+    # Arrays that are traced say where they are, so that constants can be put beside them; on the processor: nowhere.
+    jax.core.Tracer.device = None
+    cls = import_task(id)
+    lanes = Lanes(Model(make_task(cls, **keywords), control), size)
+    for lane, generator in enumerate(numpy.random.default_rng(0).spawn(size)):
+        lanes.seed(lane, generator)
+    lanes.restart()
+    model = Model(make_task(cls, xp=jax.numpy, **keywords), control)
+    shape = model.action_space.shape
+    given = map_arrays(
+        lambda values: jax.numpy.asarray(numpy.asarray(values)[..., :size]),
+        (lanes.state, numpy.full((*(shape or ()), size), 0.1 if shape else 0), lanes.next_row()),
+    )
+    step = jax.jit(lambda episode, action, noise: step_episodes("cost", model, episode, action, noise))
+
+    def once() -> None:
+        jax.block_until_ready(step(*given))
+
+    once()
+    return once
