@@ -35,14 +35,14 @@ def with_interval(record: Any, scale: float = 1.0, digits: int = 3, negligible: 
     if record is None or record.value is None:
         return "-"
 
-    def text(value: float) -> str:
+    def text(value: float, form: str = "#") -> str:
         value *= scale
         if abs(value) < negligible:
             return "0"
-        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:#.{digits}g}".rstrip(".")
+        return f"{value:,.0f}" if abs(value) >= 10.0**digits else f"{value:{form}.{digits}g}".rstrip(".")
 
     if record.low is None or record.low == record.high:
-        return f"{record.value * scale:.{digits}g}"
+        return text(record.value, "")
     return f"{text(record.value)} [{text(record.low)}, {text(record.high)}]"
 
 
