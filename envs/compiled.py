@@ -6,7 +6,6 @@ further where episodes are only stepped: it keeps the episodes in its own memory
 
 import copy
 import functools
-import importlib.util
 import itertools
 import traceback
 import warnings
@@ -30,17 +29,16 @@ from ..compiler.functions import (
     run_over,
 )
 from ..compiler.namespace import NotTraceable
+from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
 from .draws import Draws
+from .episode_noise import EpisodeNoise
 from .filter import Filter, Input
 from .model import Episode, Model
-from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
 from .task import Task
 
-AVAILABLE = importlib.util.find_spec("llvmlite") is not None
-"""Whether steps can be compiled here."""
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
 PROGRAM_CACHE_SIZE = 8
@@ -420,7 +418,7 @@ class Stepper:
         update, advance, predict, episode = model.programs.later
         tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
-        self.width, self._threads, self._model = width, model.threads, model
+        self.width, self._threads, self._model, self._report = width, model.threads, model, report
         count = itertools.count()
         self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -439,7 +437,7 @@ class Stepper:
                 second[i] = first[i]
         self._copies = (first, second)
         written = memory(update.outputs)
-        nothing = numpy.zeros((advance.inputs[-1].rows, width))
+        row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
         world, start = model.programs.start
         self._drawn = memory(world.inputs)
@@ -456,7 +454,7 @@ class Stepper:
                 (
                     update.bound(given, written),
                     tell.bound([*truth, *measurement, *updated[:states]], self._reported),
-                    advance.bound([*truth, *updated[states:], nothing], ahead),
+                    advance.bound([*truth, *updated[states:], row], ahead),
                     predict.bound([*updated[:states], *ahead[truths:]], predicted),
                 )
             )
@@ -464,11 +462,13 @@ class Stepper:
                 (
                     world.bound(self._drawn, [*truth, *initial]),
                     start.bound([*initial, *(truth if knows else [])], written),
-                    begun.advance.bound([*truth, *written[states:], nothing], ahead),
+                    begun.advance.bound([*truth, *written[states:], row], ahead),
                     begun.predict.bound([*written[:states], *ahead[truths:]], predicted),
                 )
             )
         self._now = 0
+        self._small: dict[int, Stepper] = {}
+        """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
@@ -478,19 +478,11 @@ class Stepper:
         if shown is not None:
             self._shown[...] = shown.T
 
-    def replace(self, episode: Episode, lanes: numpy.ndarray) -> None:
-        """Put the first episodes of others in place of those in some lanes."""
-        for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
-            memory[..., lanes] = values[..., : len(lanes)]
-        if self._given:
-            self._show_in(self._shown.copy())
-        self._shown[lanes] = self._model.observe(episode)[:, : len(lanes)].T
-
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
         return _copy_numbers(self._template, self._copies[self._now], self._kinds)
 
-    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: NoiseRing) -> None:
+    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise) -> None:
         """Start new episodes everywhere and let their first measurement arrive.
 
         Args:
@@ -502,18 +494,40 @@ class Stepper:
             memory[...] = values
         self._run(self._begin[self._now], noise)
 
+    def begin_some(
+        self, lanes: numpy.ndarray, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise
+    ) -> None:
+        """Start new episodes in some lanes and let their first measurement arrive.
+
+        Args:
+            lanes: which.
+            uniforms: theirs, padded to the width of ``noise``, likewise what follows.
+            normals: as in :meth:`begin`.
+            noise: of these episodes.
+        """
+        small = self._small.get(noise.width)
+        if small is None:
+            small = self._small[noise.width] = Stepper(self._model, self._report, noise.width)
+        small.begin(uniforms, normals, noise)
+        for memory, values in zip(self._copies[self._now], small._copies[small._now], strict=True):
+            memory[..., lanes] = values[..., : len(lanes)]
+        if self._given:
+            self._show_in(self._shown.copy())
+        self._shown[lanes] = small._shown[: len(lanes)]
+
     def take(self, action: numpy.ndarray) -> None:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
-    def step(self, noise: NoiseRing) -> None:
+    def step(self, noise: EpisodeNoise) -> None:
         """Apply the action and go on to the next measurement."""
         self._run(self._calls[self._now], noise)
 
-    def _run(self, calls: tuple[Call, ...], noise: NoiseRing) -> None:
+    def _run(self, calls: Sequence[Call], noise: EpisodeNoise) -> None:
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         calls[2].table[self._row_entry] = noise.address
+        calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
         if self.width <= TILE:
             for call in calls:
