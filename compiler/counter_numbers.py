@@ -124,10 +124,11 @@ class Machine(Protocol):
 def philox(counter: tuple[Any, Any, Any, Any], key: tuple[Any, Any]) -> tuple[Any, Any, Any, Any]:
     """Four words of Philox4x32-10; words are whole numbers of 64 bits below 2^32."""
     (c0, c1, c2, c3), (k0, k1) = counter, key
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
+        if number > 0:
+            k0, k1 = (k0 + KEY_STEPS[0]) & LOW, (k1 + KEY_STEPS[1]) & LOW
         a, b = c0 * MULTIPLIERS[0], c2 * MULTIPLIERS[1]
         c0, c1, c2, c3 = (b >> 32) ^ c1 ^ k0, b & LOW, (a >> 32) ^ c3 ^ k1, a & LOW
-        k0, k1 = (k0 + KEY_STEPS[0]) & LOW, (k1 + KEY_STEPS[1]) & LOW
     return c0, c1, c2, c3
 
 

@@ -431,11 +431,18 @@ class Stepper:
         self._shown, self._given = numpy.empty((width, *predict.outputs[-1].shape)), False
         self._reported = memory(tell.outputs)
         # Episodes go to and fro between two copies, which share what stays as it is.
-        first, second = (memory([*advance.outputs, *predict.outputs[:-1]]) for _ in range(2))
-        for i, same in enumerate(advance.same):
-            if same is not None:
-                second[i] = first[i]
-        self._copies = (first, second)
+        outputs = [*advance.outputs, *predict.outputs[:-1]]
+        stays = [i < len(advance.same) and advance.same[i] is not None for i in range(len(outputs))]
+        self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
+        self._going: list[numpy.ndarray] = []
+        """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
+        copies = []
+        for _ in range(2):
+            numbers, going = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if not s], width)
+            self._going.append(numbers)
+            shared, own = iter(staying), iter(going)
+            copies.append([next(shared if s else own) for s in stays])
+        self._copies = first, second = copies
         written = memory(update.outputs)
         row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
@@ -509,8 +516,11 @@ class Stepper:
         if small is None:
             small = self._small[noise.width] = Stepper(self._model, self._report, noise.width)
         small.begin(uniforms, normals, noise)
-        for memory, values in zip(self._copies[self._now], small._copies[small._now], strict=True):
-            memory[..., lanes] = values[..., : len(lanes)]
+        for numbers, begun in (
+            (self._staying, small._staying),
+            (self._going[self._now], small._going[small._now]),
+        ):
+            numbers[:, lanes] = begun[:, : len(lanes)]
         if self._given:
             self._show_in(self._shown.copy())
         self._shown[lanes] = small._shown[: len(lanes)]
@@ -675,6 +685,14 @@ def filter_stepper(model: Model, report: Report, width: int) -> FilterStepper | 
     """Return what steps the filter of a model alone."""
     kind = FilterStepper if can_step(model, report) else ModelFilterStepper
     return kind(model, report, width)
+
+
+def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
+    """Memory of all numbers of some arrays, ``(numbers, width)``, and the arrays in it, ``(..., width)``."""
+    numbers = empty_lanes((sum(leaf.rows for leaf in arrays),), width)
+    starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
+    parts = zip(arrays, starts, strict=False)
+    return numbers, [numbers[at : at + leaf.rows].reshape(*leaf.shape, width) for leaf, at in parts]
 
 
 def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy
 
 from ..compiler.counter_numbers import numbers
-from ..compiler.functions import Call, empty_lanes, round_up_lanes
+from ..compiler.functions import Call, address_of, empty_lanes, round_up_lanes
 from ..compiler.native import AVAILABLE
 from .observation import Array
 from .task import NoiseLayout, Task
@@ -94,6 +94,7 @@ class EpisodeNoise:
         """Forget what follows from identities and measurements."""
         self._start: Call | None = None
         self._next: Call | None = None
+        self._address = 0
         self._due = False
         """Whether the numbers of the measurement that is gone on to are still to be made."""
         self._row: Array = None
@@ -166,12 +167,12 @@ class EpisodeNoise:
         if not self._due:
             return ()
         self._due = False
-        return (self._next_call(),)
+        return (self._next or self._next_call(),)
 
     @property
     def address(self) -> int:
         """Address of the memory that :meth:`calls` write, rows apart as those of :func:`empty_lanes`."""
-        return int(self._next_call().table[5])
+        return self._address or address_of(self._next_call().arrays[2])
 
     def _copied_from_code(self) -> numpy.ndarray:
         for call in self.calls():
@@ -180,7 +181,8 @@ class EpisodeNoise:
 
     def _next_call(self) -> Call:
         if self._next is None:
-            self._next = self._bind(empty_lanes((self._rows,), self.width), self._layout.normals)
+            memory = empty_lanes((self._rows,), self.width)
+            self._next, self._address = self._bind(memory, self._layout.normals), address_of(memory)
         return self._next
 
     def _bind(self, rows: numpy.ndarray, normals: int) -> Call:

@@ -1,7 +1,7 @@
-"""The engine: episodes of a model side by side, each fixed by its own generator.
+"""The engine: episodes of a model side by side, each fixed by its identity.
 
-A *lane* is one episode after another, fed by one generator. Both Gymnasium faces and the evaluation drive
-this class; it owns the noise and knows nothing of spaces or autoreset.
+A *lane* is one episode after another, whose identities one generator draws (:mod:`.episode_noise`). Both Gymnasium
+faces and the evaluation drive this class; it owns the noise and knows nothing of spaces or autoreset.
 
 **Bit equality.** The batch is padded to a multiple of eight lanes, also for one episode: BLAS chooses its
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
