@@ -421,7 +421,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
             the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture,
             ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these weights from
-            the episode's generator.
+            ``np_random``.
         reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative", see :mod:`.reward`; default: the
             environment's own, and zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".

@@ -113,7 +113,7 @@ class EpisodeNoise:
     def draw_identities(self, lanes: Sequence[int]) -> numpy.ndarray:
         """Draw the identities of new episodes of some lanes, ``(2, lanes)``."""
         generators = self.generators
-        return numpy.array([draw_identity(generators[lane]) for lane in lanes], dtype=numpy.uint64).T
+        return numpy.concatenate([draw_identity(generators[lane]) for lane in lanes]).reshape(-1, 2).T
 
     def begin(self, identities: numpy.ndarray) -> tuple[numpy.ndarray, numpy.ndarray]:
         """Begin episodes in the first lanes, and go on to their first measurement.
