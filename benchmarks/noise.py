@@ -10,13 +10,14 @@ import argparse
 import time
 from collections.abc import Callable
 
-import filtergym  # noqa: F401  (registers the environments)
 import gymnasium
 import numpy
 from filtergym.compiler.counter_code import bind_numbers
 from filtergym.compiler.counter_numbers import numbers
 from filtergym.compiler.functions import empty_lanes
 from filtergym.envs.episode_noise import draw_identity, identities_of_seeds
+
+import filtergym  # noqa: F401  (registers the environments)
 
 ID = "filtergym/ManeuveringTarget-v0"
 RUNS = 9
