@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -12,6 +13,8 @@ from .emission import emit
 from .library import Library, fastest
 from .program import LOCK, Program
 
+AVAILABLE = importlib.util.find_spec("llvmlite") is not None
+"""Whether programs can be compiled here."""
 _ENGINES: list[Any] = []
 """What owns the code; it is never given back, as somebody may be about to call it."""
 
@@ -78,16 +81,33 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
         known = cache.key(repr((program.steps, program.results, list(lane_first), library)), name, features)
         if known not in _LIBRARIES:
-            text = emit(program, lane_first, library)
-            version = ".".join(map(str, binding.llvm_version_info))
-            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), library)
+            for own in library.functions.values():
+                binding.add_symbol(own.symbol, own.address)
+            _LIBRARIES[known] = _load(emit(program, lane_first, library), name, features)
         return _LIBRARIES[known]
 
 
-def _load(text: str, key: str, library: Library) -> Native:
+def native_text(text: str) -> Native:
+    """Return code of a text that calls no function: only what every processor computes alike.
+
+    Args:
+        text: of LLVM, with an entry ``@program(table, first, last)``.
+
+    Raises:
+        ImportError: without llvmlite.
+    """
+    with LOCK:
+        name, features = processor()
+        known = cache.key(text, name, features)
+        if known not in _LIBRARIES:
+            _LIBRARIES[known] = _load(text, name, features)
+        return _LIBRARIES[known]
+
+
+def _load(text: str, name: str, features: str) -> Native:
+    """Translate a text, or find it in the cache."""
     binding = llvm()
-    for own in library.functions.values():
-        binding.add_symbol(own.symbol, own.address)
+    key = cache.key(text, name, features, ".".join(map(str, binding.llvm_version_info)))
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(text)
