@@ -80,14 +80,27 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         if known not in _LIBRARIES:
             text = emit(program, lane_first, library)
             version = ".".join(map(str, binding.llvm_version_info))
-            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), library)
+            for own in library.functions.values():
+                binding.add_symbol(own.symbol, own.address)
+            signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), signature)
         return _LIBRARIES[known]
 
 
-def _load(text: str, key: str, library: Library) -> Native:
+def load_function(text: str, signature: Any) -> Any:
+    """Return the function ``@program`` of a text of LLVM that calls nothing by its name.
+
+    Args:
+        text: that defines it.
+        signature: of ctypes.
+    """
+    with LOCK:
+        version = ".".join(map(str, llvm().llvm_version_info))
+        return _load(text, cache.key(text, *processor(), version), signature)
+
+
+def _load(text: str, key: str, signature: Any) -> Any:
     binding = llvm()
-    for own in library.functions.values():
-        binding.add_symbol(own.symbol, own.address)
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(text)
@@ -98,9 +111,7 @@ def _load(text: str, key: str, library: Library) -> Native:
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
-    signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-    function: Native = signature(engine.get_function_address("program"))
-    return function
+    return signature(engine.get_function_address("program"))
 
 
 _LIBRARIES: dict[str, Native] = {}

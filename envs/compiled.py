@@ -31,6 +31,7 @@ from ..compiler.functions import (
 )
 from ..compiler.namespace import NotTraceable
 from ..compiler.program import Graph
+from ..compiler.sequence import CallSequence, Moving, moving_array
 from .draws import Draws
 from .filter import Filter, Input
 from .model import Episode, Model
@@ -139,6 +140,7 @@ class Programs:
         self._functions: dict[Any, Function] = {}
         self._of_world = of_world or self
         self._with_filter: dict[Any, Programs] = {}
+        self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter]) -> "Programs":
         """Return what is traced of the task with another filter; kept for the next time.
@@ -155,6 +157,15 @@ class Programs:
                 self._with_filter.pop(next(iter(self._with_filter)))
             self._with_filter[make] = programs
         return self._with_filter[make]
+
+    def keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what is compiled for the task beside it, made where there is none by this key; the last ones stay."""
+        if key not in self._kept:
+            made = make()
+            while len(self._kept) >= PROGRAM_CACHE_SIZE:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = made
+        return self._kept[key]
 
     def function(self, function: Callable[..., Any], **options: Any) -> Function:
         """Compiled form of ``function(task, ...)``."""
@@ -470,6 +481,7 @@ class Stepper:
             )
         self._now = 0
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
+        self._action_place = len(update.inputs) - 1
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
@@ -526,6 +538,68 @@ class Stepper:
                     call(start, min(start + TILE, last))
 
         run_over(tiles, self.width, self._threads)
+
+    def run(self, noise: NoiseRing, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
+        """Go through many measurements without going back to Python between them.
+
+        Args:
+            noise: of the measurements.
+            steps: how many.
+            steering: function of what is shown, read lane by lane, and of a memory that begins with zeros, to an action
+                and the memory. None: the action stays as it is.
+
+        Returns:
+            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
+            nothing steers.
+        """
+        if self._given:
+            self._show_in(self._shown.copy())
+        reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
+        action = None
+        memories: list[list[numpy.ndarray]] = [[], []]
+        if steering is not None:
+            action = empty_lanes((steps, *self.action.shape[:-1]), self.width)
+            memories = [[empty_lanes(leaf.shape, self.width) for leaf in steering.outputs[1:]] for _ in "ab"]
+            for array in (*memories[0], *memories[1]):
+                array[...] = 0.0
+        turns: list[list[Call]] = []
+        moving: list[Moving] = []
+        advances: list[Call] = []
+        for now in (self._now, 1 - self._now):
+            update, tell, advance, predict = (call.copy() for call in self._calls[now])
+            turns.append([update, tell, advance, predict])
+            advances.append(advance)
+            first = len(tell.arrays) - len(reported)
+            for i, array in enumerate(reported):
+                tell.replace(first + i, array[0])
+                moving.append(moving_array(tell, first + i, array.strides[0]))
+            if steering is not None and action is not None:
+                steer = steering.bound([self._shown, *memories[0]], [action[0], *memories[1]])
+                memories.reverse()
+                turns[-1].insert(0, steer)
+                place = self._action_place
+                update.replace(place, action[0])
+                moving += [
+                    moving_array(update, place, action.strides[0]),
+                    moving_array(steer, 1 + len(memories[0]), action.strides[0]),
+                ]
+        done = 0
+        while done < steps:
+            address, stride, count = noise.take_rows(steps - done)
+            rows = [Moving(advance, self._row_entry, stride) for advance in advances]
+            for advance in advances:
+                advance.table[self._row_entry] = address
+            turned = done % 2
+            CallSequence(turns[turned], turns[1 - turned], [*moving, *rows]).run(
+                count, self.width, self._threads
+            )
+            done += count
+        self._now = (self._now + steps) % 2
+        answers = [
+            array if kind == "f" else array.astype(DTYPES[kind])
+            for array, kind in zip(reported, self._report_kinds, strict=True)
+        ]
+        return map_arrays(lambda i: answers[i], self._report_template), action
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""

@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium
 import numpy
 
-from ..compiler.functions import map_arrays, round_up_lanes
+from ..compiler.functions import Specialised, map_arrays, round_up_lanes
 from ..filters.ordered_sums import ordered_sum
 from .compiled import Report, Stepper, can_step
 from .model import Episode, Model
@@ -262,6 +262,30 @@ class Lanes:
             own.show_means(self._averaged, total / self.task.decision_interval)
         self.decisions += 1
         return answers
+
+    def can_run(self, report: Report) -> bool:
+        """Whether :meth:`run` goes through whole episodes with this report: all of it is compiled, and nothing runs
+        beside the episodes.
+        """
+        return self.paper is None and can_step(self.model, report)
+
+    def run(self, report: Report, steering: Specialised | None = None) -> tuple[Any, Any]:
+        """Run the episodes that have just begun to their end in native code, and report on every measurement.
+
+        Args:
+            report: as of :meth:`decide`.
+            steering: as of :meth:`.compiled.Stepper.run`; None: the action is zero.
+
+        Returns:
+            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of what steers.
+        """
+        (stepper,) = self._reporting(report)
+        stepper.take(numpy.zeros((self.width, *(self.model.action_space.shape or ()))))
+        answer: tuple[Any, Any] = stepper.run(
+            self.noise, self.decisions_per_episode * self.task.decision_interval, steering
+        )
+        self.decisions += self.decisions_per_episode
+        return answer
 
     def next_row(self) -> Array:
         """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""

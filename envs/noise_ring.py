@@ -130,6 +130,24 @@ class NoiseRing:
             if due:
                 self._draw_rows(due, [self._children[lane] for lane in due], numpy.empty((len(due), 0)))
 
+    def take_rows(self, most: int) -> tuple[int, int, int]:
+        """Go on over several measurements whose rows lie one after the other, of NumPy's arrays.
+
+        Args:
+            most: measurements.
+
+        Returns:
+            Address of the row of the first of them, bytes from one row to the next, and how many there are.
+        """
+        self.advance()
+        slot = self._clock % self._slots
+        count = min(most, self._slots - slot)
+        if self._in_blocks:  # rows are drawn anew when a lane has come to the end of its own
+            count = min(count, self._slots - int(((self._clock - self._started) % self._slots).max()))
+        address = self.address
+        self._clock += count - 1
+        return address, self._place[1], count
+
     @property
     def row(self) -> Array:
         """Noise of this measurement, ``(row width, width)``; it is written over later."""

@@ -28,7 +28,7 @@ from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .innovations import with_innovations
 from .parallel import Workers, check_workers
-from .rollout import Progress, Series, rollout
+from .rollout import Progress, run_episodes
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
@@ -321,32 +321,33 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     """
     experiment, kind, count = piece.experiment, piece.kind, len(piece.seeds)
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    drawn = experiment.drawn_episodes - piece.first
-    report = _limits if kind == "bound" else _report(model, experiment.tracks, drawn > 0)
-    boxed = kind == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
-    series = Series(count, {DRAWN_PREFIX: drawn})
-    steps = rollout(model, piece.maker, piece.seeds, report, kind=kind, name=piece.name)
-    for step, (found, action) in enumerate(steps, 1):
+    drawn = min(max(experiment.drawn_episodes - piece.first, 0), count)
+    # What is kept of a few would take much room for all.
+    parts = [slice(0, drawn), slice(drawn, count)] if 0 < drawn < count else [slice(0, count)]
+    found: list[dict[str, numpy.ndarray]] = []
+    for part in parts:
+        report = _limits if kind == "bound" else _report(model, experiment.tracks, part.start < drawn)
+        flown = run_episodes(model, piece.maker, kind, piece.seeds[part], report, piece.name, tick)
+        arrays = dict(flown.found)
         if kind == "policy":
-            _check_reserved(model, found)
-        if experiment.strict and "lost" in found:
-            _refuse_losses(piece, found["lost"][:count], step)
-        series.add(found)
-        if boxed:
-            series.add({"action": _limit_actions(model.action_space, action, count)})
-        tick(count)
-    arrays = series.arrays()
+            _check_reserved(model, arrays)
+        if experiment.strict and "lost" in arrays:
+            _refuse_losses(piece, arrays["lost"], part.start)
+        if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+            arrays["action"] = _limit_actions(model.action_space, flown.action)
+        found.append(arrays)
+    kept = _in_one(found)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
-            if name in arrays and numpy.isnan(arrays[name]).all():
-                del arrays[name]
-    return arrays
+            if name in kept and numpy.isnan(kept[name]).all():
+                del kept[name]
+    return kept
 
 
-def _limit_actions(box: Any, action: Any, count: int) -> numpy.ndarray:
-    """Return the actions that are applied, within the limits of their box, ``(A, count)``."""
+def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
+    """Return the actions that are applied, within the limits of their box, ``(episodes, time, A)``."""
     bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
-    return bounded.reshape(count, -1).T
+    return bounded.reshape(*action.shape[:2], -1)
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
@@ -358,12 +359,20 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
         )
 
 
-def _refuse_losses(piece: Piece, faults: numpy.ndarray, step: int) -> None:
-    """Raise ValueError if an episode is lost at a measurement."""
+def _refuse_losses(piece: Piece, faults: numpy.ndarray, first: int) -> None:
+    """Raise ValueError if an episode is lost, for the first measurement at which one is.
+
+    Args:
+        piece: of the competitor.
+        faults: numbers of the reasons, ``(episodes, time)``.
+        first: number of the first of these episodes in the piece.
+    """
     if faults.any():
-        i = int(numpy.argmax(faults > 0.0))
+        step = int(numpy.argmax((faults > 0.0).any(axis=0)))
+        i = int(numpy.argmax(faults[:, step] > 0.0))
         raise ValueError(
-            f"estimator {piece.name!r}: {FAULTS[int(faults[i]) - 1]} in episode {piece.first + i} at measurement {step}"
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + first + i} "
+            f"at measurement {step + 1}"
         )
 
 
