@@ -94,7 +94,7 @@ class _Part:
         if step not in self.known:
             self.known.add(step)
             if operation == "input" and self.lane_first[arguments[0]]:
-                self._gather(*arguments, f"%v{step}")
+                self._read_by_lanes(arguments[0], arguments[1], f"%v{step}")
             elif operation == "input":
                 self.new(f"load {VECTOR}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
             elif operation == "constant" and logical:
@@ -197,7 +197,7 @@ class _Part:
             number = self.new(f"extractelement {VECTOR} {value}, i32 {lane}")
             self.lines.append(f"store double {number}, ptr {address}, align 8")
 
-    def _gather(self, argument: int, row: int, name: str) -> None:
+    def _read_by_lanes(self, argument: int, row: int, name: str) -> None:
         """Read a row of an argument that is written lane by lane."""
         value = "poison"
         for lane, address in enumerate(self._lane_places(argument, row)):

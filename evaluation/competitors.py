@@ -153,7 +153,7 @@ def says_traceable(policy: Any) -> bool:
     """Whether a policy says of its own methods, not of those that they replace, that they can be traced."""
     for cls in type(policy).__mro__:
         if "traceable" in vars(cls):
-            return bool(cls.traceable)
+            return bool(vars(cls)["traceable"])
         if vars(cls).keys() & {"act", "predict", "begin"}:
             break
     return False

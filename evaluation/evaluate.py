@@ -28,7 +28,7 @@ from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .innovations import with_innovations
 from .parallel import Workers, check_workers
-from .rollout import Progress, run_episodes
+from .rollout import More, Progress, run_episodes
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
@@ -159,10 +159,8 @@ def _limits(model: Model, episode: Episode) -> dict[str, Any]:
     return model.filter.records(episode.filter, episode.measurement)
 
 
-def _report(model: Model, tracks: bool, drawn: bool) -> Report:
+def _report(model: Model, tracks: bool) -> Report:
     """What is kept of every measurement of a task."""
-    if drawn:
-        return _track_and_drawing if tracks else _measurement_and_drawing
     if model.task.has_truth:
         return _measurement_and_track if tracks else _measurement_report
     return _expectation_and_track if tracks else _expectation_report
@@ -319,29 +317,27 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
 
     Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
     """
-    experiment, kind, count = piece.experiment, piece.kind, len(piece.seeds)
+    experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    drawn = min(max(experiment.drawn_episodes - piece.first, 0), count)
-    # What is kept of a few would take much room for all.
-    parts = [slice(0, drawn), slice(drawn, count)] if 0 < drawn < count else [slice(0, count)]
-    found: list[dict[str, numpy.ndarray]] = []
-    for part in parts:
-        report = _limits if kind == "bound" else _report(model, experiment.tracks, part.start < drawn)
-        flown = run_episodes(model, piece.maker, kind, piece.seeds[part], report, piece.name, tick)
-        arrays = dict(flown.found)
-        if kind == "policy":
-            _check_reserved(model, arrays)
-        if experiment.strict and "lost" in arrays:
-            _refuse_losses(piece, arrays["lost"], part.start)
-        if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
-            arrays["action"] = _limit_actions(model.action_space, flown.action)
-        found.append(arrays)
-    kept = _in_one(found)
+    report, drawn = _limits if kind == "bound" else _report(model, experiment.tracks), None
+    if kind != "bound" and experiment.drawn_episodes > piece.first:
+        most = experiment.drawn_episodes - piece.first
+        drawn = More(
+            _track_and_drawing if experiment.tracks else _measurement_and_drawing, most, DRAWN_PREFIX
+        )
+    flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    arrays = dict(flown.found)
+    if kind == "policy":
+        _check_reserved(model, arrays)
+    if experiment.strict and "lost" in arrays:
+        _refuse_losses(piece, arrays["lost"])
+    if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+        arrays["action"] = _limit_actions(model.action_space, flown.action)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
-            if name in kept and numpy.isnan(kept[name]).all():
-                del kept[name]
-    return kept
+            if name in arrays and numpy.isnan(arrays[name]).all():
+                del arrays[name]
+    return arrays
 
 
 def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
@@ -359,20 +355,19 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
         )
 
 
-def _refuse_losses(piece: Piece, faults: numpy.ndarray, first: int) -> None:
+def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
     """Raise ValueError if an episode is lost, for the first measurement at which one is.
 
     Args:
         piece: of the competitor.
         faults: numbers of the reasons, ``(episodes, time)``.
-        first: number of the first of these episodes in the piece.
     """
     if faults.any():
         step = int(numpy.argmax((faults > 0.0).any(axis=0)))
         i = int(numpy.argmax(faults[:, step] > 0.0))
         raise ValueError(
-            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + first + i} "
-            f"at measurement {step + 1}"
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + i} at measurement "
+            f"{step + 1}"
         )
 
 

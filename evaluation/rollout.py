@@ -123,6 +123,17 @@ def _smoothed_estimates(
     return means[..., last], covariances[..., last]
 
 
+class More(NamedTuple):
+    """What is reported of the first episodes only; of all it would take much memory."""
+
+    report: Report
+    """Of all that is reported of them."""
+    episodes: int
+    """How many they are."""
+    prefix: str
+    """Begins the names of what is not reported of the others."""
+
+
 class Flown(NamedTuple):
     """What is reported of episodes that were run to their end."""
 
@@ -140,6 +151,7 @@ def run_episodes(
     report: Report,
     name: str = "competitor",
     tick: Progress | None = None,
+    more: More | None = None,
 ) -> Flown:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
 
@@ -154,6 +166,7 @@ def run_episodes(
         report: of arrays ``(..., N)`` by name.
         name: of the competitor, in errors.
         tick: told of measurements done.
+        more: what is reported of the first episodes beside it.
     """
     count, steering, tick = len(seeds), None, tick or (lambda measurements: None)
     steers = kind == "policy"
@@ -161,29 +174,56 @@ def run_episodes(
     if steers:
         steering = _steering_of(model, competitor, name)
     if can_step(looped, report) and (steering is not None or not steers):
-        lanes = start_lanes(looped, seeds)
-        reports, actions = lanes.run(report, steering)
-        tick(count * lanes.decisions_per_episode * model.task.decision_interval)
-        found = {each: _episodes_first(values, count) for each, values in reports.items()}
-        return Flown(found, None if actions is None else _checked_actions(model, actions, count))
+        first = 0 if more is None else min(more.episodes, count)
+        parts = [] if more is None else [_run_compiled(looped, steering, seeds[:first], more.report, tick)]
+        if first < count:
+            parts.append(_run_compiled(looped, steering, seeds[first:], report, tick))
+        return _one_after_another(parts)
     steps = (
-        _steer_by_python(model, competitor, seeds, report, name)
+        _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
         if steers
-        else _step_filter(looped, seeds, report)
+        else _step_filter(looped, seeds, report if more is None else more.report)
     )
-    return _step_episodes(steps, count, steers, tick)
+    return _step_episodes(steps, count, steers, tick, more)
 
 
-def _step_episodes(steps: Iterator[tuple[Any, Array]], count: int, steers: bool, tick: Progress) -> Flown:
+def _run_compiled(
+    looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
+) -> Flown:
+    """Run compiled episodes as one call of native code."""
+    lanes, count = start_lanes(looped, seeds), len(seeds)
+    reports, actions = lanes.run(report, steering)
+    tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
+    found = {name: _episodes_first(values, count) for name, values in reports.items()}
+    return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
+
+
+def _one_after_another(parts: Sequence[Flown]) -> Flown:
+    """Join episodes; what is reported of some only is theirs alone."""
+    if len(parts) == 1:
+        return parts[0]
+    found = {
+        name: numpy.concatenate([part.found[name] for part in parts if name in part.found])
+        for name in parts[0].found
+    }
+    actions = [part.action for part in parts if part.action is not None]
+    return Flown(found, numpy.concatenate(actions) if actions else None)
+
+
+def _step_episodes(
+    steps: Iterator[tuple[Any, Array]], count: int, steers: bool, tick: Progress, more: More | None
+) -> Flown:
     """Keep what is reported of episodes that are stepped."""
     series: dict[str, list[numpy.ndarray]] = {}
     actions = []
     for found, action in steps:
-        for each, values in found.items():
-            series.setdefault(each, []).append(values)
+        for name, values in found.items():
+            if more is not None and name.startswith(more.prefix):
+                values = values[..., : more.episodes].copy()  # a view would keep the numbers of all
+            series.setdefault(name, []).append(values)
         actions.append(numpy.asarray(action))
         tick(count)
-    together = {each: _episodes_first(numpy.stack(values), count) for each, values in series.items()}
+    together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
     return Flown(together, numpy.stack(actions, axis=1) if steers else None)
 
 
