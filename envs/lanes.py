@@ -263,17 +263,11 @@ class Lanes:
         self.decisions += 1
         return answers
 
-    def can_run(self, report: Report) -> bool:
-        """Whether :meth:`run` goes through whole episodes with this report: all of it is compiled, and nothing runs
-        beside the episodes.
-        """
-        return self.paper is None and can_step(self.model, report)
-
     def run(self, report: Report, steering: Specialised | None = None) -> tuple[Any, Any]:
         """Run the episodes that have just begun to their end in native code, and report on every measurement.
 
         Args:
-            report: as of :meth:`decide`.
+            report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
             steering: as of :meth:`.compiled.Stepper.run`; None: the action is zero.
 
         Returns:

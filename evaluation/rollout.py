@@ -173,7 +173,8 @@ def run_episodes(
     looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
     if steers:
         steering = _steering_of(model, competitor, name)
-    if can_step(looped, report) and (steering is not None or not steers):
+    compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
+    if compiled and (steering is not None or not steers):
         first = 0 if more is None else min(more.episodes, count)
         parts = [] if more is None else [_run_compiled(looped, steering, seeds[:first], more.report, tick)]
         if first < count:
