@@ -141,7 +141,7 @@ class Specialised:
         arrays = [*inputs, *outputs]
         table = [address_of(self.program.constants)]
         for array, lane_first in zip(arrays, self.lane_first, strict=True):
-            table += [address_of(array), _stride(array, 0 if lane_first else -2)]
+            table += [address_of(array), _lane_stride(array) if lane_first else _stride(array)]
         return Call(self.native, numpy.array(table, dtype=numpy.int64), arrays, self.program.constants)
 
     def call(self, arrays: Sequence[numpy.ndarray], width: int, threads: int) -> list[numpy.ndarray | None]:
@@ -150,10 +150,10 @@ class Specialised:
         assert self.native is not None
         table = [address_of(self.program.constants)]
         for array in arrays:
-            table += [address_of(array), _stride(array, -2)]
+            table += [address_of(array), _stride(array)]
         rows = [leaf.rows if same is None else 0 for leaf, same in zip(self.outputs, self.same, strict=True)]
         memory = empty_lanes((sum(rows),), width)
-        start, stride = address_of(memory), _stride(memory, 0)
+        start, stride = address_of(memory), _stride(memory)
         outputs: list[numpy.ndarray | None] = []
         first = 0
         for leaf, same, count in zip(self.outputs, self.same, rows, strict=True):
@@ -198,7 +198,7 @@ class Call:
     def replace(self, place: int, array: numpy.ndarray) -> None:
         """Read or write another array of the same shape from now on."""
         self.arrays[place] = array
-        self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array, -2)
+        self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
 
     def copy(self) -> "Call":
         """Return the same call with a table of its own."""
@@ -335,6 +335,13 @@ def address_of(array: numpy.ndarray) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def _stride(array: numpy.ndarray, axis: int) -> int:
+def _stride(array: numpy.ndarray) -> int:
     """Numbers from one row to the next."""
-    return array.strides[axis] // array.itemsize if array.ndim > 1 or axis == 0 else 0
+    # An axis of one row may have any stride.
+    apart = [stride for length, stride in zip(array.shape[:-1], array.strides, strict=False) if length > 1]
+    return apart[-1] // array.itemsize if apart else 0
+
+
+def _lane_stride(array: numpy.ndarray) -> int:
+    """Numbers from one lane to the next of what is written lane by lane."""
+    return array.strides[0] // array.itemsize

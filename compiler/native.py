@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -12,6 +13,8 @@ from .emission import emit
 from .library import Library, fastest
 from .program import LOCK, Program
 
+AVAILABLE = importlib.util.find_spec("llvmlite") is not None
+"""Whether programs can be compiled here."""
 _ENGINES: list[Any] = []
 """What owns the code; it is never given back, as somebody may be about to call it."""
 
@@ -62,6 +65,8 @@ def _target() -> Any:
 
 Native = Callable[[int, int, int], None]
 """Called with the address of the table of arguments, and with the lanes from where to where."""
+NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+"""The same for ctypes."""
 
 
 def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Native:
@@ -78,29 +83,34 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
         known = cache.key(repr((program.steps, program.results, list(lane_first), library)), name, features)
         if known not in _LIBRARIES:
-            text = emit(program, lane_first, library)
-            version = ".".join(map(str, binding.llvm_version_info))
             for own in library.functions.values():
                 binding.add_symbol(own.symbol, own.address)
-            signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), signature)
+            _LIBRARIES[known] = _load(emit(program, lane_first, library), name, features, NATIVE)
         return _LIBRARIES[known]
 
 
-def load_function(text: str, signature: Any) -> Any:
-    """Return the function ``@program`` of a text of LLVM that calls nothing by its name.
+def native_text(text: str, signature: Any = NATIVE) -> Any:
+    """Return code of a text that calls no function by its name: only what every processor computes alike.
 
     Args:
-        text: that defines it.
-        signature: of ctypes.
+        text: of LLVM, with an entry ``@program``.
+        signature: of the entry, as ctypes writes it; default: ``(table, first, last)``, as of :data:`Native`.
+
+    Raises:
+        ImportError: without llvmlite.
     """
     with LOCK:
-        version = ".".join(map(str, llvm().llvm_version_info))
-        return _load(text, cache.key(text, *processor(), version), signature)
+        name, features = processor()
+        known = cache.key(text, name, features)
+        if known not in _LIBRARIES:
+            _LIBRARIES[known] = _load(text, name, features, signature)
+        return _LIBRARIES[known]
 
 
-def _load(text: str, key: str, signature: Any) -> Any:
+def _load(text: str, name: str, features: str, signature: Any) -> Any:
+    """Translate a text, or find it in the cache."""
     binding = llvm()
+    key = cache.key(text, name, features, ".".join(map(str, binding.llvm_version_info)))
     code = cache.load(key)
     if code is None:
         module = binding.parse_assembly(text)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy
 
 from .functions import Call, address_of, run_over
-from .native import load_function
+from .native import native_text
 
 TILE = 256
 """Lanes that go through all steps together."""
@@ -98,7 +98,7 @@ exit:
 def _driver() -> Any:
     pointer, integer = ctypes.c_void_p, ctypes.c_int64
     kinds = [pointer, pointer, integer, pointer, pointer, integer, integer, integer, integer, integer]
-    return load_function(TEXT, ctypes.CFUNCTYPE(None, *kinds))
+    return native_text(TEXT, ctypes.CFUNCTYPE(None, *kinds))
 
 
 class Moving(NamedTuple):
@@ -110,15 +110,16 @@ class Moving(NamedTuple):
     """Added after every step: bytes of an address, or whatever a counter counts."""
 
 
-def moving_array(call: Call, place: int, amount: int) -> Moving:
-    """Let an argument of a call be another array at every step.
+def moving_array(call: Call, place: int, arrays: numpy.ndarray) -> Moving:
+    """Let an argument of a call be the next of several arrays at every step.
 
     Args:
-        call: whose argument it is.
+        call: whose argument it is; it begins with the first.
         place: number of the argument.
-        amount: bytes from the array of a step to that of the next.
+        arrays: ``(steps, ..., N)``.
     """
-    return Moving(call, 1 + 2 * place, amount)
+    call.replace(place, arrays[0])
+    return Moving(call, 1 + 2 * place, arrays.strides[0])
 
 
 class CallSequence:
@@ -127,12 +128,11 @@ class CallSequence:
     Args:
         even: those of an even step, in their order.
         odd: those of an odd step, as many.
-        moving: what moves on with every step, in the tables of these calls.
+        moving: what moves on with every step, in tables of these calls; the calls' own stay as they are.
     """
 
     def __init__(self, even: Sequence[Call], odd: Sequence[Call], moving: Sequence[Moving]) -> None:
-        self._calls, self._moving = [*even, *odd], moving
-        self._count = len(even)
+        self._calls, self._count = [*even, *odd], len(even)
         self._codes = numpy.array([call.native_address for call in self._calls], dtype=numpy.int64)
         self._amounts = numpy.array([each.amount for each in moving], dtype=numpy.int64)
         numbers = {id(call): i for i, call in enumerate(self._calls)}
@@ -143,7 +143,7 @@ class CallSequence:
         )
 
     def run(self, steps: int, width: int, threads: int = 1, tile: int = TILE) -> None:
-        """Run the steps over all lanes; what moves has moved on afterwards.
+        """Run the steps over all lanes.
 
         Args:
             steps: how many; the first is an even one.
@@ -165,7 +165,7 @@ class CallSequence:
                 self._count,
                 address_of(entries),
                 address_of(self._amounts),
-                len(self._moving),
+                len(self._amounts),
                 steps,
                 first,
                 last,
@@ -173,5 +173,3 @@ class CallSequence:
             )
 
         run_over(lanes, width, threads)
-        for each in self._moving:
-            each.call.table[each.entry] += steps * each.amount

@@ -101,9 +101,34 @@ def _intervals_in_one_piece(app: Any, document: nodes.document) -> None:
                 text.parent.replace(text, nodes.Text(kept))
 
 
+MOVED = """
+:::{admonition} These numbers were made before the noise by counter
+:class: note
+
+The random numbers of an episode have since become a function of its seed and of the time alone. Every episode has changed
+once by it: the same seed draws another flight and other noise. Their distributions have not changed. What stands on this
+page is of the episodes before, and whoever runs a command again gets numbers that differ from it as those of other seeds
+do. All tables, figures and agents are made again together.
+:::
+"""
+"""Said at the top of pages whose numbers come from runs, until they are made again."""
+MOVED_PAGES = re.compile(
+    "comparison|results|training_seeds|agents|speed|compiled|plan|report|evaluation|live|device|own_data|own_estimator"
+    "|log_file|filter_designer|rl_researcher|recipes|offline_data|many_cores|environments|environments/.*|reproductions/.*"
+)
+
+
+def _say_what_moved(app: Any, page: str, source: list[str]) -> None:
+    """Put the notice below the first heading."""
+    if MOVED_PAGES.fullmatch(page):
+        heading, rest = source[0].split("\n", 1)
+        source[0] = f"{heading}\n{MOVED}\n{rest}"
+
+
 def setup(app: Any) -> None:
     """Register what is done to docstrings before and after Google's style is read, and to pages."""
     app.connect("autodoc-process-docstring", _hide_colons, priority=400)
     for change in (_show_colons, _formulas_as_they_stand, _without_counted_fields):
         app.connect("autodoc-process-docstring", change, priority=600)
+    app.connect("source-read", _say_what_moved)
     app.connect("doctree-read", _intervals_in_one_piece)

@@ -6,7 +6,6 @@ further where episodes are only stepped: it keeps the episodes in its own memory
 
 import copy
 import functools
-import importlib.util
 import itertools
 import traceback
 import warnings
@@ -30,18 +29,17 @@ from ..compiler.functions import (
     run_over,
 )
 from ..compiler.namespace import NotTraceable
+from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
 from ..compiler.sequence import CallSequence, Moving, moving_array
 from .draws import Draws
+from .episode_noise import EpisodeNoise
 from .filter import Filter, Input
 from .model import Episode, Model
-from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
 from .task import Task
 
-AVAILABLE = importlib.util.find_spec("llvmlite") is not None
-"""Whether steps can be compiled here."""
 TILE = 1024
 """Lanes that go through all parts of a step before the next: they stay in the second-level cache."""
 PROGRAM_CACHE_SIZE = 8
@@ -431,7 +429,7 @@ class Stepper:
         update, advance, predict, episode = model.programs.later
         tell = model.programs.report_program(report)
         truths, measured, states = (len(leaves(part)) for part in episode)
-        self.width, self._threads, self._model = width, model.threads, model
+        self.width, self._threads, self._model, self._report = width, model.threads, model, report
         count = itertools.count()
         self._template, self._kinds = map_arrays(lambda _: next(count), episode), _kinds(leaves(episode))
         self._report_template, self._report_kinds = tell.template, [leaf.kind for leaf in tell.outputs]
@@ -444,13 +442,20 @@ class Stepper:
         self._shown, self._given = numpy.empty((width, *predict.outputs[-1].shape)), False
         self._reported = memory(tell.outputs)
         # Episodes go to and fro between two copies, which share what stays as it is.
-        first, second = (memory([*advance.outputs, *predict.outputs[:-1]]) for _ in range(2))
-        for i, same in enumerate(advance.same):
-            if same is not None:
-                second[i] = first[i]
-        self._copies = (first, second)
+        outputs = [*advance.outputs, *predict.outputs[:-1]]
+        stays = [i < len(advance.same) and advance.same[i] is not None for i in range(len(outputs))]
+        self._staying, staying = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if s], width)
+        self._going: list[numpy.ndarray] = []
+        """Of each copy the numbers of all arrays that are not shared, ``(numbers, width)``."""
+        copies = []
+        for _ in range(2):
+            numbers, going = _side_by_side([o for o, s in zip(outputs, stays, strict=True) if not s], width)
+            self._going.append(numbers)
+            shared, own = iter(staying), iter(going)
+            copies.append([next(shared if s else own) for s in stays])
+        self._copies = first, second = copies
         written = memory(update.outputs)
-        nothing = numpy.zeros((advance.inputs[-1].rows, width))
+        row = empty_lanes((advance.inputs[-1].rows,), width)  # its place is taken by that of the noise
         self._calls, self._begin = [], []
         world, start = model.programs.start
         self._drawn = memory(world.inputs)
@@ -467,7 +472,7 @@ class Stepper:
                 (
                     update.bound(given, written),
                     tell.bound([*truth, *measurement, *updated[:states]], self._reported),
-                    advance.bound([*truth, *updated[states:], nothing], ahead),
+                    advance.bound([*truth, *updated[states:], row], ahead),
                     predict.bound([*updated[:states], *ahead[truths:]], predicted),
                 )
             )
@@ -475,13 +480,15 @@ class Stepper:
                 (
                     world.bound(self._drawn, [*truth, *initial]),
                     start.bound([*initial, *(truth if knows else [])], written),
-                    begun.advance.bound([*truth, *written[states:], nothing], ahead),
+                    begun.advance.bound([*truth, *written[states:], row], ahead),
                     begun.predict.bound([*written[:states], *ahead[truths:]], predicted),
                 )
             )
         self._now = 0
+        self._small: dict[int, Stepper] = {}
+        """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
-        self._action_place = len(update.inputs) - 1
+        self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
@@ -490,19 +497,11 @@ class Stepper:
         if shown is not None:
             self._shown[...] = shown.T
 
-    def replace(self, episode: Episode, lanes: numpy.ndarray) -> None:
-        """Put the first episodes of others in place of those in some lanes."""
-        for memory, values in zip(self._copies[self._now], leaves(episode), strict=True):
-            memory[..., lanes] = values[..., : len(lanes)]
-        if self._given:
-            self._show_in(self._shown.copy())
-        self._shown[lanes] = self._model.observe(episode)[:, : len(lanes)].T
-
     def episode(self) -> Episode:
         """Return the episodes, in arrays that stay as they are."""
         return _copy_numbers(self._template, self._copies[self._now], self._kinds)
 
-    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: NoiseRing) -> None:
+    def begin(self, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise) -> None:
         """Start new episodes everywhere and let their first measurement arrive.
 
         Args:
@@ -514,18 +513,43 @@ class Stepper:
             memory[...] = values
         self._run(self._begin[self._now], noise)
 
+    def begin_some(
+        self, lanes: numpy.ndarray, uniforms: numpy.ndarray, normals: numpy.ndarray, noise: EpisodeNoise
+    ) -> None:
+        """Start new episodes in some lanes and let their first measurement arrive.
+
+        Args:
+            lanes: which.
+            uniforms: theirs, padded to the width of ``noise``, likewise what follows.
+            normals: as in :meth:`begin`.
+            noise: of these episodes.
+        """
+        small = self._small.get(noise.width)
+        if small is None:
+            small = self._small[noise.width] = Stepper(self._model, self._report, noise.width)
+        small.begin(uniforms, normals, noise)
+        for numbers, begun in (
+            (self._staying, small._staying),
+            (self._going[self._now], small._going[small._now]),
+        ):
+            numbers[:, lanes] = begun[:, : len(lanes)]
+        if self._given:
+            self._show_in(self._shown.copy())
+        self._shown[lanes] = small._shown[: len(lanes)]
+
     def take(self, action: numpy.ndarray) -> None:
         """Apply an action from the next step on, batch first, of all lanes or of the first."""
         self.action[..., : len(action)] = action.T if action.ndim == 2 else action
 
-    def step(self, noise: NoiseRing) -> None:
+    def step(self, noise: EpisodeNoise) -> None:
         """Apply the action and go on to the next measurement."""
         self._run(self._calls[self._now], noise)
 
-    def _run(self, calls: tuple[Call, ...], noise: NoiseRing) -> None:
+    def _run(self, calls: Sequence[Call], noise: EpisodeNoise) -> None:
         if self._given:
             self._show_in(numpy.empty_like(self._shown))
         calls[2].table[self._row_entry] = noise.address
+        calls = (*noise.calls(), *calls)
         self._now = 1 - self._now
         if self.width <= TILE:
             for call in calls:
@@ -539,7 +563,7 @@ class Stepper:
 
         run_over(tiles, self.width, self._threads)
 
-    def run(self, noise: NoiseRing, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
+    def run(self, noise: EpisodeNoise, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
         """Go through many measurements without going back to Python between them.
 
         Args:
@@ -555,51 +579,37 @@ class Stepper:
         if self._given:
             self._show_in(self._shown.copy())
         reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
-        action = None
-        memories: list[list[numpy.ndarray]] = [[], []]
+        actions, memories = None, [self._blank_memory(steering), self._blank_memory(steering)]
         if steering is not None:
-            action = empty_lanes((steps, *self.action.shape[:-1]), self.width)
-            memories = [[empty_lanes(leaf.shape, self.width) for leaf in steering.outputs[1:]] for _ in "ab"]
-            for array in (*memories[0], *memories[1]):
-                array[...] = 0.0
+            actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
+        draw = noise.call_of_each()
         turns: list[list[Call]] = []
         moving: list[Moving] = []
-        advances: list[Call] = []
         for now in (self._now, 1 - self._now):
             update, tell, advance, predict = (call.copy() for call in self._calls[now])
-            turns.append([update, tell, advance, predict])
-            advances.append(advance)
-            first = len(tell.arrays) - len(reported)
-            for i, array in enumerate(reported):
-                tell.replace(first + i, array[0])
-                moving.append(moving_array(tell, first + i, array.strides[0]))
-            if steering is not None and action is not None:
-                steer = steering.bound([self._shown, *memories[0]], [action[0], *memories[1]])
-                memories.reverse()
+            advance.table[self._row_entry] = noise.address
+            moving += [moving_array(tell, self._report_place + i, each) for i, each in enumerate(reported)]
+            turns.append([update, tell, draw, advance, predict])
+            if steering is not None and actions is not None:
+                steer = steering.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
                 turns[-1].insert(0, steer)
-                place = self._action_place
-                update.replace(place, action[0])
-                moving += [
-                    moving_array(update, place, action.strides[0]),
-                    moving_array(steer, 1 + len(memories[0]), action.strides[0]),
-                ]
-        done = 0
-        while done < steps:
-            address, stride, count = noise.take_rows(steps - done)
-            rows = [Moving(advance, self._row_entry, stride) for advance in advances]
-            for advance in advances:
-                advance.table[self._row_entry] = address
-            turned = done % 2
-            CallSequence(turns[turned], turns[1 - turned], [*moving, *rows]).run(
-                count, self.width, self._threads
-            )
-            done += count
+                moving.append(moving_array(steer, 1 + len(memories[0]), actions))
+                moving.append(moving_array(update, self._action_place, actions))
+                memories.reverse()
+        CallSequence(turns[0], turns[1], moving).run(steps, self.width, self._threads)
         self._now = (self._now + steps) % 2
         answers = [
             array if kind == "f" else array.astype(DTYPES[kind])
             for array, kind in zip(reported, self._report_kinds, strict=True)
         ]
-        return map_arrays(lambda i: answers[i], self._report_template), action
+        return map_arrays(lambda i: answers[i], self._report_template), actions
+
+    def _blank_memory(self, steering: Specialised | None) -> list[numpy.ndarray]:
+        """Memory of what steers before its first action."""
+        blank = [empty_lanes(leaf.shape, self.width) for leaf in steering.outputs[1:]] if steering else []
+        for array in blank:
+            array[...] = 0.0
+        return blank
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""
@@ -735,6 +745,14 @@ def filter_stepper(model: Model, report: Report, width: int) -> FilterStepper | 
     """Return what steps the filter of a model alone."""
     kind = FilterStepper if can_step(model, report) else ModelFilterStepper
     return kind(model, report, width)
+
+
+def _side_by_side(arrays: Sequence[Leaf], width: int) -> tuple[numpy.ndarray, list[numpy.ndarray]]:
+    """Memory of all numbers of some arrays, ``(numbers, width)``, and the arrays in it, ``(..., width)``."""
+    numbers = empty_lanes((sum(leaf.rows for leaf in arrays),), width)
+    starts = numpy.cumsum([0, *(leaf.rows for leaf in arrays)]).tolist()
+    parts = zip(arrays, starts, strict=False)
+    return numbers, [numbers[at : at + leaf.rows].reshape(*leaf.shape, width) for leaf, at in parts]
 
 
 def _kinds(arrays: Sequence[numpy.ndarray]) -> list[str]:

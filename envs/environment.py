@@ -1,6 +1,5 @@
 """The two Gymnasium faces of a task: ``TaskEnv`` with one episode, ``TaskVectorEnv`` with many."""
 
-import copy
 import functools
 import inspect
 import math
@@ -422,7 +421,7 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         scenario: name of a scenario, a :class:`~filtergym.envs.trajectory.Trajectory` or a dictionary of its fields, or
             the path of a file with one; a :class:`~filtergym.envs.recording.Recording`, or its file; or a mixture,
             ``{"random": 0.8, "paper": 0.2}``, of which every episode flies one scenario, drawn by these weights from
-            the episode's generator.
+            ``np_random``.
         reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative", see :mod:`.reward`; default: the
             environment's own, and zero on a recording without truth.
         render_mode: None, "rgb_array" or "human".
@@ -504,17 +503,14 @@ class TaskEnv(_EnvBase, gymnasium.Env[Any, Any]):
         self._apply_reset_options(wanted, [0])
         super().reset(seed=seed)
         self.fleet.seed(0, self.np_random)
-        ahead = None if self._late is None else copy.deepcopy(self.np_random)
         self.fleet.restart()
         self._forget_errors([0])
         self.model = self.fleet.model_of(0)
-        if self._late is not None and ahead is not None:
-            self.fleet.course_of(0).draw_task(ahead)  # comes before the episode
-            if self._late.model is not self.model:
-                self._late.close()
-                self._picture_of(self.fleet.scenario_of(0))
-        if self._late is not None and ahead is not None:
-            self._late.begin(ahead)
+        if self._late is not None and self._late.model is not self.model:
+            self._late.close()
+            self._picture_of(self.fleet.scenario_of(0))
+        if self._late is not None:
+            self._late.begin(self.fleet.identity_of(0))
             self._show()
         return self._single_observation(), self._with_context({})
 
@@ -597,8 +593,8 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative"; default: the environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
-            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, drawn by the
-            same NumPy generators; float64 results differ by rounding. Torch's gradients flow from rewards and
+            rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, their
+            random numbers made on the host; float64 results differ by rounding. Torch's gradients flow from rewards and
             observations back to actions that require them, over all steps since the last reset; pass detached
             actions where none are wanted.
         device: where the torch backend computes, such as "cpu" (default) or "cuda".

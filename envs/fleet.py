@@ -7,8 +7,9 @@ place in the lanes of the task that is drawn for it; lanes grow by eight places 
 has is stepped all the same and never looked at: a step costs what as many environments of each task cost as ever flew
 it at once.
 
-What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the episode as
-in :mod:`.lanes`. So sub-environment i of N equals the single environment with the same seed, here too.
+What a lane's generator gives is first, in a mixture only, the uniform number that chooses the task, then the identity
+of the episode, see :mod:`.episode_noise`. So sub-environment i of N equals the single environment with the same seed,
+here too.
 """
 
 import copy
@@ -144,6 +145,11 @@ class Fleet:
     def model_of(self, lane: int) -> Model:
         """Return the task of a lane's episode."""
         return self._parts[self._part[lane]].model
+
+    def identity_of(self, lane: int) -> numpy.ndarray:
+        """Identity of a lane's episode, ``(2, 1)``, see :mod:`.episode_noise`."""
+        place = self._place[lane]
+        return self._parts[self._part[lane]].noise.identities[:, place : place + 1].copy()
 
     def scenario_of(self, lane: int) -> str:
         """Name of the scenario of a lane's episode."""

@@ -1,7 +1,7 @@
-"""The engine: episodes of a model side by side, each fixed by its own generator.
+"""The engine: episodes of a model side by side, each fixed by its identity.
 
-A *lane* is one episode after another, fed by one generator. Both Gymnasium faces and the evaluation drive
-this class; it owns the noise and knows nothing of spaces or autoreset.
+A *lane* is one episode after another, whose identities one generator draws (:mod:`.episode_noise`). Both Gymnasium
+faces and the evaluation drive this class; it owns the noise and knows nothing of spaces or autoreset.
 
 **Bit equality.** The batch is padded to a multiple of eight lanes, also for one episode: BLAS chooses its
 kernels by the width, and widths that are multiples of eight agree. So lane i of N equals the single
@@ -17,11 +17,12 @@ from typing import Any
 import gymnasium
 import numpy
 
+from ..compiler.emission import LANES
 from ..compiler.functions import Specialised, map_arrays, round_up_lanes
 from ..filters.ordered_sums import ordered_sum
 from .compiled import Report, Stepper, can_step
+from .episode_noise import EpisodeNoise
 from .model import Episode, Model
-from .noise_ring import NoiseRing
 from .observation import Array
 from .reward import OWN_PAY
 
@@ -66,7 +67,7 @@ class ModelStepper:
         self._action: Array = None
         self._report: Any = None
 
-    def begin(self, uniforms: Array, normals: Array, noise: NoiseRing) -> None:
+    def begin(self, uniforms: Array, normals: Array, noise: EpisodeNoise) -> None:
         """Start new episodes everywhere and let their first measurement arrive."""
         self.load(self.model.measure(self.model.begin(uniforms, normals), noise.row))
 
@@ -74,11 +75,14 @@ class ModelStepper:
         """Go on from other episodes; what they show is observed from them unless it is given."""
         self._episode, self._shown = episode, shown
 
-    def replace(self, episode: Episode, lanes: Any) -> None:
-        """Put the first episodes of others in place of those in some lanes."""
+    def begin_some(self, lanes: numpy.ndarray, uniforms: Array, normals: Array, noise: EpisodeNoise) -> None:
+        """Start new episodes in some lanes and let their first measurement arrive, see :meth:`.Stepper.begin_some`."""
+        task = self.model.task
+        episode = self.model.measure(self.model.begin(uniforms, normals), noise.row)
+        where = lanes if task.xp is numpy else task.xp.asarray(lanes, device=task.device)
         if self._shown is not None:
-            self._shown = _replace_lanes(self._shown, self.model.observe(episode), lanes)
-        self._episode = _replace_lanes(self._episode, episode, lanes)
+            self._shown = _replace_lanes(self._shown, self.model.observe(episode), where)
+        self._episode = _replace_lanes(self._episode, episode, where)
 
     def episode(self) -> Episode:
         """Return the episodes."""
@@ -97,16 +101,12 @@ class ModelStepper:
             turned = xp.concat([turned, padding], axis=-1)
         self._action = turned
 
-    def step(self, noise: NoiseRing) -> None:
+    def step(self, noise: EpisodeNoise) -> None:
         """Apply the action and go on to the next measurement."""
         after = self.model.act(self._episode, self._action)
         if self.report_function is not None:
             self._report = self.model.run(self.report_function, after)
-        row = noise.row
-        if not isinstance(row, numpy.ndarray):
-            # Autograd may keep it until the backward pass, when the ring has long been written over.
-            row = row.clone()
-        self.load(self.model.measure(after, row))
+        self.load(self.model.measure(after, noise.row))
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)``."""
@@ -172,7 +172,9 @@ class Lanes:
         """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
         """Steppers that hold the episodes, of the task and of the paper's; none before the first episode."""
-        self.noise = NoiseRing(task, count)
+        self.noise = EpisodeNoise(task, count)
+        self._some: dict[int, EpisodeNoise] = {}
+        """Noise of lanes that restart while others fly on, by their number."""
         self.decisions = numpy.zeros(count, dtype=numpy.int64)
         horizon = task.horizon // task.decision_interval
         self.decisions_per_episode = horizon if longest is None else min(horizon, longest)
@@ -182,13 +184,6 @@ class Lanes:
         self._averaged = averaged if task.decision_interval > 1 else []
         """Fields that are shown as their means over a decision."""
 
-    def _pad(self, values: numpy.ndarray, fill: float) -> Array:
-        """Widen ``(rows, lanes)`` to a multiple of eight lanes."""
-        width = round_up_lanes(values.shape[1])
-        padded = numpy.full((values.shape[0], width), fill)
-        padded[:, : values.shape[1]] = values
-        return self.task.xp.asarray(padded, device=self.task.device)
-
     # --- episodes
 
     def seed(self, lane: int, generator: numpy.random.Generator) -> None:
@@ -197,33 +192,45 @@ class Lanes:
 
     def restart(self, lanes: Sequence[int] | None = None) -> None:
         """Start new episodes in some lanes (default: all) and let their first measurement arrive."""
-        task, xp = self.task, self.task.xp
+        chosen = range(self.count) if lanes is None or len(lanes) == self.count else lanes
+        self.begin(self.noise.draw_identities(chosen), chosen)
+
+    def begin(self, identities: numpy.ndarray, lanes: Sequence[int] | None = None) -> None:
+        """Start the episodes of these identities and let their first measurement arrive.
+
+        Args:
+            identities: ``(2, lanes)``, see :mod:`.episode_noise`.
+            lanes: in which, ascending; default: all.
+        """
+        task = self.task
         everyone = lanes is None or len(lanes) == self.count
-        chosen: Sequence[int] = range(self.count) if lanes is None or everyone else list(lanes)
-        uniforms, normals = self.noise.draw_episodes(chosen)
-        index = numpy.asarray(chosen)
+        index = numpy.arange(self.count) if lanes is None else numpy.asarray(lanes)
+        noise = self.noise if everyone else self._noise_of_some(len(index))
+        uniforms, normals = noise.begin(identities)
         self.decisions[index] = 0
         if task.flights:
-            lengths = task.lengths(uniforms) // task.decision_interval
+            lengths = task.lengths(uniforms[:, : len(index)]) // task.decision_interval
             self._lengths[index] = numpy.minimum(lengths, self.decisions_per_episode)
-        # The padding lanes fly an average episode without noise.
-        scenario, start = self._pad(uniforms, 0.5), self._pad(normals, 0.0)
+        start = tuple(task.xp.asarray(numbers, device=task.device) for numbers in (uniforms, normals))
         if self._on_start is not None:
-            self._on_start(self.model.begin(scenario, start))
+            self._on_start(self.model.begin(*start))
         if everyone:
             self._moving = self._moving or self._by_functions()
             for stepper in self._moving:
-                stepper.begin(scenario, start, self.noise)
+                stepper.begin(*start, noise)
             return
-        where = index if xp is numpy else xp.asarray(chosen, device=task.device)
-        row = self.noise.row[:, where]
-        padding = round_up_lanes(len(chosen)) - len(chosen)
-        if padding:
-            row = xp.concat(
-                [row, xp.zeros((row.shape[0], padding), dtype=row.dtype, device=task.device)], axis=1
-            )
-        for each, stepper in zip(self._models, self._moving, strict=True):
-            stepper.replace(each.measure(each.begin(scenario, start), row), where)
+        for stepper in self._moving:
+            stepper.begin_some(index, *start, noise)
+        self.noise.take(noise, index)
+
+    def _noise_of_some(self, count: int) -> EpisodeNoise:
+        """Noise of so many lanes that restart, in one of a few sizes."""
+        width = LANES
+        while width < count:
+            width *= 2
+        if width not in self._some:
+            self._some[width] = EpisodeNoise(self.task, width)
+        return self._some[width]
 
     def pay(self, action: Array, kind: str) -> Array:
         """Apply one decision and return its reward, the mean over its measurements, ``(count,)``.
@@ -341,7 +348,7 @@ class Lanes:
     def __getstate__(self) -> dict[str, Any]:
         """All but what is bound to memory: a copy makes its own."""
         self._settle()
-        return {**self.__dict__, "_steppers": {}}
+        return {**self.__dict__, "_steppers": {}, "_some": {}}
 
     def grow(self, count: int) -> None:
         """Make room for more lanes; the new ones fly some episode until they are restarted.
@@ -356,7 +363,7 @@ class Lanes:
         added = count - self.count
         self.decisions = numpy.append(self.decisions, numpy.zeros(added, dtype=numpy.int64))
         self._lengths = numpy.append(self._lengths, numpy.full(added, self.decisions_per_episode))
-        self.noise.grow(count, index)
+        self.noise.grow(count, numpy.append(numpy.arange(self.width), beyond))
         self.count = self.width = count
         self._steppers, self._moving = {}, self._by_functions()
         self._load(parts)

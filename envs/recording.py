@@ -2,7 +2,7 @@
 
 A :class:`Recording` holds episodes of one environment: every array of its ``Measurement``, what everyone is told of the
 start of the track, the times, and the truth where it is known. As a scenario it puts a :class:`RecordedWorld` in the
-place of the task's own: an episode replays one recording, which the first uniform number of its generator draws. Banks,
+place of the task's own: an episode replays one recording, which its first uniform number draws. Banks,
 estimators, backends and evaluations know nothing of it.
 
 What the arrays are, the environment is asked: it measures once, and the recording must have arrays of the same names

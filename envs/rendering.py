@@ -467,7 +467,7 @@ class LatePicture:
     """The picture of one episode, which is flown again when somebody looks.
 
     Libraries ask for a render mode of environments that nobody watches (Stable-Baselines3's ``make_vec_env`` always),
-    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its generator fix an
+    and keeping what is drawn takes far longer than a step. So only the actions are kept: they and its identity fix an
     episode.
 
     Args:
@@ -478,14 +478,14 @@ class LatePicture:
         self.model = picture.model
         self._picture = picture
         self._lanes = Lanes(picture.model, 1)
-        self._generator: numpy.random.Generator | None = None
+        self._identity: numpy.ndarray | None = None
         """Of an episode that has not begun here."""
         self._actions: list[numpy.ndarray] = []
         """Those not applied here."""
 
-    def begin(self, generator: numpy.random.Generator) -> None:
-        """Note a new episode, that ``generator`` is about to draw."""
-        self._generator, self._actions = copy.deepcopy(generator), []
+    def begin(self, identity: numpy.ndarray) -> None:
+        """Note a new episode by its identity, ``(2, 1)``."""
+        self._identity, self._actions = identity, []
 
     def keep(self, action: Array) -> None:
         """Note an action, ``(A,)`` or a scalar."""
@@ -495,11 +495,10 @@ class LatePicture:
     def picture(self) -> EpisodePicture:
         """The picture with all that has happened."""
         lanes, picture = self._lanes, self._picture
-        if self._generator is not None:
-            lanes.seed(0, self._generator)
-            lanes.restart()
+        if self._identity is not None:
+            lanes.begin(self._identity)
             picture.begin(lanes.state)
-            self._generator = None
+            self._identity = None
         for action in self._actions:
             self._apply(action)
         self._actions = []

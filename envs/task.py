@@ -85,11 +85,11 @@ class Scenario:
 
 
 class NoiseLayout(NamedTuple):
-    """How many random numbers an episode takes, in the order in which they are drawn.
+    """How many random numbers an episode takes.
 
-    The generator of the episode first gives ``uniforms`` numbers on [0, 1) for the scenario, then
-    ``initial_normals`` standard normal ones for the start of the track, then one row for each measurement:
-    ``normals`` standard normal numbers followed by ``row_uniforms`` uniform ones.
+    At its start these are ``uniforms`` numbers between 0 and 1 for the scenario and ``initial_normals`` standard normal
+    ones for the start of the track, then one row for each measurement: ``normals`` standard normal numbers followed by
+    ``row_uniforms`` uniform ones. Each is a function of the episode's identity, see :mod:`.episode_noise`.
     """
 
     uniforms: int

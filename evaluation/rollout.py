@@ -9,6 +9,7 @@ import numpy
 from ..compiler.functions import Specialised, round_up_lanes
 from ..envs.compiled import CompiledModel, Report, can_step
 from ..envs.environment import check_action
+from ..envs.episode_noise import identities_of_seeds, start_numbers
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
@@ -33,9 +34,7 @@ def start_lanes(
         on_start: called with the episodes at the start of the track.
     """
     lanes = Lanes(model, len(seeds), on_start=on_start)
-    for lane, seed in enumerate(seeds):
-        lanes.seed(lane, numpy.random.default_rng(seed))
-    lanes.restart()
+    lanes.begin(identities_of_seeds(seeds))
     return lanes
 
 
@@ -107,8 +106,7 @@ def _smoothed_estimates(
     Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
     """
     task = model.task
-    noise = [numpy.random.default_rng(seed).random((task.noise.uniforms, 1)) for seed in seeds]
-    lengths = task.lengths(numpy.concatenate(noise, axis=1))
+    lengths = task.lengths(start_numbers(identities_of_seeds(seeds), task.noise)[0])
     K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
     means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
     for length in numpy.unique(lengths).tolist():

@@ -131,12 +131,12 @@ def test_backends_fly_the_same_mixture(backend):
 
 
 def test_gradients_flow_through_a_mixture(torch):
-    env = gymnasium.make_vec(ID, num_envs=10, scenario=MIXTURE, backend="torch", **SHORT)
+    env = gymnasium.make_vec(ID, num_envs=64, scenario=MIXTURE, backend="torch", **SHORT)
     observation, _ = env.reset(seed=0)
     seen = observation[:, env.unwrapped.model.columns(["available"])[0]] > 0.0
-    action = torch.zeros((10, 1), dtype=torch.float64, requires_grad=True)
+    action = torch.zeros((64, 1), dtype=torch.float64, requires_grad=True)
     env.step(action)
-    env.step(torch.zeros((10, 1), dtype=torch.float64))[1].sum().backward()
+    env.step(torch.zeros((64, 1), dtype=torch.float64))[1].sum().backward()
     assert not seen.all()  # an action on a scan that missed the target does nothing
     assert ((action.grad[:, 0] != 0.0) == seen).all()
 

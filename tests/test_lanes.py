@@ -1,38 +1,178 @@
-"""The engine's noise, beside its code: every measurement takes the next row of its episode, also across blocks."""
+"""The engine's noise: every measurement takes its own row of its own episode, whoever else flies or starts."""
 
+import copy
+import pickle
+
+import gymnasium as gym
 import numpy as np
+import pytest
+from filtergym.compiler.counter_numbers import numbers
+from filtergym.envs import episode_noise
+from filtergym.envs.episode_noise import EpisodeNoise, identities_of_seeds, start_numbers
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.noise_ring import BLOCK, LONGEST_BLOCK
+from filtergym.envs.reward import paper_model
+from filtergym.evaluation.rollout import start_lanes
 from models import make_model
 
 ID = "filtergym/ManeuveringTarget-v0"
+BACKENDS = {"numpy": "numpy", "compiled": "llvmlite"}
 
 
-def naive_rows(seed, noise, rows):
-    """Rows of noise of one long episode, as the module describes them."""
-    generator = np.random.default_rng(seed)
-    generator.random(noise.uniforms)
-    generator.standard_normal(noise.initial_normals)
-    child = np.random.default_rng(generator.integers(0, 2**63, size=2))
-    return child.standard_normal((rows, noise.normals))
+def naive_identities(generator, episodes):
+    """Identities that a lane's generator draws for one episode after another, as the module describes them."""
+    return [generator.bit_generator.random_raw(2) for _ in range(episodes)]
 
 
-def test_long_episodes_take_one_row_after_another(monkeypatch):
-    horizon = LONGEST_BLOCK + 10
-    scans = {"detection_probability": (1.0, 1.0), "scan_jitter": (0.0, 0.0)}
-    model = make_model(ID, "gain", horizon=horizon, **scans)
-    assert model.task.noise.row_uniforms == 0
-    taken = []
-    measure = model.measure
+def naive_row(identity, t, layout):
+    """Row of one episode's measurement, ``(rows,)``."""
+    return numbers(identity[:, None], np.array([t]), layout.normals, layout.row_uniforms)[:, 0]
+
+
+@pytest.fixture(params=[True, False], ids=["compiled numbers", "NumPy's numbers"])
+def either_way(request, monkeypatch):
+    if request.param:
+        pytest.importorskip("llvmlite")
+    monkeypatch.setattr(episode_noise, "AVAILABLE", request.param)
     monkeypatch.setattr(
-        model, "measure", lambda state, row: (taken.append(row.copy()), measure(state, row))[1]
+        episode_noise, "AHEAD", 16 * 7
+    )  # lanes restart in the middle of a block, and at its end
+
+
+def test_every_measurement_takes_its_own_row(monkeypatch, either_way):
+    model = make_model(ID, "gain", backend="numpy", horizon=9)
+    layout, taken, started = model.task.noise, [], []
+    measure, begin = model.measure, model.begin
+    monkeypatch.setattr(
+        model, "measure", lambda state, row: (taken.append((row, row.copy())), measure(state, row))[1]
     )
-    lanes = Lanes(model, 2)
-    for lane in range(2):
+    monkeypatch.setattr(model, "begin", lambda u, n: (started.append((u, n)), begin(u, n))[1])
+    lanes = Lanes(model, 11)
+    for lane in range(11):
         lanes.seed(lane, np.random.default_rng(10 + lane))
     lanes.restart()
-    for _ in range(3 * BLOCK):
-        lanes.decide(np.zeros((2, 1)))
-    for lane in range(2):
-        expected = naive_rows(10 + lane, model.task.noise, 3 * BLOCK + 1)
-        np.testing.assert_array_equal(np.array(taken)[:, :, lane], expected)
+    drawn = [naive_identities(np.random.default_rng(10 + lane), 9) for lane in range(11)]
+    episode, t = np.zeros(11, dtype=int), np.ones(11, dtype=int)
+
+    def check(chosen):
+        """The last row is that of the episodes in these lanes."""
+        identities = np.stack([drawn[lane][episode[lane]] for lane in chosen], axis=1)
+        rows = [
+            naive_row(identity, t[lane], layout) for lane, identity in zip(chosen, identities.T, strict=True)
+        ]
+        np.testing.assert_array_equal(taken[-1][0][:, : len(chosen)].T, rows)
+        return identities
+
+    def check_start(identities):
+        for found, own in zip(started[-1], start_numbers(identities, layout), strict=True):
+            np.testing.assert_array_equal(found[:, : identities.shape[1]], own)
+
+    everyone = list(range(11))
+    check_start(check(everyone))
+    for step in range(40):
+        lanes.decide(np.zeros((11, 1)))
+        t += 1
+        check(everyone)
+        if step % 5 == 0:
+            chosen = sorted([(3 * step) % 11, (3 * step + 4) % 11])
+            lanes.restart(chosen)
+            episode[chosen] += 1
+            t[chosen] = 1
+            check_start(check(chosen))
+    for row, then in taken:
+        np.testing.assert_array_equal(row, then, err_msg="what was taken has been written over")
+
+
+def test_both_ways_give_the_same_bits():
+    pytest.importorskip("llvmlite")
+    task = make_model("filtergym/TightlyCoupledNavigation-v0", "gain", backend="numpy").task
+    found = []
+    for compiled in (True, False):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(episode_noise, "AVAILABLE", compiled)
+            noise = EpisodeNoise(task, 5)
+            rows = list(noise.begin(identities_of_seeds(range(5))))
+            for _ in range(4):
+                rows.append(noise.row)
+                noise.advance()
+        found.append(np.concatenate([row.ravel() for row in rows]))
+    np.testing.assert_array_equal(*found)
+
+
+def test_identities_of_seeds_are_those_of_environments_that_are_reset():
+    seeds = [5, 0, 2**40]
+    identities = identities_of_seeds(seeds)
+    env = gym.make(ID, backend="numpy", disable_env_checker=True).unwrapped
+    for seed, identity in zip(seeds, identities.T, strict=True):
+        env.reset(seed=seed)
+        np.testing.assert_array_equal(env.fleet.identity_of(0)[:, 0], identity)
+    np.testing.assert_array_equal(identities_of_seeds(np.array(seeds)), identities)
+    with pytest.raises(ValueError, match="read-only"):
+        identities[0, 0] = 1
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_lanes_that_restart_at_different_times_equal_single_ones(env_id, backend):
+    pytest.importorskip(BACKENDS[backend])
+    model = make_model(env_id, backend=backend, horizon=40 * make_model(env_id).task.decision_interval)
+    count, space = 20, model.action_space
+    space.seed(0)
+    constant = np.asarray(space.sample())
+
+    def begun(lanes, seeds):
+        for lane, seed in enumerate(seeds):
+            lanes.seed(lane, np.random.default_rng(seed))
+        lanes.restart()
+        return lanes
+
+    def paid(lanes):
+        action = model.task.xp.asarray(np.stack([constant] * lanes.count))
+        return np.asarray(lanes.pay(action, "relative")), np.asarray(lanes.observe())
+
+    restarts = {2: [7], 3: [0, 7, 19], 5: [*range(1, 12)], 8: [7]}
+    together = begun(Lanes(model, count, paper_model(model)), range(count))
+    found = []
+    for step in range(10):
+        found.append(paid(together))
+        if step in restarts:
+            together.restart(restarts[step])
+            found.append((found[-1][0], np.asarray(together.observe())))
+    for lane in (0, 7, 11):
+        alone, step_of = begun(Lanes(model, 1, paper_model(model)), [lane]), iter(found)
+        for step in range(10):
+            reward, shown = next(step_of)
+            own_reward, own = paid(alone)
+            np.testing.assert_array_equal(own_reward[0], reward[lane])
+            np.testing.assert_array_equal(own[0], shown[lane])
+            if step in restarts:
+                if lane in restarts[step]:
+                    alone.restart()
+                np.testing.assert_array_equal(np.asarray(alone.observe())[0], next(step_of)[1][lane])
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda noise: pickle.loads(pickle.dumps(noise))])
+def test_copies_go_on_as_the_original(again, either_way):
+    noise = EpisodeNoise(make_model(ID, backend="numpy").task, 3)
+    for lane in range(3):
+        noise.seed(lane, np.random.default_rng(lane))
+    noise.begin(noise.draw_identities(range(3)))
+    noise.advance()
+    first, other, snapshot = noise.row, again(noise), noise.snapshot()
+    noise.advance()
+    other.advance()
+    np.testing.assert_array_equal(noise.row, other.row)
+    following, drawn = noise.row, noise.draw_identities([1])
+    np.testing.assert_array_equal(other.draw_identities([1]), drawn)
+    for _ in range(2):
+        noise.restore(snapshot)
+        noise.advance()
+        np.testing.assert_array_equal(noise.row, following)
+        np.testing.assert_array_equal(noise.draw_identities([1]), drawn)
+    assert (first != following).any()
+
+
+def test_lanes_that_were_started_by_seeds_equal_environments():
+    model = make_model(ID, backend="numpy")
+    lanes = start_lanes(model, [3, 8])
+    for lane, seed in enumerate((3, 8)):
+        env = gym.make(ID, backend="numpy", disable_env_checker=True)
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], lanes.observe()[lane])

@@ -1,0 +1,305 @@
+"""Random numbers by counter as code: the algorithm of :mod:`.counter_numbers` printed for LLVM, C and CUDA.
+
+:class:`Value` stands for a number in the text of a language; the functions of :mod:`.counter_numbers` run on such
+values as they run on arrays, and leave their text behind. :func:`bind_numbers` gives compiled code, :func:`c_text` the
+same in C.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy
+
+from .counter_numbers import UNIFORM_PAIRS, normal_pair, pair_of_bits, uniform_pair
+from .emission import LANES, TRUTH, VECTOR
+from .functions import Call, address_of
+from .native import Native, native_text
+
+WORDS = f"<{LANES} x i64>"
+_LLVM = {"*": "mul", "+": "add", "-": "sub", "&": "and", "|": "or", "^": "xor", "<<": "shl", ">>": "lshr"}
+
+
+class Value:
+    """A number in the text of a language: a whole number of 64 bits (``whole``), or a float64.
+
+    Args:
+        text: where its operations are written.
+        name: by which the text calls it.
+        whole: which of the two it is.
+    """
+
+    def __init__(self, text: "_Text", name: str, whole: bool) -> None:
+        self.text, self.name, self.whole = text, name, whole
+
+    def _with(self, operator: str, other: "Value | int | float") -> "Value":
+        name = other.name if isinstance(other, Value) else self.text.constant(other)
+        return Value(self.text, self.text.operation(operator, self.name, name, self.whole), self.whole)
+
+    def __add__(self, other: Any) -> "Value":
+        return self._with("+", other)
+
+    def __sub__(self, other: Any) -> "Value":
+        return self._with("-", other)
+
+    def __mul__(self, other: Any) -> "Value":
+        return self._with("*", other)
+
+    def __truediv__(self, other: Any) -> "Value":
+        return self._with("/", other)
+
+    def __and__(self, other: Any) -> "Value":
+        return self._with("&", other)
+
+    def __or__(self, other: Any) -> "Value":
+        return self._with("|", other)
+
+    def __xor__(self, other: Any) -> "Value":
+        return self._with("^", other)
+
+    def __lshift__(self, other: Any) -> "Value":
+        return self._with("<<", other)
+
+    def __rshift__(self, other: Any) -> "Value":
+        return self._with(">>", other)
+
+
+class _Text:
+    """Lines of a language, and the :class:`~.counter_numbers.Machine` of its values.
+
+    Args:
+        prefix: of the names that are given here.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        self.lines: list[str] = []
+        self._prefix, self._count = prefix, 0
+
+    def name(self) -> str:
+        """Name that is not taken."""
+        self._count += 1
+        return f"{self._prefix}{self._count}"
+
+    def word(self, name: str) -> Value:
+        """A whole number that the text knows by this name."""
+        return Value(self, name, True)
+
+    def constant(self, value: int | float) -> str:
+        """Text of a constant."""
+        raise NotImplementedError
+
+    def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
+        """Write an operation; returns the name of its result."""
+        raise NotImplementedError
+
+
+class _LlvmText(_Text):
+    """Vector code for eight lanes."""
+
+    def new(self, expression: str) -> str:
+        name = self.name()
+        self.lines.append(f"{name} = {expression}")
+        return name
+
+    def constant(self, value: int | float) -> str:
+        one = f"i64 {value}" if isinstance(value, int) else f"double 0x{numpy.float64(value).view('u8'):016X}"
+        return "<" + ", ".join([one] * LANES) + ">"
+
+    def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
+        if whole:
+            return self.new(f"{_LLVM[operator]} {WORDS} {one}, {other}")
+        return self.new(f"f{_LLVM.get(operator, 'div')} {VECTOR} {one}, {other}")
+
+    def bits(self, number: Value) -> Value:
+        return Value(self, self.new(f"bitcast {VECTOR} {number.name} to {WORDS}"), True)
+
+    def number(self, bits: Value) -> Value:
+        return Value(self, self.new(f"bitcast {WORDS} {bits.name} to {VECTOR}"), False)
+
+    def sqrt(self, number: Value) -> Value:
+        return Value(self, self.new(f"call {VECTOR} @llvm.sqrt.v{LANES}f64({VECTOR} {number.name})"), False)
+
+    def choose(self, condition: Value, one: Value, other: Value) -> Value:
+        true = self.new(f"icmp ne {WORDS} {condition.name}, zeroinitializer")
+        return Value(
+            self, self.new(f"select {TRUTH} {true}, {VECTOR} {one.name}, {VECTOR} {other.name}"), False
+        )
+
+
+class _CText(_Text):
+    """Scalar code in C99, or CUDA."""
+
+    def new(self, expression: str, whole: bool) -> str:
+        name = self.name()
+        self.lines.append(f"const {'uint64_t' if whole else 'double'} {name} = {expression};")
+        return name
+
+    def constant(self, value: int | float) -> str:
+        return f"UINT64_C({value})" if isinstance(value, int) else f"({value.hex()})"
+
+    def operation(self, operator: str, one: str, other: str, whole: bool) -> str:
+        return self.new(f"{one} {operator} {other}", whole)
+
+    def bits(self, number: Value) -> Value:
+        return Value(self, self.new(f"counter_bits({number.name})", True), True)
+
+    def number(self, bits: Value) -> Value:
+        return Value(self, self.new(f"counter_number({bits.name})", False), False)
+
+    def sqrt(self, number: Value) -> Value:
+        return Value(self, self.new(f"sqrt({number.name})", False), False)
+
+    def choose(self, condition: Value, one: Value, other: Value) -> Value:
+        return Value(self, self.new(f"{condition.name} ? {one.name} : {other.name}", False), False)
+
+
+Make = Callable[[Any, Any, Any], tuple[Any, Any]]
+
+
+def _write_pair(text: Any, make: Make, names: tuple[str, str, str, str]) -> tuple[str, str]:
+    """Write how two numbers are made of key, episode, measurement and pair; returns their names."""
+    one, other = make(text, *pair_of_bits(*(text.word(name) for name in names)))
+    return one.name, other.name
+
+
+def c_text(qualifiers: str = "static inline") -> str:
+    """Functions ``counter_normal_pair`` and ``counter_uniform_pair`` in C99.
+
+    To be compiled without fused operations: ``-ffp-contract=off``, of CUDA ``--fmad=false``.
+
+    Args:
+        qualifiers: written before every function; ``__device__ static`` for CUDA.
+    """
+    given = "uint64_t key, uint64_t episode, uint64_t t, uint64_t pair, double *one, double *other"
+    lines = [
+        "#include <math.h>\n#include <stdint.h>\n#include <string.h>",
+        f"{qualifiers} double counter_number(uint64_t b) {{ double x; memcpy(&x, &b, 8); return x; }}",
+        f"{qualifiers} uint64_t counter_bits(double x) {{ uint64_t b; memcpy(&b, &x, 8); return b; }}",
+    ]
+    makers: dict[str, Make] = {"normal": normal_pair, "uniform": uniform_pair}
+    for kind, make in makers.items():
+        text = _CText("v")
+        one, other = _write_pair(text, make, ("key", "episode", "t", "pair"))
+        lines += [f"{qualifiers} void counter_{kind}_pair({given}) {{", *text.lines]
+        lines += [f"*one = {one};", f"*other = {other};", "}"]
+    return "\n".join(lines) + "\n"
+
+
+def _vector_of(value: str) -> str:
+    """Vector of a scalar, as one expression after the line ``%one.X``."""
+    return f"shufflevector {WORDS} {value}, {WORDS} poison, <{LANES} x i32> zeroinitializer"
+
+
+def _loop(kind: str, make: Make, first_row: str, count: str, first_pair: int, before: str) -> list[str]:
+    """Loop over the pairs of a kind, entered from the block ``before``; it leaves to ``done_KIND``."""
+    text = _LlvmText(f"%{kind}")
+    one, other = _write_pair(text, make, ("%key", "%episode", "%t", f"%pair_{kind}"))
+    return [
+        f"%some_{kind} = icmp sgt i64 {count}, 0",
+        f"br i1 %some_{kind}, label %pairs_{kind}, label %done_{kind}",
+        f"pairs_{kind}:",
+        f"%place_{kind} = phi i64 [0, %{before}], [%next_{kind}, %pairs_{kind}]",
+        f"%half_{kind} = lshr i64 %place_{kind}, 1",
+        f"%number_{kind} = add i64 %half_{kind}, {first_pair}",
+        f"%one_{kind} = insertelement {WORDS} poison, i64 %number_{kind}, i32 0",
+        f"%pair_{kind} = {_vector_of(f'%one_{kind}')}",
+        *text.lines,
+        f"%row_{kind} = add i64 {first_row}, %place_{kind}",
+        f"%start_{kind} = mul i64 %row_{kind}, %stride",
+        f"%at_{kind} = add i64 %start_{kind}, %lane",
+        f"%to_{kind} = getelementptr double, ptr %rows, i64 %at_{kind}",
+        f"store {VECTOR} {one}, ptr %to_{kind}, align 8",
+        # The second number of the last pair may be one too many.
+        f"%beyond_{kind} = getelementptr double, ptr %to_{kind}, i64 %stride",
+        f"%second_{kind} = add i64 %place_{kind}, 1",
+        f"%both_{kind} = icmp slt i64 %second_{kind}, {count}",
+        f"%other_{kind} = select i1 %both_{kind}, ptr %beyond_{kind}, ptr %nowhere",
+        f"store {VECTOR} {other}, ptr %other_{kind}, align 8",
+        f"%next_{kind} = add i64 %place_{kind}, 2",
+        f"%more_{kind} = icmp slt i64 %next_{kind}, {count}",
+        f"br i1 %more_{kind}, label %pairs_{kind}, label %done_{kind}",
+        f"done_{kind}:",
+    ]
+
+
+@functools.cache
+def llvm_text() -> str:
+    """Text whose ``@program(table, first, last)`` goes on to the next measurement in some lanes and makes its numbers.
+
+    The table holds nothing, then address and stride of identities, of measurements and of the rows, then how many of
+    these are normal and how many uniform.
+    """
+    entries = (
+        *(("identities", "ptr", 1), ("apart", "i64", 2), ("measurements", "ptr", 3)),
+        *(("rows", "ptr", 5), ("stride", "i64", 6), ("normals", "i64", 7), ("uniforms", "i64", 8)),
+    )
+    lines = [
+        f"declare {VECTOR} @llvm.sqrt.v{LANES}f64({VECTOR})",
+        "define void @program(ptr %table, i64 %first, i64 %last) {",
+        "entry:",
+        f"%nowhere = alloca {VECTOR}, align 64",
+    ]
+    for name, kind, place in entries:
+        lines += [
+            f"%in_{name} = getelementptr i64, ptr %table, i64 {place}",
+            f"%{name} = load {kind}, ptr %in_{name}",
+        ]
+    lines += [
+        "br label %head",
+        "head:",
+        "%lane = phi i64 [%first, %entry], [%next, %done_uniform]",
+        "%inside = icmp slt i64 %lane, %last",
+        "br i1 %inside, label %body, label %exit",
+        "body:",
+        "%at_key = getelementptr i64, ptr %identities, i64 %lane",
+        "%at_episode = getelementptr i64, ptr %at_key, i64 %apart",
+        "%at_t = getelementptr i64, ptr %measurements, i64 %lane",
+        f"%key = load {WORDS}, ptr %at_key, align 8",
+        f"%episode = load {WORDS}, ptr %at_episode, align 8",
+        f"%before = load {WORDS}, ptr %at_t, align 8",
+        f"%following = add {WORDS} %before, {_LlvmText('').constant(1)}",
+        f"store {WORDS} %following, ptr %at_t, align 8",
+        # The counter's word: code for products of 32 bits may be used where it is known to be one.
+        f"%t = and {WORDS} %following, {_LlvmText('').constant(0xFFFFFFFF)}",
+        *_loop("normal", normal_pair, "0", "%normals", 0, "body"),
+        *_loop("uniform", uniform_pair, "%normals", "%uniforms", UNIFORM_PAIRS, "done_normal"),
+        f"%next = add i64 %lane, {LANES}",
+        "br label %head",
+        "exit:",
+        "ret void",
+        "}",
+    ]
+    return "\n".join(lines)
+
+
+def numbers_code() -> Native:
+    """Compiled :func:`llvm_text`.
+
+    Raises:
+        ImportError: without llvmlite.
+    """
+    return native_text(llvm_text())
+
+
+def bind_numbers(identities: numpy.ndarray, t: numpy.ndarray, rows: numpy.ndarray, normals: int) -> Call:
+    """Return what goes on to the next measurement and makes its numbers, in compiled code.
+
+    Every run adds one to ``t`` and then writes what :func:`~.counter_numbers.numbers` gives there, the same bits. So an
+    episode begins with ``t = -1``: the first run makes the numbers of its start, the next those of its first
+    measurement.
+
+    Args:
+        identities: of the episodes, ``(2, width)`` uint64.
+        t: measurement that was last made, ``(width,)`` int64.
+        rows: written, ``(numbers, width)``; the caller may :meth:`~.functions.Call.replace` it as array 2.
+        normals: how many of its first rows are normal numbers; the others are uniform.
+
+    Raises:
+        ImportError: without llvmlite.
+    """
+    arrays = [identities, t, rows]
+    table = [0]
+    for array in arrays:
+        table += [address_of(array), array.strides[0] // array.itemsize]
+    table += [normals, len(rows) - normals]
+    return Call(numbers_code(), numpy.array(table, dtype=numpy.int64), arrays, numpy.empty(0))
