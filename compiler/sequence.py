@@ -17,8 +17,9 @@ import numpy
 from .functions import Call, address_of, run_over
 from .native import native_text
 
-TILE = 256
-"""Lanes that go through all steps together."""
+TILE = 64
+"""Lanes that go through all steps together: enough that a call costs little beside its numbers, few enough for the
+cache. Of programs of 300 to 80,000 operations all run within a tenth of their fastest tile, from 32 to 512 lanes."""
 
 TEXT = """
 define void @program(ptr %codes, ptr %tables, i64 %calls, ptr %entries, ptr %amounts, i64 %moving,

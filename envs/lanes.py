@@ -270,22 +270,25 @@ class Lanes:
         self.decisions += 1
         return answers
 
-    def run(self, report: Report, steering: Specialised | None = None) -> tuple[Any, Any]:
+    def run(
+        self, report: Report, steering: Specialised | None = None, measurements: int | None = None
+    ) -> tuple[Any, Any]:
         """Run the episodes that have just begun to their end in native code, and report on every measurement.
 
         Args:
             report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
             steering: as of :meth:`.compiled.Stepper.run`; None: the action is zero.
+            measurements: after which they are left, a multiple of the decision interval; default: all.
 
         Returns:
             Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of what steers.
         """
         (stepper,) = self._reporting(report)
         stepper.take(numpy.zeros((self.width, *(self.model.action_space.shape or ()))))
-        answer: tuple[Any, Any] = stepper.run(
-            self.noise, self.decisions_per_episode * self.task.decision_interval, steering
-        )
-        self.decisions += self.decisions_per_episode
+        interval = self.task.decision_interval
+        steps = self.decisions_per_episode * interval if measurements is None else measurements
+        answer: tuple[Any, Any] = stepper.run(self.noise, steps, steering)
+        self.decisions += steps // interval
         return answer
 
     def next_row(self) -> Array:

@@ -642,10 +642,9 @@ def _dataset(
             )
             continue
         example = next(series[key] for series in per_policy.values() if key in series)
-        stacked = numpy.full((len(names), *example.shape), numpy.nan)
+        stacked = numpy.empty((len(names), *example.shape))
         for i, name in enumerate(names):
-            if key in per_policy[name]:
-                stacked[i] = per_policy[name].pop(key)  # so that little is held twice
+            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)
