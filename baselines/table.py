@@ -112,6 +112,7 @@ class ConstantMode(Policy):
     """
 
     control = "mode"
+    traceable = True
 
     def __init__(self, model: Model, mode: int) -> None:
         super().__init__(model)

@@ -17,8 +17,9 @@ from ..envs.backend import make_model
 from ..envs.catalogue import find_scenario, make_task, nearest, short_name
 from ..envs.model import Episode, Model
 from ..envs.task import Scenario
+from ..evaluation.competitors import kind_of
 from ..evaluation.parallel import Workers, check_workers
-from ..evaluation.rollout import Progress, rollout
+from ..evaluation.rollout import Progress, run_competitor
 from ..evaluation.seeds import episode_seeds
 from ..evaluation.store import Store, Work
 from .problem import Problem
@@ -29,8 +30,8 @@ FEWEST = 16
 """Episodes that a process is given at once: of fewer the work is less than what sending it takes."""
 
 
-def _cost(model: Model, episode: Episode) -> numpy.ndarray:
-    return model.cost(episode)
+def _report_cost(model: Model, episode: Episode) -> dict[str, numpy.ndarray]:
+    return {"cost": model.cost(episode)}
 
 
 class Candidate(NamedTuple):
@@ -49,9 +50,10 @@ def _costs(candidate: Candidate, tick: Progress) -> numpy.ndarray:
     keywords, make = candidate.tunable.apply(candidate.values)
     cls, control = candidate.problem.task, candidate.tunable.control
     model = make_model(cls, control, candidate.scenario, backend=candidate.backend, **keywords)
-    # Made already, so that no program is compiled for a candidate that is tried once.
-    run = rollout(model, make(model if control else model.task), candidate.seeds, _cost)
-    return numpy.stack([numpy.asarray(cost[: len(candidate.seeds)]) for cost, _ in run])
+    # Made already, so that no filter is compiled for a candidate that is tried once.
+    competitor = make(model if control else model.task)
+    found = run_competitor(model, competitor, kind_of(competitor), candidate.seeds, _report_cost)
+    return numpy.ascontiguousarray(found["cost"].T)
 
 
 def mean_cost(candidate: Candidate, workers: Workers | None = None) -> float:

@@ -93,7 +93,9 @@ class _Part:
         operation, arguments, logical = self.program.steps[step]
         if step not in self.known:
             self.known.add(step)
-            if operation == "input":
+            if operation == "input" and self.lane_first[arguments[0]]:
+                self._read_by_lanes(arguments[0], arguments[1], f"%v{step}")
+            elif operation == "input":
                 self.new(f"load {VECTOR}, ptr {self.place(*arguments)}, align 8", f"%v{step}")
             elif operation == "constant" and logical:
                 self.compare("une", self.constant(arguments[0]), ZERO, f"%v{step}")
@@ -191,15 +193,27 @@ class _Part:
         if not self.lane_first[argument]:
             self.lines.append(f"store {VECTOR} {value}, ptr {self.place(argument, row)}, align 8")
             return
+        for lane, address in enumerate(self._lane_places(argument, row)):
+            number = self.new(f"extractelement {VECTOR} {value}, i32 {lane}")
+            self.lines.append(f"store double {number}, ptr {address}, align 8")
+
+    def _read_by_lanes(self, argument: int, row: int, name: str) -> None:
+        """Read a row of an argument that is written lane by lane."""
+        value = "poison"
+        for lane, address in enumerate(self._lane_places(argument, row)):
+            number = self.new(f"load double, ptr {address}, align 8")
+            last = name if lane == LANES - 1 else None
+            value = self.new(f"insertelement {VECTOR} {value}, double {number}, i32 {lane}", last)
+
+    def _lane_places(self, argument: int, row: int) -> Iterator[str]:
+        """Addresses of the block's eight numbers in an argument that is written lane by lane."""
         start, stride = self.argument(argument)
         first = self.new(f"mul i64 %lane, {stride}")
         first = self.new(f"add i64 {first}, {row}")
         for lane in range(LANES):
             offset = self.new(f"mul i64 {stride}, {lane}")
             offset = self.new(f"add i64 {offset}, {first}")
-            number = self.new(f"extractelement {VECTOR} {value}, i32 {lane}")
-            address = self.new(f"getelementptr double, ptr {start}, i64 {offset}")
-            self.lines.append(f"store double {number}, ptr {address}, align 8")
+            yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
     def scratch(self, step: int) -> str:
         """Address of a step's value in the scratch array."""

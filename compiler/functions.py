@@ -1,5 +1,6 @@
 """Functions of nested tuples of arrays, compiled for each structure of their arguments."""
 
+import ctypes
 import functools
 import math
 import os
@@ -72,6 +73,7 @@ class Specialised:
         graph: where the constants that the function refers to were made.
         parts: arguments, or others like them.
         turned: write the last array of the answer lane by lane, ``(N, rows)``.
+        given_turned: read the first argument lane by lane, ``(N, rows)``.
         unchanged: an input that is handed on as it is stands for the output: any input for any output (None), or only
             for the output of the same number among so many first ones.
 
@@ -92,6 +94,7 @@ class Specialised:
         parts: Sequence[Any],
         turned: bool = False,
         unchanged: int | None = None,
+        given_turned: bool = False,
     ) -> None:
         self.inputs = [_leaf(array) for part in parts for array in leaves(part)]
         with namespace.tracing(graph):
@@ -123,6 +126,7 @@ class Specialised:
         self.program: Program = program(graph, wanted)
         self.lane_first = [False] * (len(self.inputs) + len(self.outputs))
         self.lane_first[-1] = turned
+        self.lane_first[0] |= given_turned
         self.native: Native | None = None
 
     def compile(self, library: Library | None = None) -> None:
@@ -192,9 +196,18 @@ class Call:
         self.address = address_of(table)
 
     def replace(self, place: int, array: numpy.ndarray) -> None:
-        """Read or write another array of the same form from now on."""
+        """Read or write another array of the same shape from now on."""
         self.arrays[place] = array
-        self.table[1 + 2 * place] = address_of(array)
+        self.table[1 + 2 * place : 3 + 2 * place] = address_of(array), _stride(array)
+
+    def copy(self) -> "Call":
+        """Return the same call with a table of its own."""
+        return Call(self.native, self.table.copy(), list(self.arrays), self._constants)
+
+    @property
+    def native_address(self) -> int:
+        """Address of the code."""
+        return ctypes.cast(self.native, ctypes.c_void_p).value or 0  # type: ignore[arg-type]
 
     def __call__(self, first: int, last: int) -> None:
         """Run from one lane to another."""

@@ -65,6 +65,8 @@ def _target() -> Any:
 
 Native = Callable[[int, int, int], None]
 """Called with the address of the table of arguments, and with the lanes from where to where."""
+NATIVE = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+"""The same for ctypes."""
 
 
 def native(program: Program, lane_first: Sequence[bool], library: Library | None = None) -> Native:
@@ -83,15 +85,16 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         if known not in _LIBRARIES:
             for own in library.functions.values():
                 binding.add_symbol(own.symbol, own.address)
-            _LIBRARIES[known] = _load(emit(program, lane_first, library), name, features)
+            _LIBRARIES[known] = _load(emit(program, lane_first, library), name, features, NATIVE)
         return _LIBRARIES[known]
 
 
-def native_text(text: str) -> Native:
-    """Return code of a text that calls no function: only what every processor computes alike.
+def native_text(text: str, signature: Any = NATIVE) -> Any:
+    """Return code of a text that calls no function by its name: only what every processor computes alike.
 
     Args:
-        text: of LLVM, with an entry ``@program(table, first, last)``.
+        text: of LLVM, with an entry ``@program``.
+        signature: of the entry, as ctypes writes it; default: ``(table, first, last)``, as of :data:`Native`.
 
     Raises:
         ImportError: without llvmlite.
@@ -100,11 +103,11 @@ def native_text(text: str) -> Native:
         name, features = processor()
         known = cache.key(text, name, features)
         if known not in _LIBRARIES:
-            _LIBRARIES[known] = _load(text, name, features)
+            _LIBRARIES[known] = _load(text, name, features, signature)
         return _LIBRARIES[known]
 
 
-def _load(text: str, name: str, features: str) -> Native:
+def _load(text: str, name: str, features: str, signature: Any) -> Any:
     """Translate a text, or find it in the cache."""
     binding = llvm()
     key = cache.key(text, name, features, ".".join(map(str, binding.llvm_version_info)))
@@ -118,9 +121,7 @@ def _load(text: str, name: str, features: str) -> Native:
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _ENGINES.append(engine)
-    signature = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-    function: Native = signature(engine.get_function_address("program"))
-    return function
+    return signature(engine.get_function_address("program"))
 
 
 _LIBRARIES: dict[str, Native] = {}

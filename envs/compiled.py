@@ -31,6 +31,7 @@ from ..compiler.functions import (
 from ..compiler.namespace import NotTraceable
 from ..compiler.native import AVAILABLE
 from ..compiler.program import Graph
+from ..compiler.sequence import CallSequence, Moving, moving_array
 from .draws import Draws
 from .episode_noise import EpisodeNoise
 from .filter import Filter, Input
@@ -137,6 +138,7 @@ class Programs:
         self._functions: dict[Any, Function] = {}
         self._of_world = of_world or self
         self._with_filter: dict[Any, Programs] = {}
+        self._kept: dict[Any, Any] = {}
 
     def with_filter(self, make: Callable[[Model], Filter]) -> "Programs":
         """Return what is traced of the task with another filter; kept for the next time.
@@ -153,6 +155,15 @@ class Programs:
                 self._with_filter.pop(next(iter(self._with_filter)))
             self._with_filter[make] = programs
         return self._with_filter[make]
+
+    def keep(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Return what is compiled for the task beside it, made where there is none by this key; the last ones stay."""
+        if key not in self._kept:
+            made = make()
+            while len(self._kept) >= PROGRAM_CACHE_SIZE:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = made
+        return self._kept[key]
 
     def function(self, function: Callable[..., Any], **options: Any) -> Function:
         """Compiled form of ``function(task, ...)``."""
@@ -477,6 +488,7 @@ class Stepper:
         self._small: dict[int, Stepper] = {}
         """Steppers in which the episodes of a few lanes begin, by their width."""
         self._row_entry = 1 + 2 * (len(advance.inputs) - 1)
+        self._action_place, self._report_place = len(update.inputs) - 1, len(tell.inputs)
 
     def load(self, episode: Episode, shown: Array = None) -> None:
         """Go on from other episodes, which show what is given, ``(fields, width)``."""
@@ -550,6 +562,54 @@ class Stepper:
                     call(start, min(start + TILE, last))
 
         run_over(tiles, self.width, self._threads)
+
+    def run(self, noise: EpisodeNoise, steps: int, steering: Specialised | None) -> tuple[Any, Any]:
+        """Go through many measurements without going back to Python between them.
+
+        Args:
+            noise: of the measurements.
+            steps: how many.
+            steering: function of what is shown, read lane by lane, and of a memory that begins with zeros, to an action
+                and the memory. None: the action stays as it is.
+
+        Returns:
+            The report on every measurement, in arrays ``(steps, ..., width)``, and the actions, likewise; None where
+            nothing steers.
+        """
+        if self._given:
+            self._show_in(self._shown.copy())
+        reported = [empty_lanes((steps, *array.shape[:-1]), self.width) for array in self._reported]
+        actions, memories = None, [self._blank_memory(steering), self._blank_memory(steering)]
+        if steering is not None:
+            actions = empty_lanes((steps, *self.action.shape[:-1]), self.width)
+        draw = noise.call_of_each()
+        turns: list[list[Call]] = []
+        moving: list[Moving] = []
+        for now in (self._now, 1 - self._now):
+            update, tell, advance, predict = (call.copy() for call in self._calls[now])
+            advance.table[self._row_entry] = noise.address
+            moving += [moving_array(tell, self._report_place + i, each) for i, each in enumerate(reported)]
+            turns.append([update, tell, draw, advance, predict])
+            if steering is not None and actions is not None:
+                steer = steering.bound([self._shown, *memories[0]], [actions[0], *memories[1]])
+                turns[-1].insert(0, steer)
+                moving.append(moving_array(steer, 1 + len(memories[0]), actions))
+                moving.append(moving_array(update, self._action_place, actions))
+                memories.reverse()
+        CallSequence(turns[0], turns[1], moving).run(steps, self.width, self._threads)
+        self._now = (self._now + steps) % 2
+        answers = [
+            array if kind == "f" else array.astype(DTYPES[kind])
+            for array, kind in zip(reported, self._report_kinds, strict=True)
+        ]
+        return map_arrays(lambda i: answers[i], self._report_template), actions
+
+    def _blank_memory(self, steering: Specialised | None) -> list[numpy.ndarray]:
+        """Memory of what steers before its first action."""
+        blank = [empty_lanes(leaf.shape, self.width) for leaf in steering.outputs[1:]] if steering else []
+        for array in blank:
+            array[...] = 0.0
+        return blank
 
     def report(self) -> Any:
         """Return the last report, in arrays ``(..., width)`` that stay as they are."""

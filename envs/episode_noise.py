@@ -169,6 +169,15 @@ class EpisodeNoise:
         self._due = False
         return (self._next or self._next_call(),)
 
+    def call_of_each(self) -> Call:
+        """Return what goes on to the next measurement and makes its numbers at :attr:`address`.
+
+        It is for whoever goes on over several in native code, and is run at least once.
+        """
+        self.advance()
+        self._due = False
+        return self._next_call()
+
     @property
     def address(self) -> int:
         """Address of the memory that :meth:`calls` write, rows apart as those of :func:`empty_lanes`."""

@@ -18,7 +18,7 @@ import gymnasium
 import numpy
 
 from ..compiler.emission import LANES
-from ..compiler.functions import map_arrays, round_up_lanes
+from ..compiler.functions import Specialised, map_arrays, round_up_lanes
 from ..filters.ordered_sums import ordered_sum
 from .compiled import Report, Stepper, can_step
 from .episode_noise import EpisodeNoise
@@ -269,6 +269,27 @@ class Lanes:
             own.show_means(self._averaged, total / self.task.decision_interval)
         self.decisions += 1
         return answers
+
+    def run(
+        self, report: Report, steering: Specialised | None = None, measurements: int | None = None
+    ) -> tuple[Any, Any]:
+        """Run the episodes that have just begun to their end in native code, and report on every measurement.
+
+        Args:
+            report: that :func:`.compiled.can_step` with, as of :meth:`decide`.
+            steering: as of :meth:`.compiled.Stepper.run`; None: the action is zero.
+            measurements: after which they are left, a multiple of the decision interval; default: all.
+
+        Returns:
+            Reports, arrays ``(measurements, ..., width)``, and the actions, likewise, of what steers.
+        """
+        (stepper,) = self._reporting(report)
+        stepper.take(numpy.zeros((self.width, *(self.model.action_space.shape or ()))))
+        interval = self.task.decision_interval
+        steps = self.decisions_per_episode * interval if measurements is None else measurements
+        answer: tuple[Any, Any] = stepper.run(self.noise, steps, steering)
+        self.decisions += steps // interval
+        return answer
 
     def next_row(self) -> Array:
         """Noise of the next measurement, ``(row width, width)`` of episodes that are stepped elsewhere."""

@@ -102,6 +102,10 @@ class Policy:
     kind: ClassVar[Kind] = "policy"
     control: ClassVar[str]
     """The control that the policy's actions are meant for."""
+    traceable: ClassVar[bool] = False
+    """Whether :meth:`act` is compiled where the steps of the model are: it computes with NumPy alone, no value decides
+    what is executed, its memory is nested tuples of arrays, batch first, of which only the values depend on the
+    observations, and nothing is kept in the object. A class with another ``act`` says it anew."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -145,6 +149,16 @@ class Policy:
         raise NotImplementedError
 
 
+def says_traceable(policy: Any) -> bool:
+    """Whether a policy says of its own methods, not of those that they replace, that they can be traced."""
+    for cls in type(policy).__mro__:
+        if "traceable" in vars(cls):
+            return bool(vars(cls)["traceable"])
+        if vars(cls).keys() & {"act", "predict", "begin"}:
+            break
+    return False
+
+
 class FunctionPolicy(Policy):
     """Actions by a function of the observation: how an agent of any library is evaluated.
 
@@ -173,6 +187,7 @@ class FunctionPolicy(Policy):
 class ConstantPolicy(Policy):
     """The same action always."""
 
+    traceable = True
     action: tuple[float, ...]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:

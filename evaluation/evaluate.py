@@ -28,7 +28,7 @@ from .competitors import TOLD_MORE, Kind, kind_of
 from .dataset import FAULTS, group_of_each, keywords_as_text, whole_number, with_windows
 from .innovations import with_innovations
 from .parallel import Workers, check_workers
-from .rollout import Progress, Series, rollout
+from .rollout import More, Progress, run_episodes
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
@@ -159,10 +159,8 @@ def _limits(model: Model, episode: Episode) -> dict[str, Any]:
     return model.filter.records(episode.filter, episode.measurement)
 
 
-def _report(model: Model, tracks: bool, drawn: bool) -> Report:
+def _report(model: Model, tracks: bool) -> Report:
     """What is kept of every measurement of a task."""
-    if drawn:
-        return _track_and_drawing if tracks else _measurement_and_drawing
     if model.task.has_truth:
         return _measurement_and_track if tracks else _measurement_report
     return _expectation_and_track if tracks else _expectation_report
@@ -319,23 +317,22 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
 
     Of a policy whose action is a box that is ``action``, too, within the limits of the box, as every bank takes it.
     """
-    experiment, kind, count = piece.experiment, piece.kind, len(piece.seeds)
+    experiment, kind = piece.experiment, piece.kind
     model = piece.model or experiment.make_model(piece.maker, piece.control)
-    drawn = experiment.drawn_episodes - piece.first
-    report = _limits if kind == "bound" else _report(model, experiment.tracks, drawn > 0)
-    boxed = kind == "policy" and isinstance(model.action_space, gymnasium.spaces.Box)
-    series = Series(count, {DRAWN_PREFIX: drawn})
-    steps = rollout(model, piece.maker, piece.seeds, report, kind=kind, name=piece.name)
-    for step, (found, action) in enumerate(steps, 1):
-        if kind == "policy":
-            _check_reserved(model, found)
-        if experiment.strict and "lost" in found:
-            _refuse_losses(piece, found["lost"][:count], step)
-        series.add(found)
-        if boxed:
-            series.add({"action": _limit_actions(model.action_space, action, count)})
-        tick(count)
-    arrays = series.arrays()
+    report, drawn = _limits if kind == "bound" else _report(model, experiment.tracks), None
+    if kind != "bound" and experiment.drawn_episodes > piece.first:
+        most = experiment.drawn_episodes - piece.first
+        drawn = More(
+            _track_and_drawing if experiment.tracks else _measurement_and_drawing, most, DRAWN_PREFIX
+        )
+    flown = run_episodes(model, piece.maker, kind, piece.seeds, report, piece.name, tick, drawn)
+    arrays = dict(flown.found)
+    if kind == "policy":
+        _check_reserved(model, arrays)
+    if experiment.strict and "lost" in arrays:
+        _refuse_losses(piece, arrays["lost"])
+    if flown.action is not None and isinstance(model.action_space, gymnasium.spaces.Box):
+        arrays["action"] = _limit_actions(model.action_space, flown.action)
     if kind in ("estimator", "smoother", "reference"):
         for name in LIKELIHOOD:
             if name in arrays and numpy.isnan(arrays[name]).all():
@@ -343,10 +340,10 @@ def run_piece(piece: Piece, tick: Progress) -> dict[str, numpy.ndarray]:
     return arrays
 
 
-def _limit_actions(box: Any, action: Any, count: int) -> numpy.ndarray:
-    """Return the actions that are applied, within the limits of their box, ``(A, count)``."""
+def _limit_actions(box: Any, action: numpy.ndarray) -> numpy.ndarray:
+    """Return the actions that are applied, within the limits of their box, ``(episodes, time, A)``."""
     bounded = numpy.clip(numpy.asarray(action, dtype=numpy.float64), box.low, box.high)
-    return bounded.reshape(count, -1).T
+    return bounded.reshape(*action.shape[:2], -1)
 
 
 def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
@@ -358,12 +355,19 @@ def _check_reserved(model: Model, found: Mapping[str, Any]) -> None:
         )
 
 
-def _refuse_losses(piece: Piece, faults: numpy.ndarray, step: int) -> None:
-    """Raise ValueError if an episode is lost at a measurement."""
+def _refuse_losses(piece: Piece, faults: numpy.ndarray) -> None:
+    """Raise ValueError if an episode is lost, for the first measurement at which one is.
+
+    Args:
+        piece: of the competitor.
+        faults: numbers of the reasons, ``(episodes, time)``.
+    """
     if faults.any():
-        i = int(numpy.argmax(faults > 0.0))
+        step = int(numpy.argmax((faults > 0.0).any(axis=0)))
+        i = int(numpy.argmax(faults[:, step] > 0.0))
         raise ValueError(
-            f"estimator {piece.name!r}: {FAULTS[int(faults[i]) - 1]} in episode {piece.first + i} at measurement {step}"
+            f"estimator {piece.name!r}: {FAULTS[int(faults[i, step]) - 1]} in episode {piece.first + i} at measurement "
+            f"{step + 1}"
         )
 
 
@@ -638,10 +642,9 @@ def _dataset(
             )
             continue
         example = next(series[key] for series in per_policy.values() if key in series)
-        stacked = numpy.full((len(names), *example.shape), numpy.nan)
+        stacked = numpy.empty((len(names), *example.shape))
         for i, name in enumerate(names):
-            if key in per_policy[name]:
-                stacked[i] = per_policy[name].pop(key)  # so that little is held twice
+            stacked[i] = per_policy[name].pop(key, numpy.nan)  # so that little is held twice
         dims = ["policy", "drawn_episode" if key.startswith(DRAWN_PREFIX) else "episode", "time"]
         dims += _further_dimensions(key, example.ndim - 3)
         variables[key] = (dims, stacked)

@@ -1,12 +1,14 @@
 """Episodes from their seeds to their end, with whatever competes in the loop."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy
 
-from ..compiler.functions import round_up_lanes
-from ..envs.compiled import Report
+from ..compiler.functions import Specialised, round_up_lanes
+from ..envs.compiled import CompiledModel, Report, can_step
+from ..envs.environment import check_action
 from ..envs.episode_noise import identities_of_seeds, start_numbers
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
@@ -14,6 +16,7 @@ from ..envs.observation import Array
 from .competitors import Kind, check_competitor, kind_of, make_competitor
 from .filters import put_in_loop
 from .smoothers import SmoothedTrack, check_open_loop, run_forward
+from .steered_filter import compile_policy, trace_policy
 from .stepping import SteppingPolicy
 
 Progress = Callable[[int], None]
@@ -60,23 +63,39 @@ def rollout(
         action applied to it, batch first.
     """
     kind = kind or kind_of(competitor)
-    if kind == "smoother":
-        check_open_loop(model, name)
-        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
-    if kind != "policy":
-        model = put_in_loop(model, competitor, kind, name, len(seeds))
-        lanes, action = start_lanes(model, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
-        for _ in range(lanes.decisions_per_episode):
-            for found, _ in lanes.decide(action, report):
-                yield found, action
+    if kind == "policy":
+        yield from _steer_by_python(model, competitor, seeds, report, name)
         return
+    yield from _step_filter(_put_in_loop(model, competitor, kind, seeds, name), seeds, report)
+
+
+def _step_filter(looped: Model, seeds: Sequence[int], report: Report) -> Iterator[tuple[Any, Array]]:
+    """Step a filter that needs nobody who steers it."""
+    lanes, action = start_lanes(looped, seeds), numpy.zeros(len(seeds), dtype=numpy.int64)
+    for _ in range(lanes.decisions_per_episode):
+        for found, _ in lanes.decide(action, report):
+            yield found, action
+
+
+def _steer_by_python(
+    model: Model, competitor: Any, seeds: Sequence[int], report: Report, name: str
+) -> Iterator[tuple[Any, Array]]:
+    """Step a bank, and ask its policy before every decision."""
     lanes = start_lanes(model, seeds)
-    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), kind))
+    policy = SteppingPolicy(model, check_competitor(name, make_competitor(competitor, model), "policy"))
     memory = policy.begin(seeds)
     for _ in range(lanes.decisions_per_episode):
         action, memory = policy.predict(lanes.observe(), memory)
         for found, _ in lanes.decide(action, report):
             yield found, action
+
+
+def _put_in_loop(model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], name: str) -> Model:
+    """Return a model whose filter is a competitor, of a smoother what it has found in these episodes."""
+    if kind == "smoother":
+        check_open_loop(model, name)
+        competitor, kind = SmoothedTrack(*_smoothed_estimates(model, competitor, seeds, name)), "estimator"
+    return put_in_loop(model, competitor, kind, name, len(seeds))
 
 
 def _smoothed_estimates(
@@ -102,50 +121,40 @@ def _smoothed_estimates(
     return means[..., last], covariances[..., last]
 
 
-class Series:
-    """What is kept of every measurement of episodes that run side by side.
+class More(NamedTuple):
+    """What is reported of the first episodes only; of all it would take much memory."""
 
-    Args:
-        episodes: how many run.
-        fewer: beginning of names -> of how many of the first episodes these are kept; everything else of all.
-    """
-
-    def __init__(self, episodes: int, fewer: Mapping[str, int] | None = None) -> None:
-        self.episodes, self.fewer = episodes, fewer or {}
-        self._counts: dict[str, int] = {}
-        self._values: dict[str, list[numpy.ndarray]] = {}
-
-    def add(self, found: Mapping[str, Any]) -> None:
-        """Keep what is there after a measurement, arrays ``(..., N)`` by name, padding beyond the episodes."""
-        for name, values in found.items():
-            if name not in self._values:
-                counts = [count for beginning, count in self.fewer.items() if name.startswith(beginning)]
-                self._counts[name], self._values[name] = min([self.episodes, *counts]), []
-            count = self._counts[name]
-            kept = values[..., :count]
-            # A view of a few episodes would keep the numbers of all.
-            kept = kept.copy() if count < self.episodes else kept
-            self._values[name].append(kept)
-
-    def arrays(self) -> dict[str, numpy.ndarray]:
-        """Return what was kept, ``(episodes, time, ...)`` by name."""
-        return {name: _by_episodes(values) for name, values in self._values.items()}
+    report: Report
+    """Of all that is reported of them."""
+    episodes: int
+    """How many they are."""
+    prefix: str
+    """Begins the names of what is not reported of the others."""
 
 
-def _by_episodes(values: Sequence[numpy.ndarray]) -> numpy.ndarray:
-    """Put the arrays ``(..., N)`` of T measurements into one, ``(N, T, ...)``, rows one after the other."""
-    first = values[0]
-    together = numpy.empty(
-        (first.shape[-1], len(values), *first.shape[:-1]), dtype=numpy.result_type(*values[:1])
-    )
-    numpy.stack(values, out=numpy.moveaxis(together, 0, -1), casting="same_kind")
-    return together
+class Flown(NamedTuple):
+    """What is reported of episodes that were run to their end."""
+
+    found: dict[str, numpy.ndarray]
+    """Arrays ``(episodes, time, ...)`` by name; not always one row after the other in memory."""
+    action: numpy.ndarray | None
+    """That a policy applied to each measurement, ``(episodes, time, ...)``; None of what has none."""
 
 
-def run_competitor(
-    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
-) -> dict[str, numpy.ndarray]:
+def run_episodes(
+    model: Model,
+    competitor: Any,
+    kind: Kind,
+    seeds: Sequence[int],
+    report: Report,
+    name: str = "competitor",
+    tick: Progress | None = None,
+    more: More | None = None,
+) -> Flown:
     """Run whatever competes over one episode for each seed, and return what is reported of every measurement.
+
+    Where everything is compiled, world, filter, policy and report, all episodes are one call of native code; else they
+    are stepped. The numbers are the same.
 
     Args:
         model: as in :func:`rollout`, likewise what follows.
@@ -153,11 +162,110 @@ def run_competitor(
         kind: likewise.
         seeds: likewise.
         report: of arrays ``(..., N)`` by name.
-
-    Returns:
-        Arrays ``(episodes, time, ...)`` by name.
+        name: of the competitor, in errors.
+        tick: told of measurements done.
+        more: what is reported of the first episodes beside it.
     """
-    series = Series(len(seeds))
-    for found, _ in rollout(model, competitor, seeds, report, kind=kind):
-        series.add(found)
-    return series.arrays()
+    count, steering, tick = len(seeds), None, tick or (lambda measurements: None)
+    steers = kind == "policy"
+    looped = model if steers else _put_in_loop(model, competitor, kind, seeds, name)
+    if steers:
+        steering = _steering_of(model, competitor, name)
+    compiled = can_step(looped, report) and (more is None or can_step(looped, more.report))
+    if compiled and (steering is not None or not steers):
+        first = 0 if more is None else min(more.episodes, count)
+        parts = [] if more is None else [_run_compiled(looped, steering, seeds[:first], more.report, tick)]
+        if first < count:
+            parts.append(_run_compiled(looped, steering, seeds[first:], report, tick))
+        return _one_after_another(parts)
+    steps = (
+        _steer_by_python(model, competitor, seeds, report if more is None else more.report, name)
+        if steers
+        else _step_filter(looped, seeds, report if more is None else more.report)
+    )
+    return _step_episodes(steps, count, steers, tick, more)
+
+
+def _run_compiled(
+    looped: Model, steering: Specialised | None, seeds: Sequence[int], report: Report, tick: Progress
+) -> Flown:
+    """Run compiled episodes as one call of native code."""
+    lanes, count = start_lanes(looped, seeds), len(seeds)
+    reports, actions = lanes.run(report, steering)
+    tick(count * lanes.decisions_per_episode * looped.task.decision_interval)
+    found = {name: _episodes_first(values, count) for name, values in reports.items()}
+    return Flown(found, None if actions is None else _checked_actions(looped, actions, count))
+
+
+def _one_after_another(parts: Sequence[Flown]) -> Flown:
+    """Join episodes; what is reported of some only is theirs alone."""
+    if len(parts) == 1:
+        return parts[0]
+    found = {
+        name: numpy.concatenate([part.found[name] for part in parts if name in part.found])
+        for name in parts[0].found
+    }
+    actions = [part.action for part in parts if part.action is not None]
+    return Flown(found, numpy.concatenate(actions) if actions else None)
+
+
+def _step_episodes(
+    steps: Iterator[tuple[Any, Array]], count: int, steers: bool, tick: Progress, more: More | None
+) -> Flown:
+    """Keep what is reported of episodes that are stepped."""
+    series: dict[str, list[numpy.ndarray]] = {}
+    actions = []
+    for found, action in steps:
+        for name, values in found.items():
+            if more is not None and name.startswith(more.prefix):
+                values = values[..., : more.episodes].copy()  # a view would keep the numbers of all
+            series.setdefault(name, []).append(values)
+        actions.append(numpy.asarray(action))
+        tick(count)
+    together = {name: _episodes_first(numpy.stack(values), count) for name, values in series.items()}
+    return Flown(together, numpy.stack(actions, axis=1) if steers else None)
+
+
+def _steering_of(model: Model, competitor: Any, name: str) -> Specialised | None:
+    """Return what steers the model in native code; None of a policy that is asked in Python."""
+
+    def trace() -> Specialised | None:
+        policy = check_competitor(name, make_competitor(competitor, model), "policy")
+        found: Specialised | None = compile_policy(model, policy, trace_policy)
+        return found
+
+    if not isinstance(model, CompiledModel):
+        return None
+    try:
+        return model.programs.keep((run_episodes, competitor), trace)
+    except TypeError:  # it has no hash
+        return trace()
+
+
+def _episodes_first(values: numpy.ndarray, count: int) -> numpy.ndarray:
+    """Return a view ``(episodes, time, ...)`` of arrays ``(time, ..., N)``, without the padding."""
+    return numpy.moveaxis(values[..., :count], -1, 0)
+
+
+def _checked_actions(model: Model, actions: numpy.ndarray, count: int) -> numpy.ndarray:
+    """Return actions ``(time, ..., N)``, episodes first.
+
+    Raises:
+        ValueError: for the first that is not in the action space, but for the limits of a box.
+    """
+    space, kept = model.action_space, _episodes_first(actions, count)
+    if isinstance(space, gymnasium.spaces.Discrete):
+        kept = kept.astype(numpy.int64)
+        wrong = (kept < 0) | (kept >= space.n)
+    else:
+        wrong = ~numpy.isfinite(kept)
+    for k in numpy.flatnonzero(wrong.any(axis=(0, *range(2, wrong.ndim))))[:1]:
+        check_action(space, kept[:, k], count)
+    return kept
+
+
+def run_competitor(
+    model: Model, competitor: Any, kind: Kind, seeds: Sequence[int], report: Report
+) -> dict[str, numpy.ndarray]:
+    """Run whatever competes, see :func:`run_episodes`, and return what is reported, ``(episodes, time, ...)``."""
+    return run_episodes(model, competitor, kind, seeds, report).found

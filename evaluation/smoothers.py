@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy
 
+from ..compiler.functions import map_arrays
 from ..envs.failures import explain_errors
 from ..envs.filter import Initial
 from ..envs.lanes import Lanes, whole_episode
-from ..envs.model import Model
+from ..envs.model import Episode, Model
 from ..envs.observation import Array
 
 
@@ -67,17 +68,9 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
         ValueError: if what it returns has other shapes.
     """
     python = looped.filter.in_python
-
-    def memory_in(episode: Any) -> Any:
-        return looped.filter.own.memory if python else episode.filter.memory
-
-    measurements: list[Any] = []
-    memories = [memory_in(lanes.state)]
-    action = numpy.zeros(lanes.count, dtype=numpy.int64)
-    while len(measurements) < length:
-        for episode, _ in lanes.decide(action, whole_episode):
-            measurements.append(looped.task.world.mask_missing(episode.measurement))
-            memories.append(memory_in(episode))
+    measurements, memories = (
+        _step_forward(looped, lanes, length) if python else _run_compiled(looped, lanes, length)
+    )
     own = looped.filter.own.own if python else looped.filter.own
     with explain_errors(f"smoother {name!r} failed after {length} measurements"):
         means, covariances = own.smooth(measurements, memories)
@@ -86,6 +79,41 @@ def run_forward(looped: Model, lanes: Lanes, length: int, name: str) -> tuple[nu
         _check_shape("means", means, (C, length, lanes.width), name),
         _check_shape("covariances", covariances, (C, C, length, lanes.width), name),
     )
+
+
+def _step_forward(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
+    """Measurements and memories of a smoother that is stepped."""
+
+    def memory_in(episode: Any) -> Any:
+        return looped.filter.own.memory if looped.filter.in_python else episode.filter.memory
+
+    measurements: list[Any] = []
+    memories = [memory_in(lanes.state)]
+    action = numpy.zeros(lanes.count, dtype=numpy.int64)
+    while len(measurements) < length:
+        for episode, _ in lanes.decide(action, whole_episode):
+            measurements.append(looped.task.world.mask_missing(episode.measurement))
+            memories.append(memory_in(episode))
+    return measurements, memories
+
+
+def report_forward(model: Model, episode: Episode) -> tuple[Any, Any]:
+    """Report what a smoother is given back."""
+    return episode.measurement, episode.filter.memory
+
+
+def _run_compiled(looped: Model, lanes: Lanes, length: int) -> tuple[list[Any], list[Any]]:
+    """The same of one that is compiled; its measurements are masked afterwards, as it is shown them."""
+    first = lanes.state.filter.memory
+    kept, _ = lanes.run(report_forward, measurements=length)
+    moments = [_moment(kept, k) for k in range(length)]
+    measurements = [looped.task.world.mask_missing(measurement) for measurement, _ in moments]
+    return measurements, [first, *(memory for _, memory in moments)]
+
+
+def _moment(kept: Any, k: int) -> Any:
+    """What was kept of a measurement, rows one after the other: by these matrix products round."""
+    return map_arrays(lambda values: numpy.ascontiguousarray(values[k]), kept)
 
 
 def _check_shape(word: str, values: Any, shape: Sequence[int], name: str) -> numpy.ndarray:

@@ -3,25 +3,29 @@
 Traced for one track, its arithmetic is a straight line: what steers is then compiled and exported with its bank.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy
 
-from ..compiler.functions import leaves, map_arrays
+from ..compiler import namespace
+from ..compiler.emission import LANES
+from ..compiler.functions import Function, Specialised, leaves, map_arrays
+from ..compiler.namespace import NotTraceable
+from ..compiler.program import Graph
+from ..envs.compiled import CompiledModel, warn_of
 from ..envs.filter import Filter, Input
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
-from .competitors import Policy
+from .competitors import Policy, says_traceable
 
 
-class Steered(NamedTuple):
-    """State of a steered filter."""
+class Decisions(NamedTuple):
+    """What a policy has decided so far, and remembers."""
 
-    bank: Any
-    """Of the bank."""
     memory: Any
-    """What the policy remembers, every array as ``(entries, N)``; before its first decision zeros."""
+    """Of the policy, every array as ``(entries, N)``; before its first decision zeros."""
     count: Array
     """Measurements taken in since the last decision, that of the decision among them; zero before the first one,
     ``(N,)``."""
@@ -36,53 +40,43 @@ Act = Callable[[Array, Any, Array], tuple[Array, Any]]
 ``(1,)`` and the memory."""
 
 
-class SteeredFilter(Filter[Any, Any, Steered]):
-    """A bank closed by a policy, for one track: N is 1, or the arrays are traced.
+class Decider:
+    """A policy asked at every measurement, of whose answers those stand that are due.
+
+    Its arithmetic is that of NumPy on one track, or on traced arrays: then it serves any number.
 
     Args:
-        model: with the bank.
+        model: whose observations it is shown.
         act: asks the policy.
         memory: that the policy returns, arrays of one track; their values do not matter.
         interval: measurements for which an action holds; default: the task's decision interval.
     """
 
     def __init__(self, model: Model, act: Act, memory: Any, interval: int | None = None) -> None:
-        super().__init__(model.task)
-        self.model, self.bank, self.ask = model, model.filter, act
+        self.xp, self.ask, self._template = model.task.xp, act, memory
         self._shapes = shapes_of(memory)
-        self._template = memory
-        self.interval = self.task.decision_interval if interval is None else interval
+        self._fields = len(model.fields)
+        self.space = model.action_space
+        self.size = math.prod(self.space.shape or (1,))
+        self.interval = model.task.decision_interval if interval is None else interval
         averaged = [i for i, f in enumerate(model.fields) if f.over_interval == "mean"]
         self.averaged = averaged if self.interval > 1 else []
 
-    def start(self, initial: Any) -> Steered:
-        """Start the bank; the policy begins at its first decision."""
-        zero = 0.0 * initial.mean[0]
+    def start(self, zero: Array) -> Decisions:
+        """Nothing is decided yet; all numbers are zero, ``(N,)``."""
         memory = map_arrays(
             lambda array: self.xp.stack([zero] * max(int(numpy.size(array)), 1)), self._template
         )
-        size = int(numpy.prod(self.bank.action_space.shape or (1,)))
-        return Steered(
-            self.bank.start(initial),
-            memory,
-            zero,
-            self.xp.stack([zero] * size),
-            self.xp.stack([zero] * max(len(self.averaged), 1)),
-        )
+        action = self.xp.stack([zero] * self.size)
+        return Decisions(memory, zero, action, self.xp.stack([zero] * max(len(self.averaged), 1)))
 
-    def predict(self, state: Steered, measurement: Any) -> Steered:
-        """Predict in the bank."""
-        return state._replace(bank=self.bank.predict(state.bank, measurement))
-
-    def is_due(self, state: Steered) -> Array:
+    def is_due(self, state: Decisions) -> Array:
         """Whether the policy is asked at the next measurement, ``(N,)``."""
-        first = state.count == 0.0
-        return first | (state.count >= float(self.interval))
+        return (state.count == 0.0) | (state.count >= float(self.interval))
 
-    def update(self, state: Steered, given: Input) -> Steered:
-        """Ask the policy where a decision is due, and apply its action."""
+    def decide(self, observation: Array, state: Decisions) -> tuple[Array, Decisions]:
+        """Return the action in force, ``(A, N)`` floats or ``(N,)`` integers, after an observation ``(fields, N)``."""
         xp, K = self.xp, self.interval
-        observation = self.model.observe(Episode(None, given.measurement, state.bank))
         first = state.count == 0.0
         due, total = self.is_due(state), state.total
         if self.averaged:
@@ -90,21 +84,20 @@ class SteeredFilter(Filter[Any, Any, Steered]):
             means = xp.where(first, xp.stack([observation[i] for i in self.averaged]), total / K)
             place = {field: i for i, field in enumerate(self.averaged)}
             observation = xp.stack(
-                [means[place[i]] if i in place else observation[i] for i in range(len(self.model.fields))]
+                [means[place[i]] if i in place else observation[i] for i in range(self._fields)]
             )
             total = xp.where(due, 0.0, total)
-        answer, memory = self._decide(observation, state.memory, first)
+        answer, memory = self._ask(observation, state.memory, first)
         if K > 1:
             answer = xp.where(due, answer, state.action)
             kept = iter(leaves(state.memory))
             memory = map_arrays(lambda array: xp.where(due, array, next(kept)), memory)
-        action = answer if self.bank.action_space.shape else xp.astype(answer[0], xp.int64)
-        bank = self.bank.act(state.bank, given.measurement, action)
+        action = answer if self.space.shape else xp.astype(answer[0], xp.int64)
         # Never more than the interval: float has no whole numbers beyond 2^24 for a filter that runs for days.
         count = xp.where(due, 1.0, state.count + 1.0) if K > 1 else xp.ones_like(state.count)
-        return Steered(bank, memory, count, answer, total)
+        return action, Decisions(memory, count, answer, total)
 
-    def _decide(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
+    def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
         """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
         shapes = iter(self._shapes)
 
@@ -114,11 +107,52 @@ class SteeredFilter(Filter[Any, Any, Steered]):
             return number > 0.5 if kind == "b" else number
 
         answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
+        answer = self.xp.asarray(answer)
+        if answer.size != self.size or (answer.dtype.kind == "f" and not self.space.shape):
+            raise ValueError(
+                f"expected an action of {self.space}, got {answer.dtype} of shape {answer.shape}"
+            )
         flat = map_arrays(
             lambda array: self.xp.astype(self.xp.reshape(self.xp.asarray(array), (-1, 1)), self.xp.float64),
             memory,
         )
-        return self.xp.astype(self.xp.reshape(self.xp.asarray(answer), (-1, 1)), self.xp.float64), flat
+        return self.xp.astype(self.xp.reshape(answer, (-1, 1)), self.xp.float64), flat
+
+
+class Steered(NamedTuple):
+    """State of a steered filter."""
+
+    bank: Any
+    """Of the bank."""
+    policy: Decisions
+    """Of the policy."""
+
+
+class SteeredFilter(Filter[Any, Any, Steered]):
+    """A bank closed by a policy, for one track: N is 1, or the arrays are traced.
+
+    Args:
+        model: with the bank.
+        decider: asks the policy.
+    """
+
+    def __init__(self, model: Model, decider: Decider) -> None:
+        super().__init__(model.task)
+        self.model, self.bank, self.decider = model, model.filter, decider
+
+    def start(self, initial: Any) -> Steered:
+        """Start the bank; the policy begins at its first decision."""
+        return Steered(self.bank.start(initial), self.decider.start(0.0 * initial.mean[0]))
+
+    def predict(self, state: Steered, measurement: Any) -> Steered:
+        """Predict in the bank."""
+        return state._replace(bank=self.bank.predict(state.bank, measurement))
+
+    def update(self, state: Steered, given: Input) -> Steered:
+        """Ask the policy where a decision is due, and apply its action."""
+        observation = self.model.observe(Episode(None, given.measurement, state.bank))
+        action, decisions = self.decider.decide(observation, state.policy)
+        return Steered(self.bank.act(state.bank, given.measurement, action), decisions)
 
     def mean(self, state: Steered) -> Array:
         """That of the bank."""
@@ -142,18 +176,76 @@ def shapes_of(memory: Any) -> list[tuple[tuple[int, ...], str]]:
     return [(numpy.shape(array), numpy.asarray(array).dtype.kind) for array in leaves(memory)]
 
 
-def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
-    """Close the bank of a model by a policy, made for the same task on NumPy arrays.
+def decider_of(model: Model, policy: Policy, interval: int | None = None) -> Decider:
+    """Return what asks a policy at every measurement of a model.
 
     Args:
         model: on NumPy or traced arrays.
-        policy: whose ``act`` is arithmetic of NumPy.
+        policy: made for the same task on NumPy arrays, whose ``act`` is arithmetic of NumPy.
         interval: measurements for which an action holds; default: the task's decision interval.
-
-    Raises:
-        NotTraceable: on traced arrays, where it is not.
     """
     blank = numpy.zeros((1, len(model.fields)))
     with numpy.errstate(all="ignore"):
         _, memory = policy.act(blank, None, numpy.ones(1, dtype=bool))
-    return SteeredFilter(model, policy.act, memory, interval)
+    return Decider(model, policy.act, memory, interval)
+
+
+def steer(model: Model, policy: Policy, interval: int | None = None) -> SteeredFilter:
+    """Close the bank of a model by a policy; arguments as of :func:`decider_of`.
+
+    Raises:
+        NotTraceable: on traced arrays, where the policy's arithmetic cannot be traced.
+    """
+    return SteeredFilter(model, decider_of(model, policy, interval))
+
+
+def trace_policy(model: CompiledModel, policy: Policy) -> Specialised:
+    """Return what a policy decides, for :meth:`.Lanes.run`: a function of what is shown and of :class:`Decisions`.
+
+    Args:
+        model: compiled, in which it acts.
+        policy: made for it.
+
+    Raises:
+        NotTraceable: if its arithmetic cannot be traced.
+    """
+    decider, graph, given = _trace_decider(model, policy, None)
+    return Specialised(decider.decide, graph, given, unchanged=0, given_turned=True)
+
+
+def trace_decision(model: CompiledModel, policy: Policy) -> tuple[Function, Decisions]:
+    """Return the same of a policy that is asked only where a decision is due, and its memory before the first one.
+
+    Raises:
+        NotTraceable: if its arithmetic cannot be traced.
+    """
+    decider, graph, given = _trace_decider(model, policy, 1)
+    function = Function(decider.decide, graph, unchanged=0)
+    function.specialise(*given)
+    return function, given[1]
+
+
+def _trace_decider(model: CompiledModel, policy: Policy, interval: int | None) -> tuple[Decider, Graph, Any]:
+    graph = Graph()
+    with namespace.tracing(graph):
+        decider = decider_of(model.programs.traced, policy, interval)
+        nothing = decider_of(model, policy, interval).start(numpy.zeros(LANES))
+    return decider, graph, (numpy.zeros((len(model.fields), LANES)), nothing)
+
+
+def compile_policy(model: Model, policy: Any, trace: Callable[[CompiledModel, Policy], Any]) -> Any:
+    """Return a policy traced, or None where it is asked in Python; a warning says why what calls itself traceable is
+    not.
+
+    Args:
+        model: in which it acts.
+        policy: made for it.
+        trace: :func:`trace_policy` or :func:`trace_decision`.
+    """
+    if not (isinstance(model, CompiledModel) and isinstance(policy, Policy) and says_traceable(policy)):
+        return None
+    try:
+        return trace(model, policy)
+    except NotTraceable as error:
+        warn_of(f"policy {type(policy).__name__} of {model.task.id}", error)
+        return None

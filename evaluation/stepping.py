@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 
 import numpy
 
-from ..compiler.functions import round_up_lanes
+from ..compiler.functions import map_arrays, round_up_lanes
 from ..envs.environment import check_action
 from ..envs.model import Model
 from .competitors import Policy
+from .steered_filter import compile_policy, trace_decision
 
 MODEL_ROWS = 128
 """Observations that a model of Stable-Baselines3 is asked about at once, always as many."""
@@ -28,7 +29,7 @@ class SteppingPolicy(Policy):
 
     Matrix products round by their shape, and an episode must not depend on how many others there are. So the policy
     is asked about a multiple of eight observations, a model of Stable-Baselines3 always about as many, and the last
-    one is repeated to fill up.
+    one is repeated to fill up. A policy that is ``traceable`` is asked in compiled code where the model's steps are.
 
     Args:
         model: task with the bank that the policy steers.
@@ -44,6 +45,8 @@ class SteppingPolicy(Policy):
         self.policy = policy
         self.control = model.control  # type: ignore[misc]  # made for it
         self.scenario, self.task_keywords = scenario, dict(task_keywords or {})
+        self._traced: Any = None
+        self._is_traced = False
 
     @property
     def keywords(self) -> dict[str, Any]:
@@ -100,11 +103,32 @@ class SteppingPolicy(Policy):
             raise ValueError(f"the state is not one of {len(batch)} episodes: begin anew with state=None")
         answers, kept = [], []
         for call, memory in zip(calls, memories, strict=True):
-            answer, after = self.policy.predict(batch[call], memory, start[call], deterministic=deterministic)
+            answer, after = self._ask(batch[call], memory, start[call], deterministic)
             answers.append(check_action(self.model.action_space, answer, len(call)))
             kept.append(after)
         action = numpy.concatenate(answers)[: len(batch)]
         return (action[0] if single else action), Memory(kept, False)
+
+    def _ask(
+        self, observation: numpy.ndarray, memory: Any, start: numpy.ndarray, deterministic: bool
+    ) -> tuple[Any, Any]:
+        """Ask the policy, in code of the processor where it can be traced."""
+        if not self._is_traced:
+            self._traced, self._is_traced = compile_policy(self.model, self.policy, trace_decision), True
+        if self._traced is None:
+            answer: tuple[Any, Any] = self.policy.predict(
+                observation, memory, start, deterministic=deterministic
+            )
+            return answer
+        decide, nothing = self._traced
+        width = len(observation)
+        before = memory or map_arrays(lambda array: numpy.zeros((*array.shape[:-1], width)), nothing)
+        action, after = decide(observation.T, before._replace(count=numpy.where(start, 0.0, 1.0)))
+        return action.T, after
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the code: a copy makes its own."""
+        return {**self.__dict__, "_traced": None, "_is_traced": False}
 
     def _calls(self, count: int) -> list[numpy.ndarray]:
         """Episodes that each call of the policy is shown."""

@@ -100,6 +100,7 @@ class TimeVarying(Policy):
     """
 
     control = "gain"
+    traceable = True
 
     def __init__(self, model: Model, intensity: float | None = None) -> None:
         super().__init__(model)
@@ -191,6 +192,8 @@ class AugmentedGain(TimeVarying):
     wanted; otherwise it waits for an innovation of the other sign, which comes after two samples on average.
     So one gain can do more than weigh two sensors, at the price of a covariance that knows nothing of it.
     """
+
+    traceable = True
 
     def __init__(
         self, model: Model, rule: type[MeasurementNoise] = MeasurementNoise, **values: float

@@ -26,6 +26,7 @@ class InteractingMultipleModel(Policy):
     """The paper's algorithm: weights by Bayes' rule, equations (12)-(14)."""
 
     control = "weights"
+    traceable = True
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -51,6 +52,7 @@ class HardInteractingMultipleModel(InteractingMultipleModel):
     """
 
     control = "mode"
+    traceable = True
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Name the mode of largest posterior probability."""
@@ -110,6 +112,7 @@ class AdaptiveGain(Policy):
     """
 
     control = "gain"
+    traceable = True
     rearm = False
 
     def __init__(self, model: Model, false_alarm_probability: float = 1e-3, ramp_scans: float = 7.0) -> None:

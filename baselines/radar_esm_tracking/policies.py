@@ -40,6 +40,7 @@ class _Posterior(Policy):
     """Shared reading of the observation: log-likelihoods of the classes, ``(M, N)`` each."""
 
     control = "weights"
+    traceable = True
 
     def __init__(self, model: Model) -> None:
         super().__init__(model)
@@ -103,6 +104,7 @@ class MostProbable(_Posterior):
     """The most probable class (8) alone, in place of the combination (11)."""
 
     control = "mode"
+    traceable = True
 
     def log_posterior(self, observation: numpy.ndarray) -> numpy.ndarray:
         """Prior, radar and ESM, as the paper's algorithm has them."""
@@ -143,6 +145,8 @@ class ForgettingJointType(JointType):
         refused: as in :class:`JointType`.
         esm: likewise.
     """
+
+    traceable = True
 
     def __init__(self, model: Model, change: float = 0.002, refused: float = 0.0, esm: float = 1.0) -> None:
         super().__init__(model, refused, esm)

@@ -99,6 +99,7 @@ class NisAdaptive(Policy):
     """
 
     control = "gain"
+    traceable = True
 
     def __init__(
         self,
@@ -135,6 +136,8 @@ class StuckCheck(NisAdaptive):
     the filter trusts it.
     """
 
+    traceable = True
+
     def __init__(self, model: Model, threshold: float = 3.0, rates: float = 0.0) -> None:
         super().__init__(model, threshold, rates, accelerometers=0.0)
         self.repeat = model.reader("accelerometers_repeat")
@@ -157,6 +160,8 @@ class StuckCheckFallback(StuckCheck):
     Under `stuck-check` an excess of the pseudoranges makes them noisier. Between houses it comes from errors that last,
     which are then believed all the same, and the dynamics with them.
     """
+
+    traceable = True
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Keep what is said of the accelerometers."""

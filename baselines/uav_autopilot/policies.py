@@ -53,6 +53,7 @@ class InnovationAdaptive(Policy):
     """
 
     control = "gain"
+    traceable = True
 
     def __init__(
         self,

@@ -119,7 +119,8 @@ class SteeredSteps:
 
     def due_nodes(self, state: Steered, graph: Graph) -> list[int]:
         """Expression of whether the policy is asked at a measurement."""
-        return nodes_of(self.steered.is_due(state)) if self.steered.interval > 1 else [graph.constant(True)]
+        decider = self.steered.decider
+        return nodes_of(decider.is_due(state.policy)) if decider.interval > 1 else [graph.constant(True)]
 
 
 def clear_missing(task: Task, measurement: Any) -> Any:

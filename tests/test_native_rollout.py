@@ -1,0 +1,141 @@
+"""Whole episodes in one native call are the episodes that are stepped, bit for bit."""
+
+import numpy as np
+import pytest
+from filtergym.baselines.problem import problem_of
+from filtergym.envs.backend import make_model
+from filtergym.evaluation import rollout as rollouts
+from filtergym.evaluation.competitors import Policy, kind_of
+from filtergym.evaluation.evaluate import _limits, _measurement_and_track, control_of
+from filtergym.evaluation.rollout import rollout, run_episodes
+from filtergym.evaluation.seeds import episode_seeds
+
+from filtergym import evaluate
+
+pytest.importorskip("llvmlite")
+
+ID = "filtergym/ManeuveringTarget-v0"
+SEEDS = episode_seeds("test", 4, 11)
+TIGHT = [
+    ("TightlyCoupledNavigation", scenario, {"horizon": 40}, names)
+    for scenario, names in (
+        (
+            "urban",
+            ("multi-hypothesis", "stuck-check", "fixed-robust", "huber", "known-mode", "known-mode-bound"),
+        ),
+        ("accelerometer-failure", ("nis-adaptive", "rest")),
+    )
+]
+"""Every competitor takes seconds to compile."""
+CASES = [
+    ("ManeuveringTarget", "random", {}, ()),
+    ("ManeuveringTarget", "missed-detections", {"horizon": 40, "decision_interval": 5}, ()),
+    ("RadarEsmTracking", "class-change", {"horizon": 60}, ()),
+    ("LooselyCoupledNavigation", "outage", {"horizon": 300}, ()),  # more than the noise that is drawn at once
+    ("LooselyCoupledNavigation", "jamming", {"horizon": 33, "decision_interval": 3}, ()),
+    ("UavAutopilot", "sensor-degradation", {"horizon": 90}, ()),
+    *(pytest.param(*case, marks=pytest.mark.slow) for case in TIGHT),
+]
+
+
+def model_of(environment, name, scenario, threads=1, **keywords):
+    problem = problem_of(f"filtergym/{environment}-v0")
+    maker = problem.competitor(name)
+    kind = kind_of(maker)
+    control = control_of(maker, kind, None, problem.task, name)
+    keywords = {**getattr(maker, "task_keywords", {}), **keywords}
+    model = make_model(problem.task, control, scenario, backend="compiled", threads=threads, **keywords)
+    return model, maker, kind, _limits if kind == "bound" else _measurement_and_track
+
+
+def run_stepped(model, maker, kind, report, seeds=SEEDS):
+    """The same by one step after another."""
+    series, actions = {}, []
+    for found, action in rollout(model, maker, seeds, report, kind=kind):
+        for each, values in found.items():
+            series.setdefault(each, []).append(np.moveaxis(values[..., : len(seeds)], -1, 0).copy())
+        actions.append(action)
+    return {each: np.stack(values, axis=1) for each, values in series.items()}, np.stack(actions, axis=1)
+
+
+@pytest.mark.parametrize(("environment", "scenario", "keywords", "names"), CASES)
+def test_whole_episodes_are_those_that_are_stepped(environment, scenario, keywords, names, monkeypatch):
+    monkeypatch.setattr(rollouts, "_step_episodes", None)
+    known = problem_of(f"filtergym/{environment}-v0").baselines
+    for name in names or [each for each in known.names if each not in ("random", *known.smoothers)]:
+        given = model_of(environment, name, scenario, **keywords)
+        found, action = run_episodes(*given[:3], SEEDS, given[3])
+        expected, actions = run_stepped(*given)
+        assert found.keys() == expected.keys()
+        for each, values in expected.items():
+            np.testing.assert_array_equal(found[each], values, err_msg=f"{name}: {each}")
+        if given[2] == "policy":
+            np.testing.assert_array_equal(action, actions, err_msg=name)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_company_tiles_and_threads_change_no_bit(threads):
+    """1600 lanes are several tiles, and enough for several threads."""
+    given = model_of("ManeuveringTarget", "adaptive", "random", threads=threads, horizon=7)
+    seeds = episode_seeds("test", 5, 1600)
+    found, action = run_episodes(*given[:3], seeds, given[3])
+    few, few_actions = run_episodes(*given[:3], seeds[1100:1103], given[3])
+    np.testing.assert_array_equal(action[1100:1103], few_actions)
+    for each, values in few.items():
+        np.testing.assert_array_equal(found[each][1100:1103], values, err_msg=each)
+
+
+class Traced(Policy):
+    """Says what it answers."""
+
+    control = "gain"
+    traceable = True
+
+    def act(self, observation, state, start):
+        return self.answer(observation), None
+
+
+class Far(Traced):
+    def answer(self, observation):
+        return 1e3 * observation[:, :1]
+
+
+class NoNumber(Traced):
+    def answer(self, observation):
+        return np.log(-1.0 - observation[:, :1] ** 2)
+
+
+class Branching(Traced):
+    def answer(self, observation):
+        if (observation[:, 0] > 0.5).any():
+            return np.zeros((len(observation), 1))
+        return np.ones((len(observation), 1))
+
+
+class Counting(Far):
+    """Another ``act`` that says nothing of itself."""
+
+    def act(self, observation, state, start):
+        self.asked = getattr(self, "asked", 0) + 1
+        return np.full((len(observation), 1), 0.01 * self.asked), None
+
+
+def test_actions_are_recorded_within_their_limits():
+    action = evaluate(ID, {"far": Far}, episodes=3, horizon=10)["action"].values
+    assert np.abs(action).max() == 1.0
+
+
+def test_an_action_that_is_no_number_is_refused():
+    with np.errstate(invalid="ignore"), pytest.raises(ValueError, match="expected finite actions"):
+        evaluate(ID, {"none": NoNumber}, episodes=3, horizon=10)
+
+
+def test_what_cannot_be_traced_is_asked_in_python_and_says_so():
+    with pytest.warns(UserWarning, match="Branching.*test_native_rollout.py, line"):
+        run = evaluate(ID, {"mine": Branching}, episodes=3, horizon=10)
+    assert set(np.unique(run["action"])) <= {0.0, 1.0}
+
+
+def test_a_method_that_is_replaced_is_not_taken_for_traceable():
+    action = evaluate(ID, {"mine": Counting}, episodes=3, horizon=10)["action"].values
+    np.testing.assert_allclose(action[0, 0, :, 0], 0.01 * np.arange(1, 11), rtol=1e-15)
