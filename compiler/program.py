@@ -105,6 +105,8 @@ class Graph:
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
+        if table.view(numpy.int64).min() == table.view(numpy.int64).max():  # the same wherever it is read
+            return self.constant(table[0])
         key = ("table", table.tobytes())
         if key not in self._found:
             self._found[key] = len(self.tables)

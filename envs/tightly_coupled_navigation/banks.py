@@ -17,6 +17,7 @@ import numpy
 
 from ...filters import extended_kalman, gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ...filters.packed_covariance import pack, unpack
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank, Initial
 from ..observation import BOUNDED_LOG, SIGNED_LOG, Array, Block, Quantity
@@ -40,7 +41,7 @@ class Prediction(NamedTuple):
     mean: Array
     """``(17, M, N)``."""
     covariance: Array
-    """``(17, 17, M, N)``."""
+    """Packed (:mod:`~filtergym.filters.packed_covariance`), ``(153, M, N)``."""
     log_probabilities: Array
     """Logarithm of the predicted probabilities, ``(M, N)``."""
     combined: Array
@@ -48,14 +49,18 @@ class Prediction(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """The bank at one moment."""
+    """The bank at one moment.
+
+    Covariances are packed, so that a compiled step knows that they are symmetric and computes one half. That of the
+    combination (step 8) is computed where somebody asks for it.
+    """
 
     predicted: Prediction
     """To the measurement at hand; after :meth:`act`, to the next one."""
     means: Array
     """After the update, ``(17, M, N)``."""
     covariances: Array
-    """``(17, 17, M, N)``."""
+    """Packed, ``(153, M, N)``."""
     log_likelihood: Array
     """``(M, N)``."""
     nis: Array
@@ -74,8 +79,6 @@ class Filters(NamedTuple):
     """Weights of the hypotheses in force, ``(M, N)``."""
     mean: Array
     """Of the combination, ``(17, N)``."""
-    covariance: Array
-    """``(17, 17, N)``."""
     last_action: Array
     """``(A, N)``."""
 
@@ -186,7 +189,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, M, task = self.xp, len(HYPOTHESES), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
-        covariances = xp.stack([initial.covariance] * M, axis=2)
+        covariances = xp.stack([pack(initial.covariance)] * M, axis=1)
         probabilities = task.constant(self.parameters.initial_probabilities)[:, None] + zeros
         nis = xp.stack([xp.stack([zeros] * M)] * len(task.sensors))
         return Filters(
@@ -202,7 +205,6 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             range_innovation=xp.stack([zeros] * task.tracked.stop),
             probabilities=probabilities,
             mean=initial.mean,
-            covariance=initial.covariance,
             last_action=xp.stack([zeros] * len(self.actions)),
         )
 
@@ -210,10 +212,10 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
         task, common = self.task, self.task.common
         chain = imm.predict_mode_probabilities(task.transition, probabilities)
-        mixed = imm.mix(means, covariances, chain.mixing)
+        mixed = imm.mix(means, unpack(covariances, gnss_ins.SIZE), chain.mixing)
         mean, covariance = gnss_ins.predict(*mixed, task.axis, common.T, common.decay, task.process_noise)
         combined = weighted_sum(chain.probabilities, mean)
-        return Prediction(mean, covariance, imm.log_probabilities(chain.probabilities), combined)
+        return Prediction(mean, pack(covariance), imm.log_probabilities(chain.probabilities), combined)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
         """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
@@ -233,7 +235,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         repeated = xp.all(accelerometers == state.accelerometers, axis=0)
         return state._replace(
             means=update.mean,
-            covariances=update.covariance,
+            covariances=pack(update.covariance),
             log_likelihood=update.log_likelihood,
             nis=nis,
             log_density=imm.log_mixture_density(state.predicted.log_probabilities, update.log_likelihood),
@@ -262,7 +264,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         residual = measurement.readings[:, None] - expected
         return extended_kalman.update_one_by_one(
             predicted.mean,
-            predicted.covariance,
+            unpack(predicted.covariance, gnss_ins.SIZE),
             residual,
             rows,
             variance,
@@ -299,14 +301,17 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
 
     def _combine_and_predict(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
         """Combine (step 8), and predict to the next measurement."""
-        mean, covariance = imm.combine(state.means, state.covariances, probabilities)
         return state._replace(
             predicted=self._predict_hypotheses(state.means, state.covariances, probabilities),
             probabilities=probabilities,
-            mean=mean,
-            covariance=covariance,
+            mean=weighted_sum(probabilities, state.means),
             last_action=last_action,
         )
+
+    def covariance(self, state: Filters) -> Array:
+        """Of the combination (step 8)."""
+        covariances = unpack(state.covariances, gnss_ins.SIZE)
+        return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
         """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
@@ -336,6 +341,13 @@ class NoiseBank(HypothesisBank):
         """The groups of sensors."""
         return [sensor.name for sensor in self.task.sensors]
 
+    def predict(self, state: Filters, measurement: Measurement) -> Filters:
+        """Compare the prediction with a measurement. The update itself waits for the noise that the action asks for:
+        what a compiled step does not keep, it does not compute.
+        """
+        compared = super().predict(state, measurement)
+        return compared._replace(means=state.means, covariances=state.covariances)
+
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update with the noise that the action asks for, and weigh by Bayes' rule."""
         xp = self.xp
@@ -344,7 +356,7 @@ class NoiseBank(HypothesisBank):
             state, measurement, self._variance(exponent, state), self._thresholds(exponent)
         )
         state = state._replace(
-            means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
+            means=update.mean, covariances=pack(update.covariance), log_likelihood=update.log_likelihood
         )
         return self.weigh_by_bayes(state, exponent)
 
