@@ -298,7 +298,7 @@ def test_a_likelihood_far_below_the_smallest_float_leaves_probabilities():
     assert (bank.log_likelihood < -2800.0).any()
     probabilities = model.filter.act(bank, measured.measurement, numpy.zeros((3, 8))).probabilities
     numpy.testing.assert_allclose(probabilities.sum(axis=0), 1.0, rtol=1e-15)
-    winner = (bank.predicted.log_probabilities + bank.log_likelihood).argmax(axis=0)
+    winner = (bank.log_predicted + bank.log_likelihood).argmax(axis=0)
     assert (probabilities.argmax(axis=0) == winner).all()
     assert (probabilities.max(axis=0) > 0.5).all()
 
