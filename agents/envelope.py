@@ -70,22 +70,13 @@ class WatchedPolicy(Policy):
         """Begin the policy's memory."""
         return self.policy.begin(seeds)
 
-    def predict(
-        self,
-        observation: numpy.ndarray,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
-    ) -> tuple[numpy.ndarray, Any]:
+    def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
         """Look at what is shown, and let the network answer."""
-        outside = self.range.is_outside(numpy.atleast_2d(observation)[:, self.columns])
+        outside = self.range.is_outside(observation[:, self.columns])
         before = 0.0 * outside if self.memory is None else self.memory
-        if episode_start is not None:
-            before = numpy.where(numpy.reshape(episode_start, (-1, 1)), 0.0, before)
+        before = numpy.where(start[:, None], 0.0, before)
         self.memory = before + (outside - before) / WINDOW
-        answer: tuple[numpy.ndarray, Any] = self.policy.predict(
-            observation, state, episode_start, deterministic
-        )
+        answer: tuple[numpy.ndarray, Any] = self.policy.predict(observation, state, start)
         return answer
 
     def describe(self) -> list[str]:

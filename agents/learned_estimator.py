@@ -5,52 +5,43 @@ outside there is neither observation nor action: measurements go in, mean and co
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy
 
 from ..compiler.functions import map_arrays
-from ..envs.model import Episode, Model
+from ..envs.filter import Input
+from ..envs.model import Model
 from ..envs.observation import Array
 from ..envs.task import Task
 from ..evaluation.competitors import Kind, Policy
-
-
-class EstimatorMemory(NamedTuple):
-    """Memory of a learned estimator."""
-
-    bank: Any
-    """State of the filter."""
-    network: Any
-    """Memory of the network; None before the first measurement."""
+from ..evaluation.steered_filter import Steered, steer
 
 
 class LearnedEstimator:
     """A trained bank with its network, see :class:`~..evaluation.competitors.Estimator`.
 
     Args:
+        model: with the bank.
         network: a policy made for the bank, on NumPy.
     """
 
     kind: ClassVar[Kind] = "estimator"
+    traceable: ClassVar[bool] = True
 
-    def __init__(self, network: Policy) -> None:
-        self.network, self.model = network, network.model
+    def __init__(self, model: Model, network: Policy) -> None:
+        self.network = network
+        self.filter = steer(model, network, interval=1)
 
-    def start(self, initial: Any, N: int) -> EstimatorMemory:
+    def start(self, initial: Any, N: int) -> Steered:
         """Start the filter where everyone starts."""
-        return EstimatorMemory(self.model.filter.start(initial), None)
+        return self.filter.start(initial)
 
-    def update(self, measurement: Any, memory: EstimatorMemory) -> tuple[Array, Array, EstimatorMemory]:
+    def update(self, measurement: Any, memory: Steered) -> tuple[Array, Array, Steered]:
         """Predict, show the network what comes of it, and update as it answers."""
-        bank: Any = self.model.filter
         measurement = map_arrays(numpy.nan_to_num, measurement)  # banks weigh values by their availability
-        state = bank.predict(memory.bank, measurement)
-        shown = self.model.observe(Episode(None, measurement, state))
-        action, network = self.network.predict(shown.T, memory.network)
-        # In double: arithmetic with constants would stay in the network's precision.
-        state = bank.act(state, measurement, action.T.astype(float))
-        return bank.mean(state), bank.covariance(state), EstimatorMemory(state, network)
+        state = self.filter.update(self.filter.predict(memory, measurement), Input(measurement))
+        return self.filter.mean(state), self.filter.covariance(state), state
 
 
 class EstimatorMaker:
@@ -67,5 +58,6 @@ class EstimatorMaker:
         self.bank, self.policy = bank, policy
 
     def __call__(self, task: Task) -> LearnedEstimator:
-        """Make it on NumPy, whatever the task computes on."""
-        return LearnedEstimator(self.policy(Model(task, self.bank).on_numpy()))
+        """Make it."""
+        model = Model(task, self.bank)
+        return LearnedEstimator(model, self.policy(model.on_numpy()))

@@ -43,8 +43,10 @@ ROWS = 8
 
 def _product(rows: numpy.ndarray, weight: numpy.ndarray) -> numpy.ndarray:
     """``rows @ weight.T`` in products of one shape: BLAS rounds by the shape, and an observation's action must
-    not depend on how many others there are.
+    not depend on how many others there are. Of symbols the compiler makes a loop.
     """
+    if not isinstance(rows, numpy.ndarray):
+        return rows @ weight.T
     count, width = rows.shape
     padded = numpy.zeros((-(-count // ROWS), ROWS, width), rows.dtype)
     padded.reshape(-1, width)[:count] = rows
@@ -60,7 +62,7 @@ class LearnedPolicy(Policy):
 
     Args:
         model: whose observations it is shown.
-        arrays: float32, named as in the module's description.
+        arrays: named as in the module's description; of float32, as they are stored, or wider.
         output: one of ``OUTPUTS``.
         activation: between layers, "tanh" or "relu".
         fields: names of what it takes of an observation, in its order; default: all that the model shows.
@@ -80,6 +82,7 @@ class LearnedPolicy(Policy):
         super().__init__(model)
         self.control = model.control  # type: ignore[misc]  # as it was trained
         self.columns = slice(None) if fields is None else model.columns(fields)
+        arrays = {name: values.astype(numpy.float64) for name, values in arrays.items()}
         self.arrays, self.output = arrays, output
         self.activation = ACTIVATIONS[activation]
         self.layers = [
@@ -88,10 +91,12 @@ class LearnedPolicy(Policy):
         ]
 
     def act(self, observation: numpy.ndarray, state: Any, start: numpy.ndarray) -> tuple[numpy.ndarray, Any]:
-        """Run the network in float32, as it was trained."""
+        """Run the network, in float64 as the filters: asked here, compiled with them or written in NumPy, it answers
+        the same to rounding.
+        """
         a = self.arrays
         x = (observation[:, self.columns] - a["observation_mean"]) / a["observation_scale"]
-        x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(numpy.float32)
+        x = numpy.clip(x, -OBSERVATION_LIMIT, OBSERVATION_LIMIT).astype(a["observation_mean"].dtype)
         if "gru_input_weight" in a:
             memory = self._memory(state, start, a["gru_memory_weight"].shape[1])
             x = state = self._gru_step(x, memory)
@@ -104,7 +109,7 @@ class LearnedPolicy(Policy):
             if i < len(self.layers) - 1:
                 x = self.activation(x)
         if self.output == "argmax":
-            return x.argmax(axis=1), state
+            return numpy.argmax(x, axis=1), state
         space: Any = self.model.action_space
         if self.output == "clip":
             return numpy.clip(x, space.low, space.high), state
@@ -112,8 +117,9 @@ class LearnedPolicy(Policy):
 
     def _memory(self, state: Any, start: numpy.ndarray, width: int) -> numpy.ndarray:
         """What is remembered, ``(N, width)``: nothing at the start of an episode."""
-        memory = numpy.zeros((len(start), width), numpy.float32) if state is None else state
-        return numpy.where(start[:, None], numpy.float32(0.0), memory)
+        dtype = self.arrays["observation_mean"].dtype
+        memory = numpy.zeros((len(start), width), dtype) if state is None else state
+        return numpy.where(start[:, None], dtype.type(0.0), memory)
 
     def _gru_step(self, x: numpy.ndarray, memory: numpy.ndarray) -> numpy.ndarray:
         """One step of the gated recurrent unit (Cho et al., 2014, in torch's form)."""

@@ -301,6 +301,8 @@ def write_program(
         between: statements that stand where the first results are known, before any other input is read.
         results: how many these are.
     """
+    if any(step.operation == "product" for step in program.steps):
+        raise ValueError("a product that is a loop has no form in C: trace it with Graph(loops=False)")
     starts = sorted({step.arguments[:2] for step in program.steps if step.operation == "take"})
     tables = {start: f"{name}_table_{i}" for i, (start, _) in enumerate(starts)}
     text = _Text(program, read, scalar, tables)
@@ -348,9 +350,8 @@ def _statements(
     lines: list[str] = []
     fetched: set[int] = set()
     for step in steps:
-        operation, arguments, _logical = text.program.steps[step]
-        if operation not in FREE:
-            for argument in arguments[2:] if operation == "take" else arguments:
+        if text.program.steps[step].operation not in FREE:
+            for argument in text.program.steps[step].parts:
                 crosses = argument not in own and text.program.steps[argument].operation not in FREE
                 if crosses and argument not in fetched:
                     fetched.add(argument)

@@ -6,11 +6,12 @@ than the length of a function. What crosses a cut lies in a scratch array on the
 of the constants, then two integers for each argument, address and stride.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from .library import BINARY, Library
-from .parts import FREE, cut_parts, scratch_slots
-from .program import FUNCTIONS, OPERATIONS, Program
+from .parts import FREE, cut_parts, product_places, scratch_slots
+from .program import BAND, FUNCTIONS, OPERATIONS, Program
 
 LANES = 8
 PART = 100
@@ -30,11 +31,22 @@ def _splat(value: str, kind: str = "double") -> str:
 ONE, ZERO, MINUS_ONE = _splat("1.0"), _splat("0.0"), _splat("-1.0")
 
 
+class _Places(NamedTuple):
+    """What lies where in the scratch array."""
+
+    slots: dict[int, int]
+    """Of steps that cross a cut."""
+    products: dict[int, int]
+    """Of what comes out of products."""
+    vector: int
+    """Of the vector that is multiplied."""
+
+
 class _Part:
     """Text of one part; values are named by the steps that they come from."""
 
-    def __init__(self, program: Program, lane_first: Sequence[bool], slots: Mapping[int, int]) -> None:
-        self.program, self.lane_first, self.slots = program, lane_first, slots
+    def __init__(self, program: Program, lane_first: Sequence[bool], places: "_Places") -> None:
+        self.program, self.lane_first, self.places = program, lane_first, places
         self.lines: list[str] = []
         self.known: set[int] = set()
         self._arguments: dict[int, tuple[str, str]] = {}
@@ -101,9 +113,13 @@ class _Part:
                 self.compare("une", self.constant(arguments[0]), ZERO, f"%v{step}")
             elif operation == "constant":
                 self.constant(arguments[0], f"%v{step}")
+            elif operation == "entry":
+                row, product = arguments
+                address = self.scratch(self.places.products[product] + row)
+                self.new(f"load {VECTOR}, ptr {address}, align 64", f"%v{step}")
             else:
                 kind = TRUTH if logical else VECTOR
-                self.new(f"load {kind}, ptr {self.scratch(step)}, align 64", f"%v{step}")
+                self.new(f"load {kind}, ptr {self.scratch(self.places.slots[step])}, align 64", f"%v{step}")
         return f"%v{step}"
 
     def step(self, index: int) -> None:
@@ -116,6 +132,9 @@ class _Part:
         self.known.add(index)
         if operation == "take":
             self._take(arguments, name)
+            return
+        if operation == "product":
+            self._product(index)
             return
         a, *rest = (self.value(argument) for argument in arguments)
         if operation in _INFIX:
@@ -185,6 +204,18 @@ class _Part:
             name,
         )
 
+    def _product(self, index: int) -> None:
+        """Put the vector where the loop reads it, and let the loop write what comes out."""
+        table, rows, *vector = self.program.steps[index].arguments
+        for place, step in enumerate(vector):
+            value = self.value(step)
+            address = self.scratch(self.places.vector + place)
+            self.lines.append(f"store {VECTOR} {value}, ptr {address}, align 64")
+        matrix = self.new(f"getelementptr double, ptr {self.constants}, i64 {table}")
+        given, found = self.scratch(self.places.vector), self.scratch(self.places.products[index])
+        sizes = f"i64 {len(vector)}, i64 {-(-rows // BAND)}"
+        self.lines.append(f"call void @product(ptr {matrix}, ptr {given}, ptr {found}, {sizes})")
+
     def store(self, argument: int, row: int, step: int) -> None:
         """Write a result."""
         value = self.value(step)
@@ -215,14 +246,15 @@ class _Part:
             offset = self.new(f"add i64 {offset}, {first}")
             yield self.new(f"getelementptr double, ptr {start}, i64 {offset}")
 
-    def scratch(self, step: int) -> str:
-        """Address of a step's value in the scratch array."""
-        return self.new(f"getelementptr {VECTOR}, ptr %scratch, i64 {self.slots[step]}")
+    def scratch(self, place: int) -> str:
+        """Address of a place in the scratch array."""
+        return self.new(f"getelementptr {VECTOR}, ptr %scratch, i64 {place}")
 
     def hand_on(self, step: int) -> None:
         """Put a value into the scratch array."""
         kind = TRUTH if self.program.steps[step].logical else VECTOR
-        self.lines.append(f"store {kind} {self.value(step)}, ptr {self.scratch(step)}, align 64")
+        address = self.scratch(self.places.slots[step])
+        self.lines.append(f"store {kind} {self.value(step)}, ptr {address}, align 64")
 
 
 def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
@@ -238,12 +270,14 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
     """
     parts, _ = cut_parts(program, PART)
     slots = scratch_slots(program, parts)
+    places = _Places(slots, *product_places(program, max(slots.values(), default=-1) + 1))
+    vectors = [len(step.parts) for step in program.steps if step.operation == "product"]
     results: dict[int, list[tuple[int, int]]] = {}
     for argument, row, step in program.results:
         results.setdefault(step, []).append((argument, row))
     text = list(_declarations(program, library))
     for number, steps in enumerate(parts):
-        part = _Part(program, lane_first, slots)
+        part = _Part(program, lane_first, places)
         for step in steps:
             part.step(step)
             for place in results.get(step, ()):
@@ -252,7 +286,9 @@ def emit(program: Program, lane_first: Sequence[bool], library: Library) -> str:
                 part.hand_on(step)
         header = "ptr noalias readonly %table, ptr noalias %scratch, i64 %lane"
         text += [f"define internal void @part{number}({header}) {{", *part.lines, "ret void", "}"]
-    text += _entry(len(parts), max(slots.values(), default=0) + 1)
+    if vectors:
+        text += _product_function()
+    text += _entry(len(parts), max(1, places.vector + max(vectors, default=0)))
     return "\n".join([*text, "!0 = !{}"])
 
 
@@ -270,6 +306,51 @@ def _entry(parts: int, slots: int) -> Iterator[str]:
         yield f"call void @part{number}(ptr %table, ptr %scratch, i64 %lane)"
     yield f"%next = add i64 %lane, {LANES}"
     yield "br label %head"
+    yield "exit:"
+    yield "ret void"
+    yield "}"
+
+
+def _product_function() -> Iterator[str]:
+    """The product of a matrix of constants with a vector of lane values: bands of rows side by side, each row's terms
+    added one after the other.
+    """
+    sums = range(BAND)
+    yield "define internal void @product(ptr noalias readonly %matrix, ptr noalias readonly %vector, "
+    yield "                              ptr noalias %result, i64 %columns, i64 %bands) {"
+    yield "entry:"
+    yield "br label %band"
+    yield "band:"
+    yield "%number = phi i64 [0, %entry], [%following, %written]"
+    yield "%start = phi ptr [%matrix, %entry], [%ahead, %written]"
+    yield "br label %term"
+    yield "term:"
+    yield "%column = phi i64 [0, %band], [%next, %term]"
+    yield "%place = phi ptr [%start, %band], [%ahead, %term]"
+    for i in sums:
+        yield f"%sum{i} = phi {VECTOR} [{ZERO}, %band], [%more{i}, %term]"
+    yield f"%address = getelementptr {VECTOR}, ptr %vector, i64 %column"
+    yield f"%factor = load {VECTOR}, ptr %address, align 64"
+    for i in sums:
+        yield f"%at{i} = getelementptr double, ptr %place, i64 {i}"
+        yield f"%number{i} = load double, ptr %at{i}, align 8"
+        yield f"%one{i} = insertelement {VECTOR} poison, double %number{i}, i32 0"
+        yield f"%all{i} = shufflevector {VECTOR} %one{i}, {VECTOR} poison, <{LANES} x i32> zeroinitializer"
+        yield f"%term{i} = fmul {VECTOR} %all{i}, %factor"
+        yield f"%more{i} = fadd {VECTOR} %sum{i}, %term{i}"
+    yield f"%ahead = getelementptr double, ptr %place, i64 {BAND}"
+    yield "%next = add i64 %column, 1"
+    yield "%left = icmp slt i64 %next, %columns"
+    yield "br i1 %left, label %term, label %written"
+    yield "written:"
+    yield f"%first = mul i64 %number, {BAND}"
+    for i in sums:
+        yield f"%row{i} = add i64 %first, {i}"
+        yield f"%to{i} = getelementptr {VECTOR}, ptr %result, i64 %row{i}"
+        yield f"store {VECTOR} %more{i}, ptr %to{i}, align 64"
+    yield "%following = add i64 %number, 1"
+    yield "%again = icmp slt i64 %following, %bands"
+    yield "br i1 %again, label %band, label %exit"
     yield "exit:"
     yield "ret void"
     yield "}"

@@ -101,6 +101,11 @@ def pullback(
         if node not in flowing or name in FLAT:
             continue
         arguments = graph.arguments[node]
+        if name == "entry":
+            row, product = arguments
+            for part, weight in zip(graph.parts(product), graph.matrix(product)[row].tolist(), strict=True):
+                flow(part, flowing[node] * weight)
+            continue
         y, *parts = (Traced(part, bool if graph.logical[part] else float) for part in (node, *arguments))
         known = [graph.values[argument] is not None for argument in arguments]
         rule = _of_the_limited if name in ("maximum", "minimum") and any(known) else RULES[name]

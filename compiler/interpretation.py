@@ -1,11 +1,13 @@
 """A program run step by step in NumPy, in any precision: slow, and what other languages are compared with."""
 
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy
 
-from .program import FUNCTIONS, OPERATIONS, Program
+from .program import BAND, FUNCTIONS, OPERATIONS, Program, unband
 
 _COMPUTE: dict[str, Callable[..., Any]] = {**OPERATIONS, **FUNCTIONS, "where": numpy.where}
 
@@ -46,6 +48,13 @@ def interpret(
             elif operation == "take":
                 start, length, index = arguments
                 value = constants[start : start + length][_places(values[index], length)]
+            elif operation == "product":
+                start, rows, *vector = arguments
+                table = constants[start : start + -(-rows // BAND) * BAND * len(vector)]
+                columns = zip(unband(table, rows, len(vector)).T[..., None], vector, strict=True)
+                value = functools.reduce(operator.add, (column * values[i] for column, i in columns))
+            elif operation == "entry":
+                value = values[arguments[1]][arguments[0]]
             elif operation == "number":
                 value = numpy.asarray(values[arguments[0]]).astype(dtype)
             else:

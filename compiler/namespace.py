@@ -458,8 +458,32 @@ def sort(x: Any, /, *, axis: int = -1) -> Traced:
     return moveaxis(stack(rows), 0, axis)
 
 
+LARGE = 256
+"""Numbers of a matrix of constants, not zero, whose product becomes a loop: fewer are a short straight line."""
+
+
+def is_loop(matrix: Any) -> builtins.bool:
+    """Whether the product with a matrix is a loop: many constants, few of them zero."""
+    if not isinstance(matrix, numpy.ndarray) or matrix.ndim != 2 or not _OPEN.get().loops:
+        return False
+    count = int(numpy.count_nonzero(matrix))
+    return count >= LARGE and 2 * count > matrix.size
+
+
 def matmul(a: Any, b: Any, /) -> Traced:
-    """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out."""
+    """Product of matrices, the terms added one after the other; what is multiplied by a constant zero is left out.
+
+    Where the graph allows loops, the product with a large matrix of constants is one.
+    """
+    if is_loop(b):  # x^T B = (B^T x)^T
+        return matmul(b.T, asarray(a).mT).mT if asarray(a).ndim > 1 else matmul(b.T, a)
+    if is_loop(a):
+        b = _numbers(asarray(b))
+        columns = b.nodes.reshape(len(b), -1) if len(b) == a.shape[1] and b.ndim < 3 else None
+        if columns is not None:
+            product = _OPEN.get().product
+            made = [product(numpy.asarray(a, dtype=float), column) for column in columns.T.tolist()]
+            return Traced(numpy.array(made).T.reshape(len(a), *b.shape[1:]), numpy.result_type(a, b.dtype))
     a, b = asarray(a), asarray(b)
     left, right = (a[None] if a.ndim == 1 else a), (b[:, None] if b.ndim == 1 else b)
     if left.shape[-1] != right.shape[-2]:

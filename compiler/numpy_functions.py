@@ -66,6 +66,11 @@ def stack(arrays: Sequence[Any], axis: int = 0) -> Traced:
     return namespace.stack(list(arrays), axis=axis)
 
 
+def split(x: Any, sections: int, axis: int = 0) -> list[Traced]:
+    """Cut an array into equal parts."""
+    return [Traced(part, x.dtype) for part in numpy.split(x.nodes, sections, axis)]
+
+
 _STANDARD = [
     "add",
     "subtract",
@@ -168,6 +173,7 @@ FUNCTIONS: Mapping[Any, Callable[..., Any]] = {
     numpy.full_like: full_like,
     numpy.concatenate: concatenate,
     numpy.stack: stack,
+    numpy.split: split,
     numpy.argmax: arg_max,
     numpy.mean: mean,
     numpy.copy: copy_array,

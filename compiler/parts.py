@@ -5,10 +5,10 @@ What crosses a cut lies in a scratch array; inputs and constants are read again 
 
 import heapq
 
-from .program import Program
+from .program import BAND, Program
 
-FREE = ("input", "constant")
-"""Steps that every part makes again instead of fetching them from the scratch array."""
+FREE = ("input", "constant", "entry")
+"""Steps that every part makes again instead of fetching them from a slot of the scratch array."""
 
 
 def cut_parts(program: Program, size: int, pause: int = 0) -> tuple[list[list[int]], int]:
@@ -41,10 +41,10 @@ def scratch_slots(program: Program, parts: list[list[int]]) -> dict[int, int]:
     part_of = {step: i for i, part in enumerate(parts) for step in part}
     last_user: dict[int, int] = {}
     for index, part in part_of.items():
-        operation, arguments, _ = program.steps[index]
-        if operation in FREE:
+        step = program.steps[index]
+        if step.operation in FREE:
             continue
-        for argument in arguments[2:] if operation == "take" else arguments:
+        for argument in step.parts:
             if part_of.get(argument, part) < part and program.steps[argument].operation not in FREE:
                 last_user[argument] = part
     free: list[int] = []
@@ -56,3 +56,18 @@ def scratch_slots(program: Program, parts: list[list[int]]) -> dict[int, int]:
         found[step] = free.pop() if free else len(busy)
         heapq.heappush(busy, (last_user[step], found[step]))
     return found
+
+
+def product_places(program: Program, first: int) -> tuple[dict[int, int], int]:
+    """Place in the scratch array of what comes out of every product, and behind all of them that of a vector.
+
+    Args:
+        program: that was cut.
+        first: place behind the slots.
+    """
+    places = {}
+    for index, (operation, arguments, _) in enumerate(program.steps):
+        if operation == "product":
+            places[index] = first
+            first += -(-arguments[1] // BAND) * BAND
+    return places, first

@@ -55,22 +55,35 @@ if hasattr(os, "register_at_fork"):
     # A child has none of the other threads, and what one of them holds it would wait for without end.
     os.register_at_fork(before=LOCK.acquire, after_in_parent=LOCK.release, after_in_child=LOCK.release)
 _COMPUTE = OPERATIONS | FUNCTIONS
+BAND = 8
+"""Rows of a matrix of constants that a loop sums side by side."""
+OTHERS = {"take": 1, "product": 2, "entry": 1}
+"""How many arguments of these expressions come before those that are expressions."""
+
+
+def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
+    """Matrix ``(rows, columns)`` of the table of a product."""
+    return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
 
 
 class Graph:
     """Expressions of one lane.
 
     ``input`` (argument, row) reads a number that the program is given; ``constant`` has a value; ``take`` (table,
-    index) reads a table of constants; everything else is an entry of ``OPERATIONS`` or ``FUNCTIONS``.
+    index) reads a table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a vector,
+    and ``entry`` (row, product) is a number of what comes out; everything else is an entry of ``OPERATIONS`` or
+    ``FUNCTIONS``.
 
     Attributes:
         operations: name of every expression.
         arguments: expressions that it is made of (numbers, of inputs, and the table of ``take``).
         values: value of a constant, None of what varies.
-        tables: what ``take`` reads, ``(length,)`` each.
+        tables: what ``take`` and ``product`` read, ``(length,)`` each.
+        loops: whether products with large matrices of constants may be kept whole, for code that has loops.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, loops: bool = False) -> None:
+        self.loops = loops
         self.operations: list[str] = []
         self.arguments: list[tuple[int, ...]] = []
         self.values: list[float | bool | None] = []
@@ -105,12 +118,37 @@ class Graph:
         known = self.values[index]
         if known is not None:
             return self.constant(table[int(known)])
+        if table.view(numpy.int64).min() == table.view(numpy.int64).max():  # the same wherever it is read
+            return self.constant(table[0])
+        place = self._table(table)
+        return self._intern(("take", place, index), "take", (place, index), None, False)
+
+    def product(self, matrix: numpy.ndarray, vector: Sequence[int]) -> list[int]:
+        """Entries of the product of a matrix ``(rows, columns)`` with a vector, summed from the first column on.
+
+        The table holds the matrix as the loop reads it: bands of ``BAND`` rows, the last one filled up with zeros, and
+        in each the columns one after the other.
+        """
+        rows, columns = matrix.shape
+        bands = -(-rows // BAND)
+        padded = numpy.zeros((bands * BAND, columns))
+        padded[:rows] = matrix
+        table = padded.reshape(bands, BAND, columns).swapaxes(1, 2).ravel()
+        arguments = (self._table(table), rows, *vector)
+        whole = self._intern(("product", *arguments), "product", arguments, None, False)
+        return [self._intern(("entry", row, whole), "entry", (row, whole), None, False) for row in range(rows)]
+
+    def matrix(self, product: int) -> numpy.ndarray:
+        """Return the matrix of a product, ``(rows, columns)``."""
+        table, rows, *vector = self.arguments[product]
+        return unband(self.tables[table], rows, len(vector))
+
+    def _table(self, table: numpy.ndarray) -> int:
         key = ("table", table.tobytes())
         if key not in self._found:
             self._found[key] = len(self.tables)
             self.tables.append(table)
-        place = self._found[key]
-        return self._intern(("take", place, index), "take", (place, index), None, False)
+        return int(self._found[key])
 
     def node(self, name: str, *arguments: int) -> int:
         """Expression of others."""
@@ -184,7 +222,7 @@ class Graph:
     def parts(self, node: int) -> tuple[int, ...]:
         """Expressions that one is directly made of."""
         name = self.operations[node]
-        return () if name == "input" else self.arguments[node][1 if name == "take" else 0 :]
+        return () if name == "input" else self.arguments[node][OTHERS.get(name, 0) :]
 
 
 class Result(NamedTuple):
@@ -201,7 +239,15 @@ class Step(NamedTuple):
     operation: str
     arguments: tuple[int, ...]
     """Steps before it; of an ``input`` argument and row, of a ``constant`` its place in ``constants``, of a
-    ``take`` the place of its table and a step."""
+    ``take`` the place of its table in ``constants``, its length and a step, of a ``product`` the place of its table,
+    its number of rows and the steps of the vector, of an ``entry`` a row and the step of the product."""
+
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Steps that it is directly made of."""
+        if self.operation in ("input", "constant"):
+            return ()
+        return self.arguments[{"take": 2, "product": 2, "entry": 1}.get(self.operation, 0) :]
     logical: bool
 
 
@@ -224,7 +270,7 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     place = {node: i for i, node in enumerate(order)}
     scalars = [node for node in order if graph.values[node] is not None]
     scalar = {node: i for i, node in enumerate(scalars)}
-    tables = sorted({graph.arguments[node][0] for node in order if graph.operations[node] == "take"})
+    tables = sorted({graph.arguments[node][0] for node in order if graph.operations[node] in ("take", "product")})
     lengths = [len(graph.tables[table]) for table in tables]
     starts = dict(zip(tables, numpy.cumsum([len(scalars), *lengths]).tolist(), strict=False))
     sizes = dict(zip(tables, lengths, strict=True))
@@ -235,6 +281,10 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
             arguments = (scalar[node],)
         elif name == "take":
             arguments = (starts[arguments[0]], sizes[arguments[0]], place[arguments[1]])
+        elif name == "product":
+            arguments = (starts[arguments[0]], arguments[1], *(place[part] for part in arguments[2:]))
+        elif name == "entry":
+            arguments = (arguments[0], place[arguments[1]])
         elif name != "input":
             arguments = tuple(place[argument] for argument in arguments)
         steps.append(Step(name, arguments, graph.logical[node]))

@@ -370,7 +370,7 @@ class CompiledModel(Model):
 
 
 def _trace(cls: type[Task], parameters: Any, control: str, recording: Any) -> Programs:
-    graph = Graph()
+    graph = Graph(loops=True)
     with namespace.tracing(graph):
         programs = Programs(Model(cls(parameters, namespace, None, recording), control), graph)
     _ = programs.later

@@ -36,19 +36,18 @@ class Decisions(NamedTuple):
 
 
 Act = Callable[[Array, Any, Array], tuple[Array, Any]]
-"""From an observation ``(1, fields)``, memory, and whether the episode begins ``(1,)``, to an action ``(1, A)`` or
-``(1,)`` and the memory."""
+"""From an observation ``(N, fields)``, memory, and whether the episode begins ``(N,)``, to an action ``(N, A)`` or
+``(N,)`` and the memory."""
 
 
 class Decider:
     """A policy asked at every measurement, of whose answers those stand that are due.
 
-    Its arithmetic is that of NumPy on one track, or on traced arrays: then it serves any number.
-
     Args:
         model: whose observations it is shown.
         act: asks the policy.
-        memory: that the policy returns, arrays of one track; their values do not matter.
+        memory: that the policy returns, arrays of one track; their values do not matter. Where one is not batch first,
+            the filter is for one track: N is 1, or the arrays are traced.
         interval: measurements for which an action holds; default: the task's decision interval.
     """
 
@@ -99,24 +98,26 @@ class Decider:
 
     def _ask(self, observation: Array, memory: Any, first: Array) -> tuple[Array, Any]:
         """Action ``(A, N)`` and memory, every array ``(entries, N)``."""
-        shapes = iter(self._shapes)
+        shapes, N = iter(self._shapes), observation.shape[-1]
 
         def restore(array: Array) -> Array:
             shape, kind = next(shapes)
-            number = self.xp.reshape(array, shape)
+            several = shape[:1] == (1,)
+            number = self.xp.reshape(array.T, (-1, *shape[1:])) if several else self.xp.reshape(array, shape)
             return number > 0.5 if kind == "b" else number
+
+        def flatten(array: Array, several: bool = True) -> Array:
+            rows = self.xp.reshape(self.xp.asarray(array), (N, -1) if several else (1, -1))
+            return self.xp.astype(rows.T, self.xp.float64)
 
         answer, memory = self.ask(observation.T, map_arrays(restore, memory), first)
         answer = self.xp.asarray(answer)
-        if answer.size != self.size or (answer.dtype.kind == "f" and not self.space.shape):
+        if answer.size != self.size * N or (answer.dtype.kind == "f" and not self.space.shape):
             raise ValueError(
                 f"expected an action of {self.space}, got {answer.dtype} of shape {answer.shape}"
             )
-        flat = map_arrays(
-            lambda array: self.xp.astype(self.xp.reshape(self.xp.asarray(array), (-1, 1)), self.xp.float64),
-            memory,
-        )
-        return self.xp.astype(self.xp.reshape(answer, (-1, 1)), self.xp.float64), flat
+        batched = iter(shape[:1] == (1,) for shape, _ in self._shapes)
+        return flatten(answer), map_arrays(lambda array: flatten(array, next(batched)), memory)
 
 
 class Steered(NamedTuple):
@@ -129,7 +130,7 @@ class Steered(NamedTuple):
 
 
 class SteeredFilter(Filter[Any, Any, Steered]):
-    """A bank closed by a policy, for one track: N is 1, or the arrays are traced.
+    """A bank closed by a policy.
 
     Args:
         model: with the bank.

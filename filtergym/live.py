@@ -67,7 +67,8 @@ def online(
         return OnlineFilter(model, maker, kind, name, tracks)
     if isinstance(maker, EstimatorMaker):
         estimator = maker(model.task)
-        watch = estimator.network = WatchedPolicy(estimator.network, range)
+        watch = WatchedPolicy(estimator.network, range)
+        estimator.filter.ask = watch.act
         return OnlineFilter(model, estimator, kind, name, tracks, watch)
     watch = WatchedPolicy(make_competitor(maker, model), range)
     return OnlineFilter(model, watch, kind, name, tracks, watch)

@@ -12,6 +12,7 @@ which needs no inverse and is the joint update (12) of the paper by Gridnev, Rus
 the Kalman gain of the P in use, so the short form is the Joseph form here.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -43,7 +44,13 @@ def pack(P: Array) -> Array:
 
 def unpack(packed: Array, n: int) -> Array:
     """Symmetric matrix ``(n, n, ...)`` of a packed triangle."""
-    return namespace(packed).stack([packed[column(n, j)] for j in range(n)], axis=0)
+    return packed[_matrix(n)]
+
+
+@functools.cache
+def _matrix(n: int) -> numpy.ndarray:
+    """Row of the packed triangle that holds each element of the matrix, ``(n, n)``."""
+    return numpy.array([column(n, j) for j in range(n)])
 
 
 def propagator(F: numpy.ndarray) -> numpy.ndarray:

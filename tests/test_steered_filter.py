@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from filtergym.agents.learned_policy import PRETRAINED
 from filtergym.compiler.namespace import NotTraceable
 from filtergym.envs.backend import make_model
 from filtergym.evaluation.competitors import make_competitor
@@ -13,6 +14,8 @@ from filtergym.names import find_competitor, import_problem
 
 pytest.importorskip("llvmlite")
 
+AGENTS = [file for file in sorted(PRETRAINED.glob("*/*.safetensors")) if file.stem != "kalman-net"]
+"""All that are shipped and act."""
 SEEDS = range(8)
 HORIZON = 30
 
@@ -45,6 +48,15 @@ def estimates(model, episode):
         ("LooselyCoupledNavigation", "innovation-adaptive", {"decision_interval": 5}),
         ("UavAutopilot", "innovation-adaptive", {}),
         pytest.param("TightlyCoupledNavigation", "stuck-check", {}, marks=pytest.mark.slow),
+        *(
+            pytest.param(
+                file.parent.name.removesuffix("-v0"),
+                file.stem,
+                {},
+                marks=pytest.mark.slow if file.parent.name.startswith("Tightly") else (),
+            )
+            for file in AGENTS
+        ),
     ],
 )
 def test_a_traced_policy_does_what_it_does_when_it_is_asked(environment, name, options):

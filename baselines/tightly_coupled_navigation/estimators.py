@@ -79,7 +79,7 @@ class Huber:
         filters = self.bank.weigh_by_bayes(filters, memory.last_action)
         records = self.bank.records(filters, measurement)
         likelihood = Likelihood(*(records[name] for name in Likelihood._fields))
-        return filters.mean, filters.covariance, filters, likelihood
+        return filters.mean, self.bank.covariance(filters), filters, likelihood
 
 
 class HuberStuckCheck:

@@ -12,6 +12,7 @@ from ...envs.tightly_coupled_navigation.world import Measurement, Truth
 from ...evaluation.competitors import Likelihood
 from ...filters import extended_kalman, gnss_ins
 from ...filters.ordered_sums import ordered_sum
+from ...filters.packed_covariance import diagonal, pack, unpack
 
 
 class Track(NamedTuple):
@@ -20,7 +21,7 @@ class Track(NamedTuple):
     mean: Array
     """``(17, N)``."""
     covariance: Array
-    """``(17, 17, N)``."""
+    """Packed (:mod:`~filtergym.filters.packed_covariance`), ``(153, N)``."""
     mode: Array
     """True hypothesis at the last measurement, ``(N,)``."""
 
@@ -28,13 +29,12 @@ class Track(NamedTuple):
 def _replace_acceleration(
     matrix: Array, variance: float, task: TightlyCoupledNavigation, lanes: Array
 ) -> Array:
-    """Covariance ``(17, 17, N)`` with an acceleration that has nothing to do with the past in some lanes."""
-    xp = task.xp
-    part = [1.0 if gnss_ins.ACCELERATION.start <= i < gnss_ins.ACCELERATION.stop else 0.0 for i in range(17)]
-    new = task.constant(part)
-    keep = 1.0 - new
-    fresh = matrix * (keep[:, None] * keep)[:, :, None] + (variance * xp.eye(17) * new)[:, :, None]
-    return xp.where(lanes, fresh, matrix)
+    """Packed covariance with an acceleration that has nothing to do with the past in some lanes."""
+    new = numpy.zeros(gnss_ins.SIZE)
+    new[gnss_ins.ACCELERATION] = 1.0
+    keep = task.constant(pack(numpy.outer(1.0 - new, 1.0 - new)))
+    fresh = matrix * keep[:, None] + task.constant(pack(variance * numpy.diag(new)))[:, None]
+    return task.xp.where(lanes, fresh, matrix)
 
 
 class _KnownMode:
@@ -53,7 +53,7 @@ class _KnownMode:
 
     def start(self, initial: Initial, truth: Truth) -> Track:
         """Start where everyone starts."""
-        return Track(initial.mean, initial.covariance, truth.mode)
+        return Track(initial.mean, pack(initial.covariance), truth.mode)
 
     def reset_acceleration(self, track: Track, lanes: Array, variance: float) -> Track:
         """Track with an unknown acceleration of some variance in some lanes."""
@@ -84,13 +84,13 @@ class _KnownMode:
         noise = xp.take(noises, moved_by, axis=-1)[:, :, None]
         mean, covariance = gnss_ins.predict(
             track.mean[:, None],
-            track.covariance[:, :, None],
+            unpack(track.covariance, gnss_ins.SIZE)[:, :, None],
             axis,
             task.common.T,
             task.common.decay,
             noise,
         )
-        track = Track(mean[:, 0], covariance[:, :, 0], truth.mode)
+        track = Track(mean[:, 0], pack(covariance[:, :, 0]), truth.mode)
         return self.reset_acceleration(track, jumped, variance)
 
     def readings_and_jacobian(self, measurement: Measurement, state: Array) -> tuple[Array, Any]:
@@ -151,12 +151,13 @@ class KnownMode(_KnownMode):
         residual = xp.concat([residual[ranges] - truth.range_error, residual[ranges.stop :]])
         variance, available = self.sensors(measurement, truth)
         update = extended_kalman.update_one_by_one(
-            track.mean, track.covariance, residual, rows, variance, available
+            track.mean, unpack(track.covariance, gnss_ins.SIZE), residual, rows, variance, available
         )
         likelihood = Likelihood(
             update.log_likelihood, ordered_sum(update.squared_residuals), ordered_sum(available)
         )
-        return update.mean, update.covariance, Track(update.mean, update.covariance, truth.mode), likelihood
+        after = Track(update.mean, pack(update.covariance), truth.mode)
+        return update.mean, update.covariance, after, likelihood
 
 
 class KnownModeBound(_KnownMode):
@@ -191,7 +192,11 @@ class KnownModeBound(_KnownMode):
         track = self.predict_track(truth, memory, self.noises, 0.0)
         expected, rows = self.readings_and_jacobian(measurement, truth.state)
         update = extended_kalman.update_one_by_one(
-            track.mean, track.covariance, xp.zeros_like(expected), rows, *self.sensors(measurement, truth)
+            track.mean,
+            unpack(track.covariance, gnss_ins.SIZE),
+            xp.zeros_like(expected),
+            rows,
+            *self.sensors(measurement, truth),
         )
-        P = update.covariance
-        return xp.stack([P[i, i] for i in range(gnss_ins.SIZE)]), track._replace(covariance=P)
+        P = pack(update.covariance)
+        return P[diagonal(gnss_ins.SIZE)], track._replace(covariance=P)

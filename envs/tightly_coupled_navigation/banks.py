@@ -1,8 +1,9 @@
 """The filters of TightlyCoupledNavigation that are steered: a bank of extended Kalman filters.
 
 One filter for each hypothesis on the motion, mixed before every measurement by the weights in force and
-combined after it. The steps are numbered as in the paper (see :mod:`.task`). Step 4, the prediction, stands at
-the end of :meth:`act`, because it steers the tracking loops of the next measurement.
+combined after it. The steps are numbered as in the paper (see :mod:`.task`). Of steps 1 to 4, the prediction, the
+combined mean is computed twice: after :meth:`act`, because it steers the tracking loops of the next measurement, and
+with the rest of the prediction in :meth:`predict`.
 
 Reading: step 3 of the scan lacks a hat and carries the index k|k-1; the spread is taken about the posterior
 estimates, otherwise the matrix is not symmetric.
@@ -17,6 +18,7 @@ import numpy
 
 from ...filters import extended_kalman, gnss_ins, imm
 from ...filters.ordered_sums import ordered_sum, weighted_sum
+from ...filters.packed_covariance import pack, unpack
 from ..controls import bank_action_space, bank_probabilities
 from ..filter import Bank, Initial
 from ..observation import BOUNDED_LOG, SIGNED_LOG, Array, Block, Quantity
@@ -40,22 +42,24 @@ class Prediction(NamedTuple):
     mean: Array
     """``(17, M, N)``."""
     covariance: Array
-    """``(17, 17, M, N)``."""
-    log_probabilities: Array
-    """Logarithm of the predicted probabilities, ``(M, N)``."""
-    combined: Array
-    """Mean of the combined prediction, ``(17, N)``."""
+    """Packed, as those of :class:`Filters`, ``(153, M, N)``."""
+    probabilities: Array
+    """``(M, N)``."""
 
 
 class Filters(NamedTuple):
-    """The bank at one moment."""
+    """The bank at one moment.
 
-    predicted: Prediction
-    """To the measurement at hand; after :meth:`act`, to the next one."""
+    Covariances are packed (:mod:`~filtergym.filters.packed_covariance`), so that a compiled step knows that they are
+    symmetric and computes one half. That of the combination (step 8) is computed where somebody asks for it.
+    """
+
     means: Array
-    """After the update, ``(17, M, N)``."""
+    """After the update, ``(17, M, N)``; of a bank whose action sets the noise, before :meth:`act`, as predicted."""
     covariances: Array
-    """``(17, 17, M, N)``."""
+    """Likewise, packed, ``(153, M, N)``."""
+    log_predicted: Array
+    """Logarithm of the predicted probabilities, ``(M, N)``."""
     log_likelihood: Array
     """``(M, N)``."""
     nis: Array
@@ -74,8 +78,6 @@ class Filters(NamedTuple):
     """Weights of the hypotheses in force, ``(M, N)``."""
     mean: Array
     """Of the combination, ``(17, N)``."""
-    covariance: Array
-    """``(17, 17, N)``."""
     last_action: Array
     """``(A, N)``."""
 
@@ -136,7 +138,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
                 "the log-likelihood minus the largest one, nats", HYPOTHESES, BOUNDED_LOG,
             ),
             Block(
-                "log_predicted", lambda f, y: f.predicted.log_probabilities,
+                "log_predicted", lambda f, y: f.log_predicted,
                 "the logarithm of the predicted probability", HYPOTHESES, SIGNED_LOG,
             ),
             Block(
@@ -186,13 +188,13 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         xp, M, task = self.xp, len(HYPOTHESES), self.task
         zeros = 0.0 * initial.mean[0]
         means = xp.stack([initial.mean] * M, axis=1)
-        covariances = xp.stack([initial.covariance] * M, axis=2)
+        covariances = xp.stack([pack(initial.covariance)] * M, axis=1)
         probabilities = task.constant(self.parameters.initial_probabilities)[:, None] + zeros
         nis = xp.stack([xp.stack([zeros] * M)] * len(task.sensors))
         return Filters(
-            predicted=self._predict_hypotheses(means, covariances, probabilities),
             means=means,
             covariances=covariances,
+            log_predicted=imm.log_probabilities(probabilities),
             log_likelihood=nis[0],
             nis=nis,
             log_density=zeros,
@@ -202,58 +204,73 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             range_innovation=xp.stack([zeros] * task.tracked.stop),
             probabilities=probabilities,
             mean=initial.mean,
-            covariance=initial.covariance,
             last_action=xp.stack([zeros] * len(self.actions)),
         )
 
-    def _predict_hypotheses(self, means: Array, covariances: Array, probabilities: Array) -> Prediction:
+    def _predict_hypotheses(self, state: Filters) -> Prediction:
         """Steps 1 to 4: mix on the weights in force, and extrapolate under every hypothesis."""
         task, common = self.task, self.task.common
-        chain = imm.predict_mode_probabilities(task.transition, probabilities)
-        mixed = imm.mix(means, covariances, chain.mixing)
+        chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
+        mixed = imm.mix(state.means, unpack(state.covariances, gnss_ins.SIZE), chain.mixing)
         mean, covariance = gnss_ins.predict(*mixed, task.axis, common.T, common.decay, task.process_noise)
-        combined = weighted_sum(chain.probabilities, mean)
-        return Prediction(mean, covariance, imm.log_probabilities(chain.probabilities), combined)
+        return Prediction(mean, pack(covariance), chain.probabilities)
 
     def feedback(self, state: Filters, measurement: Any) -> Array | None:
         """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
-        return state.predicted.combined if self.parameters.aperture else None
+        if not self.parameters.aperture:
+            return None
+        predicted = self._predict_hypotheses(state)
+        return weighted_sum(predicted.probabilities, predicted.mean)
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
-        """Compare the prediction with a measurement, and update with the nominal noise."""
-        xp, task, combined = self.xp, self.task, state.predicted.combined
+        """Predict, compare the prediction with a measurement, and update with the nominal noise."""
+        xp, task, predicted = self.xp, self.task, self._predict_hypotheses(state)
+        combined = weighted_sum(predicted.probabilities, predicted.mean)
         seen = gnss_ins.geometry(combined, measurement.satellite_position, measurement.satellite_velocity)
         innovation = measurement.readings[task.tracked] - xp.concat(gnss_ins.ranges(combined, seen))
         update = self._update_hypotheses(
-            state, measurement, task.sensor_variance, self.thresholds(state, measurement)
+            predicted.mean,
+            predicted.covariance,
+            measurement,
+            task.sensor_variance,
+            self.thresholds(state, measurement),
         )
         nis = xp.stack([ordered_sum(update.squared_residuals[sensor.readings]) for sensor in task.sensors])
         change = nis / self._present(measurement) - state.average_nis
         accelerometers = measurement.readings[task.sensors[2].readings]
         repeated = xp.all(accelerometers == state.accelerometers, axis=0)
+        log_predicted = imm.log_probabilities(predicted.probabilities)
+        means, covariances = self._before_the_action(predicted, update)
         return state._replace(
-            means=update.mean,
-            covariances=update.covariance,
+            means=means,
+            covariances=covariances,
+            log_predicted=log_predicted,
             log_likelihood=update.log_likelihood,
             nis=nis,
-            log_density=imm.log_mixture_density(state.predicted.log_probabilities, update.log_likelihood),
+            log_density=imm.log_mixture_density(log_predicted, update.log_likelihood),
             average_nis=state.average_nis + (1.0 / self.parameters.averaging_measurements) * change,
             accelerometers=accelerometers,
             repeated=xp.astype(repeated, combined.dtype),
             range_innovation=innovation,
         )
 
+    def _before_the_action(
+        self, predicted: Prediction, update: extended_kalman.Correction
+    ) -> tuple[Array, Array]:
+        """Means and covariances, packed, that :meth:`act` goes on from."""
+        return update.mean, pack(update.covariance)
+
     def _update_hypotheses(
         self,
-        state: Filters,
+        means: Array,
+        covariances: Array,
         measurement: Measurement,
         variance: Sequence[Any],
         thresholds: Sequence[Array] | None = None,
     ) -> extended_kalman.Correction:
         """Steps 5 and 6 for every hypothesis."""
-        predicted = state.predicted
         expected, rows = gnss_ins.observe(
-            predicted.mean,
+            means,
             measurement.satellite_position[:, :, None],
             measurement.satellite_velocity[:, :, None],
             measurement.ins_angles[:, None],
@@ -261,8 +278,8 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         )
         residual = measurement.readings[:, None] - expected
         return extended_kalman.update_one_by_one(
-            predicted.mean,
-            predicted.covariance,
+            means,
+            unpack(covariances, gnss_ins.SIZE),
             residual,
             rows,
             variance,
@@ -280,7 +297,7 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         probabilities = bank_probabilities(
             control,
             action,
-            state.predicted.log_probabilities,
+            state.log_predicted,
             state.log_likelihood,
             self.parameters.evidence_scale,
             xp,
@@ -290,23 +307,25 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
             last = probabilities
         else:
             last = xp.astype(xp.clip(action, 0.0 if control == "weights" else -1.0, 1.0), dtype)
-        return self._combine_and_predict(state, probabilities, last)
+        return self._combine(state, probabilities, last)
 
     def weigh_by_bayes(self, state: Filters, last_action: Array) -> Filters:
         """Weigh the hypotheses by Bayes' rule (step 7), as the paper does."""
-        probabilities = imm.mode_posterior(state.predicted.log_probabilities, state.log_likelihood)
-        return self._combine_and_predict(state, probabilities, last_action)
+        probabilities = imm.mode_posterior(state.log_predicted, state.log_likelihood)
+        return self._combine(state, probabilities, last_action)
 
-    def _combine_and_predict(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
-        """Combine (step 8), and predict to the next measurement."""
-        mean, covariance = imm.combine(state.means, state.covariances, probabilities)
+    def _combine(self, state: Filters, probabilities: Array, last_action: Array) -> Filters:
+        """Combine the means (step 8)."""
         return state._replace(
-            predicted=self._predict_hypotheses(state.means, state.covariances, probabilities),
             probabilities=probabilities,
-            mean=mean,
-            covariance=covariance,
+            mean=weighted_sum(probabilities, state.means),
             last_action=last_action,
         )
+
+    def covariance(self, state: Filters) -> Array:
+        """Of the combination (step 8)."""
+        covariances = unpack(state.covariances, gnss_ins.SIZE)
+        return imm.combine(state.means, covariances, state.probabilities)[1]
 
     def records(self, state: Filters, measurement: Measurement) -> dict[str, Array]:
         """Probabilities, NIS of the combination and its degrees, log-density of the measurement as predicted, whether a
@@ -336,15 +355,22 @@ class NoiseBank(HypothesisBank):
         """The groups of sensors."""
         return [sensor.name for sensor in self.task.sensors]
 
+    def _before_the_action(
+        self, predicted: Prediction, update: extended_kalman.Correction
+    ) -> tuple[Array, Array]:
+        """Those of the prediction: the update waits for the noise that the action asks for. What of the nominal one
+        is not kept, a compiled step does not compute.
+        """
+        return predicted.mean, predicted.covariance
+
     def act(self, state: Filters, measurement: Measurement, action: Array) -> Filters:
         """Update with the noise that the action asks for, and weigh by Bayes' rule."""
         xp = self.xp
         exponent = xp.astype(xp.clip(action, -1.0, 1.0), state.mean.dtype)
-        update = self._update_hypotheses(
-            state, measurement, self._variance(exponent, state), self._thresholds(exponent)
-        )
+        variance, thresholds = self._variance(exponent, state), self._thresholds(exponent)
+        update = self._update_hypotheses(state.means, state.covariances, measurement, variance, thresholds)
         state = state._replace(
-            means=update.mean, covariances=update.covariance, log_likelihood=update.log_likelihood
+            means=update.mean, covariances=pack(update.covariance), log_likelihood=update.log_likelihood
         )
         return self.weigh_by_bayes(state, exponent)
 
