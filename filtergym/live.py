@@ -68,7 +68,7 @@ def online(
     if isinstance(maker, EstimatorMaker):
         estimator = maker(model.task)
         watch = WatchedPolicy(estimator.network, range)
-        estimator.filter.ask = watch.act
+        estimator.filter.decider.ask = watch.act
         return OnlineFilter(model, estimator, kind, name, tracks, watch)
     watch = WatchedPolicy(make_competitor(maker, model), range)
     return OnlineFilter(model, watch, kind, name, tracks, watch)
