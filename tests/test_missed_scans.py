@@ -12,6 +12,7 @@ from filtergym.envs.backend import host_array
 from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
 from models import make_model
+from naive import episode_numbers
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -49,11 +50,9 @@ def paper_state(time):
 
 def paper_data(seed):
     """Start, and of every scan time, truth and measurement (None where it missed), from the documented numbers."""
-    rng = gym.utils.seeding.np_random(seed)[0]
-    detection, jitter = rng.random(2)
+    normals, (detection, jitter), rows, uniforms = episode_numbers(seed, 4, 2, 2, 2, 101)
     detection = IRREGULAR["detection_probability"][0] + 0.4 * detection
     jitter = IRREGULAR["scan_jitter"][0] + 0.6 * jitter
-    normals, rows, uniforms = rng.standard_normal(4), rng.standard_normal((101, 2)), rng.random((101, 2))
     begun = paper_state(0.0)
     sigma = np.sqrt(variances(*begun[:2]))
     start = begun + np.concatenate([sigma, math.sqrt(2) * sigma / T]) * normals
@@ -578,16 +577,21 @@ def test_a_table_may_be_missed():
 
 def test_pictures_leave_out_what_was_missed():
     env = gym.make(
-        ID, render_mode="rgb_array", detection_probability=(0.3, 0.3), scan_jitter=(0.5, 0.5), horizon=8
+        ID,
+        scenario="paper",  # one whose flights all miss scans
+        render_mode="rgb_array",
+        detection_probability=(0.3, 0.3),
+        scan_jitter=(0.5, 0.5),
+        horizon=40,
     )
     env.reset(seed=0)
     picture = env.unwrapped.model.picture()
     missed = []
-    for _ in range(8):
+    for _ in range(40):
         state = env.unwrapped.fleet.only.state
         values = picture.records(state)
         missed.append(not state.measurement.available[0])
         assert np.isnan(values["measured_x"]) == np.isnan(values["measured_y"]) == missed[-1]
         env.step(np.zeros(2))
-    assert 0 < sum(missed) < 8
+    assert 0 < sum(missed) < 40
     assert env.render().shape[-1] == 3

@@ -16,6 +16,7 @@ import xarray
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.compiled import AVAILABLE
+from filtergym.envs.episode_noise import uniforms_of_seeds
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.envs.recorded_tables import Columns
@@ -75,7 +76,7 @@ def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
     replay = gym.make_vec(env, num_envs=3, control=control, backend=backend, scenario=read, reward="cost")
     seeds = {}
     for seed in range(100):
-        uniforms = np.random.default_rng(seed).random((replay.unwrapped.task.noise.uniforms, 1))
+        uniforms = uniforms_of_seeds([seed], replay.unwrapped.task.noise)
         seeds[int(replay.unwrapped.task.flight_of(uniforms)[0])] = seed
     shown = [
         original.reset(seed=[int(s) for s in episode_seeds("test", 0, 3)])[0],
@@ -172,7 +173,7 @@ def test_flights_and_user_keywords_go_with_a_recording():
         for n, name in ((40, "a"), (25, "b"))
     ]
     scenario = {"trajectories": flights, "fewest_scans": 2}
-    made = record(TARGET, scenario, episodes=4, backend="numpy", range_sigma=50.0)
+    made = record(TARGET, scenario, episodes=24, backend="numpy", range_sigma=50.0)
     assert made.parameters == {"range_sigma": 50.0}  # and no table of the flights
     assert sorted(set(made.lengths.tolist())) == [24, 39]
     assert make_model(TARGET, scenario=made).task.parameters.range_sigma == 50.0
@@ -217,7 +218,7 @@ def test_without_truth_rewards_are_zero_and_nothing_is_judged(recordings):
     for keywords in ({"reward": "cost"}, {"observation": "asymmetric"}):
         with pytest.raises(ValueError, match="has no truth, so the cost of an estimate is not known"):
             gym.make(TARGET, scenario=recording, **keywords)
-    paying = gym.make(TARGET, horizon=24).unwrapped
+    paying = gym.make(TARGET, horizon=24, reward="cost").unwrapped  # also of a scan that missed
     with pytest.raises(ValueError, match="and this environment gives rewards: make another one"):
         paying.reset(options={"scenario": recording})
     paying.reset(options={"scenario": recordings[TARGET]}, seed=0)
@@ -264,13 +265,13 @@ def test_every_environment_has_a_likelihood_without_truth(env, recordings):
 @pytest.mark.parametrize("control", ["evidence", "gain"])
 def test_log_likelihood_is_the_density_of_what_was_predicted(control):
     model = make_model(TARGET, control, horizon=10)
-    lanes = Lanes(model, 3)
-    for lane in range(3):
+    lanes = Lanes(model, 64)
+    for lane in range(64):
         lanes.seed(lane, np.random.default_rng(lane))
     lanes.restart()
     for _ in range(3):
-        lanes.decide(np.full((3, *model.action_space.shape), 0.3))
-    action = np.full((*model.action_space.shape, 8), 0.3)
+        lanes.decide(np.full((64, *model.action_space.shape), 0.3))
+    action = np.full((*model.action_space.shape, 64), 0.3)
     bank, said = lanes.state.filter, model.records(model.act(lanes.state, action))
     if control == "gain":
         S = np.stack([np.diag(v) for v in bank.innovation_variance.T], axis=-1)
@@ -468,6 +469,9 @@ def test_ranges_and_decisions(tmp_path):
 
 
 def test_netcdf_without_a_start_starts_from_the_first_measurements(recordings, tmp_path):
+    # Without a plot in one of its first two scans a track could not be started.
+    seen = record(TARGET, "irregular-scans", episodes=3, backend="numpy", **OPEN[TARGET])
+    recordings = {**recordings, TARGET: seen}
     for env, used in ((TARGET, 2), (LOOSE, 0), (ESM, 1)):
         data = recordings[env].dataset
         data = data.drop_vars([name for name in data.variables if str(name).startswith("initial_")])

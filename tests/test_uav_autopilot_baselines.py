@@ -224,10 +224,13 @@ def test_a_bound_does_not_depend_on_the_control_and_nobody_beats_it(plant: str) 
 def test_the_bound_told_of_a_slow_actuator_holds_for_the_filter_that_is_not(plant: str) -> None:
     if plant == "P":
         pytest.skip("plant P has no actuator")
-    dataset = run("U", "actuator-lag", 100, ("kalman", "known-noise-bound"))
+    dataset = run("U", "actuator-lag", 400, ("kalman", "known-noise-bound"))
     squares = (dataset["error"].sel(policy="kalman") ** 2).mean("time").values
-    bound = dataset["mean_square"].sel(policy="known-noise-bound").mean(["episode", "time"]).values
-    assert (squares.mean(axis=0) > bound).all()
+    above = squares - dataset["mean_square"].sel(policy="known-noise-bound").mean("time").values
+    error = above.std(axis=0) / math.sqrt(len(above))
+    # The actuator concerns two of the five components; in the others the filter may reach the bound.
+    assert (above.mean(axis=0) > -4.0 * error).all()
+    assert (above.mean(axis=0) > 4.0 * error).sum() == 2
 
 
 # ---------------------------------------------------------------- no leak
@@ -344,8 +347,8 @@ def step_records(episodes: int) -> dict[str, Record]:
 
 
 def test_step_response_of_the_mean_output() -> None:
-    found = step_records(800)
-    # The averaged response has noise of 0.008: the response without noise is 0.46 s, 0.54 s, no overshoot.
+    found = step_records(6400)
+    # The averaged response has noise of 0.003: the response without noise is 0.46 s, 0.54 s, no overshoot.
     assert found["rise_time"].value == pytest.approx(0.46, abs=0.021)
     assert found["settling_time"].value == pytest.approx(0.54, abs=0.061)
     value, low, high = found["mean_output"].value, found["mean_output"].low, found["mean_output"].high
