@@ -105,10 +105,10 @@ MOVED = """
 :::{admonition} These numbers were made before the noise by counter
 :class: note
 
-The random numbers of an episode have since become a function of its seed and of the time alone. Every episode has changed
-once by it: the same seed draws another flight and other noise. Their distributions have not changed. What stands on this
-page is of the episodes before, and whoever runs a command again gets numbers that differ from it as those of other seeds
-do. All tables, figures and agents are made again together.
+The random numbers of an episode have since become a function of its seed and of the time alone. Every episode has
+changed once by it: the same seed draws another flight and other noise. Their distributions have not changed. What
+stands on this page is of the episodes before, and whoever runs a command again gets numbers that differ from it as
+those of other seeds do. All tables, figures and agents are made again together.
 :::
 """
 """Said at the top of pages whose numbers come from runs, until they are made again."""

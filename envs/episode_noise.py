@@ -65,6 +65,16 @@ def start_numbers(identities: numpy.ndarray, layout: NoiseLayout) -> tuple[numpy
     return found[layout.initial_normals :], found[: layout.initial_normals]
 
 
+def uniforms_of_seeds(seeds: Sequence[int], layout: NoiseLayout) -> numpy.ndarray:
+    """Uniform numbers ``(layout.uniforms, N)`` that draw the scenarios of the episodes of these seeds.
+
+    Args:
+        seeds: as in :func:`identities_of_seeds`.
+        layout: of the task.
+    """
+    return start_numbers(identities_of_seeds(seeds), layout)[0]
+
+
 class EpisodeNoise:
     """Noise of ``count`` lanes.
 

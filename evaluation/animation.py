@@ -10,6 +10,7 @@ from PIL import Image
 from ..envs.backend import make_model
 from ..envs.catalogue import find_scenario
 from ..envs.environment import TaskEnv
+from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.task import Task
@@ -98,8 +99,7 @@ def _estimate_frames(
 
     kind, chosen = kind_of(estimator), find_scenario(task, scenario, keywords)
     model = make_model(task, task.controls[0], scenario, **keywords)
-    uniforms = numpy.random.default_rng(seed).random((model.task.noise.uniforms, 1))
-    length = int(model.task.lengths(uniforms)[0])
+    length = int(model.task.lengths(uniforms_of_seeds([seed], model.task.noise))[0])
     found = run_competitor(model, estimator, kind, [seed], _picture_track)
     track = {key: values[0, :length] for key, values in found.items()}
     drawn = EstimatePicture(model, track)

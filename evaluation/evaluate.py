@@ -16,6 +16,7 @@ import xarray
 from ..envs.backend import make_model
 from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, read_files, task_class
 from ..envs.compiled import Report
+from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.recording import Recording
@@ -557,14 +558,15 @@ def _flights_in_turn(
     missing = numpy.full(count, share)
     first = 0
     while missing.any():
-        for candidate in episode_seeds(split, seed, share * count, first):
-            uniforms = numpy.random.default_rng(candidate).random((model.task.noise.uniforms, 1))
-            flight = int(model.task.flight_of(uniforms)[0])
+        candidates = episode_seeds(split, seed, share * count, first)
+        uniforms = uniforms_of_seeds(candidates, model.task.noise)
+        drawn = zip(candidates, model.task.flight_of(uniforms), model.task.lengths(uniforms), strict=True)
+        for candidate, flight, length in drawn:
             if missing[flight]:
                 missing[flight] -= 1
                 found.append(candidate)
-                flown.append(flight)
-                lengths.append(int(model.task.lengths(uniforms)[0]))
+                flown.append(int(flight))
+                lengths.append(int(length))
         first += share * count
     return found, numpy.array(flown), numpy.array(lengths)
 

@@ -7,6 +7,7 @@ import numpy
 
 from ..envs.backend import make_model
 from ..envs.catalogue import find_scenario, make_task, read_files
+from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
@@ -133,9 +134,7 @@ def _record(
             keep(episode)
         tick(count * model.task.decision_interval)
     keep(lanes.state)
-    uniforms = numpy.stack(
-        [numpy.random.default_rng(s).random(model.task.noise.uniforms) for s in seeds], axis=1
-    )
+    uniforms = uniforms_of_seeds(seeds, model.task.noise)
     initial["length"] = model.task.lengths(uniforms)
     if model.task.flights:
         initial["flight"] = model.task.flight_of(uniforms)

@@ -9,7 +9,7 @@ import numpy
 from ..compiler.functions import Specialised, round_up_lanes
 from ..envs.compiled import CompiledModel, Report, can_step
 from ..envs.environment import check_action
-from ..envs.episode_noise import identities_of_seeds, start_numbers
+from ..envs.episode_noise import identities_of_seeds, uniforms_of_seeds
 from ..envs.lanes import Lanes, whole_episode
 from ..envs.model import Episode, Model
 from ..envs.observation import Array
@@ -106,7 +106,7 @@ def _smoothed_estimates(
     Episodes of one length are smoothed together, from their last measurement on; beyond it that estimate is held.
     """
     task = model.task
-    lengths = task.lengths(start_numbers(identities_of_seeds(seeds), task.noise)[0])
+    lengths = task.lengths(uniforms_of_seeds(seeds, task.noise))
     K, C, width = task.horizon, len(task.components), round_up_lanes(len(seeds))
     means, covariances = numpy.empty((C, K, width)), numpy.empty((C, C, K, width))
     for length in numpy.unique(lengths).tolist():

@@ -11,6 +11,7 @@ from filtergym.evaluation.dataset import windows_of
 from filtergym.filters import alpha_beta, imm
 from filtergym.filters.gaussian import log_density
 from models import make_model
+from naive import episode_numbers
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -47,10 +48,9 @@ def paper_flight():
 
 
 def paper_data(seed):
-    """Start of the filters and measurements of the episode with this seed, in the documented order."""
-    rng = gym.utils.seeding.np_random(seed)[0]
+    """Start of the filters and measurements of the episode with this seed, from the documented numbers."""
     truth = paper_flight()
-    normals, rows = rng.standard_normal(4), rng.standard_normal((101, 2))
+    normals, _, rows, _ = episode_numbers(seed, 4, 0, 2, 0, 101)
     sigma = np.sqrt(variances(*truth[0, :2]))
     start = truth[0] + np.concatenate([sigma, math.sqrt(2) * sigma / T]) * normals
     z = [truth[k, :2] + np.sqrt(variances(*truth[k, :2])) * rows[k - 1] for k in range(1, 102)]

@@ -12,6 +12,7 @@ from filtergym.envs.backend import host_array
 from filtergym.envs.maneuvering_target.banks import AlphaBeta
 from filtergym.filters import alpha_beta
 from models import make_model
+from naive import episode_numbers
 from scipy.stats import multivariate_normal
 
 from filtergym import evaluate
@@ -49,11 +50,9 @@ def paper_state(time):
 
 def paper_data(seed):
     """Start, and of every scan time, truth and measurement (None where it missed), from the documented numbers."""
-    rng = gym.utils.seeding.np_random(seed)[0]
-    detection, jitter = rng.random(2)
+    normals, (detection, jitter), rows, uniforms = episode_numbers(seed, 4, 2, 2, 2, 101)
     detection = IRREGULAR["detection_probability"][0] + 0.4 * detection
     jitter = IRREGULAR["scan_jitter"][0] + 0.6 * jitter
-    normals, rows, uniforms = rng.standard_normal(4), rng.standard_normal((101, 2)), rng.random((101, 2))
     begun = paper_state(0.0)
     sigma = np.sqrt(variances(*begun[:2]))
     start = begun + np.concatenate([sigma, math.sqrt(2) * sigma / T]) * normals

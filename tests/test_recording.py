@@ -16,6 +16,7 @@ import xarray
 from filtergym.baselines.problem import problem_of
 from filtergym.envs.catalogue import task_class
 from filtergym.envs.compiled import AVAILABLE
+from filtergym.envs.episode_noise import uniforms_of_seeds
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.maneuvering_target.logs import read_log
 from filtergym.envs.recorded_tables import Columns
@@ -75,7 +76,7 @@ def test_replay_is_the_simulation_bit_for_bit(env, backend, tmp_path):
     replay = gym.make_vec(env, num_envs=3, control=control, backend=backend, scenario=read, reward="cost")
     seeds = {}
     for seed in range(100):
-        uniforms = np.random.default_rng(seed).random((replay.unwrapped.task.noise.uniforms, 1))
+        uniforms = uniforms_of_seeds([seed], replay.unwrapped.task.noise)
         seeds[int(replay.unwrapped.task.flight_of(uniforms)[0])] = seed
     shown = [
         original.reset(seed=[int(s) for s in episode_seeds("test", 0, 3)])[0],
