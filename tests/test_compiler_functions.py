@@ -14,6 +14,7 @@ import pytest
 from filtergym.compiler import cache, functions, namespace, native
 from filtergym.compiler.functions import Function, Specialised
 from filtergym.compiler.program import Graph
+from filtergym.compiler.sequence import CallSequence, moving_array
 
 pytest.importorskip("llvmlite")
 
@@ -361,6 +362,7 @@ import sys, numpy
 from filtergym.compiler import namespace
 from filtergym.compiler.functions import Function
 from filtergym.compiler.program import Graph
+from filtergym.compiler.sequence import CallSequence, moving_array
 x = numpy.frombuffer(bytes.fromhex(sys.argv[1])).reshape(3, -1)
 function = Function(lambda x: namespace.exp(-x) * namespace.sin(x[::-1]) + namespace.sum(x * x, axis=0) / 3.0, Graph())
 print(function(x).tobytes().hex())
@@ -395,3 +397,35 @@ def test_a_bound_function_reads_and_writes_other_memory_when_told():
     call(0, 8)
     np.testing.assert_array_equal(result, second + 1.0)
     assert special.example().shape == (2, 8)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_a_sequence_runs_its_calls_over_all_steps(threads):
+    """x <- x + y[k], reported at every step; what one step writes the next one reads, from the other memory."""
+    steps, width = 5, 3 * 512
+    x, y = numbers(width), np.stack([numbers(width, seed=k) for k in range(steps)])
+    add = Function(lambda x, y: (x + y,), Graph()).specialise(x, y[0])
+    tell = Function(lambda x: (2.0 * x,), Graph()).specialise(x)
+    memory, told = [x.copy(), np.empty(width)], np.empty((steps, width))
+    turns, moving = [], []
+    for now, then in (memory, memory[::-1]):
+        calls = [add.bound([now, y[0]], [then]), tell.bound([then], [told[0]])]
+        moving += [moving_array(calls[0], 1, y), moving_array(calls[1], 1, told)]
+        turns.append(calls)
+    tables = [call.table.copy() for calls in turns for call in calls]
+    CallSequence(*turns, moving).run(steps, width, threads, tile=40)
+    expected = [x]
+    for row in y:
+        expected.append(expected[-1] + row)
+    np.testing.assert_array_equal(told, 2.0 * np.array(expected[1:]))
+    np.testing.assert_array_equal(memory[steps % 2], expected[-1])
+    for call, table in zip((call for calls in turns for call in calls), tables, strict=True):
+        np.testing.assert_array_equal(call.table, table)
+
+
+def test_an_argument_can_be_read_lane_by_lane():
+    x = numbers(24, 3)
+    special = Specialised(lambda x, y: (x[0] - x[2] + y,), Graph(), [x.T, x[:, 1]], given_turned=True)
+    answer = np.empty(24)
+    special.bound([x, x[:, 1].copy()], [answer])(0, 24)
+    np.testing.assert_array_equal(answer, x[:, 0] - x[:, 2] + x[:, 1])
