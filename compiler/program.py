@@ -70,9 +70,9 @@ class Graph:
     """Expressions of one lane.
 
     ``input`` (argument, row) reads a number that the program is given; ``constant`` has a value; ``take`` (table,
-    index) reads a table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a vector,
-    and ``entry`` (row, product) is a number of what comes out; everything else is an entry of ``OPERATIONS`` or
-    ``FUNCTIONS``.
+    index) reads a table of constants; ``product`` (table, rows, *vector) multiplies a matrix of constants with a
+    vector, and ``entry`` (row, product) is a number of what comes out; everything else is an entry of ``OPERATIONS``
+    or ``FUNCTIONS``.
 
     Attributes:
         operations: name of every expression.
@@ -136,7 +136,9 @@ class Graph:
         table = padded.reshape(bands, BAND, columns).swapaxes(1, 2).ravel()
         arguments = (self._table(table), rows, *vector)
         whole = self._intern(("product", *arguments), "product", arguments, None, False)
-        return [self._intern(("entry", row, whole), "entry", (row, whole), None, False) for row in range(rows)]
+        return [
+            self._intern(("entry", row, whole), "entry", (row, whole), None, False) for row in range(rows)
+        ]
 
     def matrix(self, product: int) -> numpy.ndarray:
         """Return the matrix of a product, ``(rows, columns)``."""
@@ -248,6 +250,7 @@ class Step(NamedTuple):
         if self.operation in ("input", "constant"):
             return ()
         return self.arguments[{"take": 2, "product": 2, "entry": 1}.get(self.operation, 0) :]
+
     logical: bool
 
 
@@ -270,7 +273,9 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     place = {node: i for i, node in enumerate(order)}
     scalars = [node for node in order if graph.values[node] is not None]
     scalar = {node: i for i, node in enumerate(scalars)}
-    tables = sorted({graph.arguments[node][0] for node in order if graph.operations[node] in ("take", "product")})
+    tables = sorted(
+        {graph.arguments[node][0] for node in order if graph.operations[node] in ("take", "product")}
+    )
     lengths = [len(graph.tables[table]) for table in tables]
     starts = dict(zip(tables, numpy.cumsum([len(scalars), *lengths]).tolist(), strict=False))
     sizes = dict(zip(tables, lengths, strict=True))
