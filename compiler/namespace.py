@@ -462,7 +462,7 @@ LARGE = 256
 """Numbers of a matrix of constants, not zero, whose product becomes a loop: fewer are a short straight line."""
 
 
-def is_loop(matrix: Any) -> builtins.bool:
+def _is_loop(matrix: Any) -> builtins.bool:
     """Whether the product with a matrix is a loop: many constants, few of them zero."""
     if not isinstance(matrix, numpy.ndarray) or matrix.ndim != 2 or not _OPEN.get().loops:
         return False
@@ -475,9 +475,9 @@ def matmul(a: Any, b: Any, /) -> Traced:
 
     Where the graph allows loops, the product with a large matrix of constants is one.
     """
-    if is_loop(b):  # x^T B = (B^T x)^T
+    if _is_loop(b):  # x^T B = (B^T x)^T
         return matmul(b.T, asarray(a).mT).mT if asarray(a).ndim > 1 else matmul(b.T, a)
-    if is_loop(a):
+    if _is_loop(a):
         b = _numbers(asarray(b))
         columns = b.nodes.reshape(len(b), -1) if len(b) == a.shape[1] and b.ndim < 3 else None
         if columns is not None:

@@ -41,10 +41,10 @@ def scratch_slots(program: Program, parts: list[list[int]]) -> dict[int, int]:
     part_of = {step: i for i, part in enumerate(parts) for step in part}
     last_user: dict[int, int] = {}
     for index, part in part_of.items():
-        taken = program.steps[index]
-        if taken.operation in FREE:
+        used = program.steps[index]
+        if used.operation in FREE:
             continue
-        for argument in taken.parts:
+        for argument in used.parts:
             if part_of.get(argument, part) < part and program.steps[argument].operation not in FREE:
                 last_user[argument] = part
     free: list[int] = []

@@ -50,12 +50,13 @@ PRODUCT = learned_policy._product
 
 
 def product_in_another_order(seed):
-    """Return a matrix product of observations and weights whose sums run in another order."""
+    """Return a matrix product of observations and weights in float32 whose sums run in another order."""
     generator = np.random.default_rng(seed)
 
     def reordered(rows, weight):
         order = generator.permutation(rows.shape[1])
-        return PRODUCT(rows[:, order], weight[:, order])
+        single = (part[:, order].astype(np.float32) for part in (rows, weight))
+        return PRODUCT(*single).astype(float)
 
     return reordered
 
@@ -70,9 +71,9 @@ def test_shipped_agent_scores_what_its_record_says(file, monkeypatch):
         return float(dataset["cost"].mean())
 
     cost = mean_cost()
-    # The filters and the agent's network in float32 amplify rounding between processors: by how much is asked where
-    # it matters. Other processors sum the terms of a product in another order. Four times the largest change,
-    # because few episodes decide on it, and other ones in each order.
+    # The filters amplify the rounding of the network in float32, in which it was when the record was made: by how much
+    # is asked where it matters, of sums in several orders. Four times the largest change, because few episodes decide
+    # on it, and other ones in each order.
     tolerance = 1e-3 * check["cost"]
     if abs(cost - check["cost"]) > tolerance:
         changes = []

@@ -168,7 +168,8 @@ def test_c_compiles_without_a_warning_and_answers_what_the_filter_answers(
 ):
     writer, given = writer_of(environment, name, scalar)
     said = compile_and_test(writer, given, compiler(), (*FLAGS, "-O0"))
-    assert float(said.split()[2]) < (1e-4 if scalar is c_source.DOUBLE else 1e-2)
+    # Measured 4e-13 of all agents, their networks in double; the other figure is that of float.
+    assert float(said.split()[2]) < (1e-9 if scalar is c_source.DOUBLE else 1e-2)
     for file, text in files_of(writer, given).items():
         (tmp_path / file).write_text(text, encoding="ascii")
     words = [compiler(), *FLAGS, *SANITIZERS, "main.c", f"{writer.name}.c", "-lm", "-o", "run"]

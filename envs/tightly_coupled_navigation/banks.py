@@ -219,8 +219,11 @@ class HypothesisBank(Bank[Task, Measurement, Filters]):
         """State that the tracking loops expect at the next measurement, ``(17, N)``; None without apertures."""
         if not self.parameters.aperture:
             return None
-        predicted = self._predict_hypotheses(state)
-        return weighted_sum(predicted.probabilities, predicted.mean)
+        task, common = self.task, self.task.common
+        chain = imm.predict_mode_probabilities(task.transition, state.probabilities)
+        mixed = weighted_sum(chain.mixing, state.means[:, :, None])
+        mean = gnss_ins.advance(mixed, task.axis, common.T, common.decay)
+        return weighted_sum(chain.probabilities, mean)
 
     def predict(self, state: Filters, measurement: Measurement) -> Filters:
         """Predict, compare the prediction with a measurement, and update with the nominal noise."""

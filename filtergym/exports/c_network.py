@@ -1,4 +1,4 @@
-"""A learned policy's network as C: loops over constant arrays, in float as it was trained."""
+"""A learned policy's network as C: loops over constant arrays of float, in which it was trained, summed as all else."""
 
 from typing import Any
 
@@ -9,17 +9,17 @@ from ..compiler.c_source import FLOAT, Parameter, Scalar, array_text, function_t
 
 _LAYER = """/* One linear layer: the sums of all rows side by side, each in its order, so that they vectorise. */
 static void {name}_layer(
-    const float *restrict x, int inputs, const float *weight, const float *bias, int outputs, float *restrict y) {{
+    const {real} *restrict x, int inputs, const float *weight, const float *bias, int outputs, {real} *restrict y) {{
     int i, j;
-    for (i = 0; i < outputs; ++i) y[i] = 0.0f;
+    for (i = 0; i < outputs; ++i) y[i] = {zero};
     for (j = 0; j < inputs; ++j)
-        for (i = 0; i < outputs; ++i) y[i] += weight[j * outputs + i] * x[j];
-    for (i = 0; i < outputs; ++i) y[i] += bias[i];
+        for (i = 0; i < outputs; ++i) y[i] += ({real})weight[j * outputs + i] * x[j];
+    for (i = 0; i < outputs; ++i) y[i] += ({real})bias[i];
 }}
 
 """
-_LOGISTIC = """static float {name}_logistic(float x) {{
-    return 0.5f * (1.0f + tanhf(0.5f * x));
+_LOGISTIC = """static {real} {name}_logistic({real} x) {{
+    return {half} * ({one} + tanh{f}({half} * x));
 }}
 
 """
@@ -27,21 +27,21 @@ _GRU = """/* Gated recurrent unit: reset, update, new. */
 {name}_layer(x, {inputs}, &{name}_gru_input_weight[0][0], {name}_gru_input_bias, {gates}, a);
 {name}_layer(memory, {units}, &{name}_gru_memory_weight[0][0], {name}_gru_memory_bias, {gates}, b);
 for (i = 0; i < {units}; ++i) {{
-    const float reset = {name}_logistic(a[i] + b[i]);
-    const float update = {name}_logistic(a[{units} + i] + b[{units} + i]);
-    const float candidate = tanhf(a[{twice} + i] + reset * b[{twice} + i]);
-    memory[i] = (1.0f - update) * candidate + update * memory[i];
+    const {real} reset = {name}_logistic(a[i] + b[i]);
+    const {real} update = {name}_logistic(a[{units} + i] + b[{units} + i]);
+    const {real} candidate = tanh{f}(a[{twice} + i] + reset * b[{twice} + i]);
+    memory[i] = ({one} - update) * candidate + update * memory[i];
     x[i] = memory[i];
 }}"""
 _LSTM = """/* Long short-term memory: admit, keep, new, show; what it shows, then its cells. */
 {name}_layer(x, {inputs}, &{name}_lstm_input_weight[0][0], {name}_lstm_input_bias, {gates}, a);
 {name}_layer(memory, {units}, &{name}_lstm_memory_weight[0][0], {name}_lstm_memory_bias, {gates}, b);
 for (i = 0; i < {units}; ++i) {{
-    const float admit = {name}_logistic(a[i] + b[i]);
-    const float keep = {name}_logistic(a[{units} + i] + b[{units} + i]);
-    const float cell = keep * memory[{units} + i] + admit * tanhf(a[{twice} + i] + b[{twice} + i]);
-    const float show = {name}_logistic(a[{thrice} + i] + b[{thrice} + i]);
-    memory[i] = show * tanhf(cell);
+    const {real} admit = {name}_logistic(a[i] + b[i]);
+    const {real} keep = {name}_logistic(a[{units} + i] + b[{units} + i]);
+    const {real} cell = keep * memory[{units} + i] + admit * tanh{f}(a[{twice} + i] + b[{twice} + i]);
+    const {real} show = {name}_logistic(a[{thrice} + i] + b[{thrice} + i]);
+    memory[i] = show * tanh{f}(cell);
     memory[{units} + i] = cell;
     x[i] = memory[i];
 }}"""
@@ -61,7 +61,7 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     Args:
         network: to write.
         name: that everything begins with.
-        scalar: of what it is shown and answers.
+        scalar: in which it computes.
 
     Returns:
         Its text, and the bytes of its constants.
@@ -76,41 +76,43 @@ def network_text(network: LearnedPolicy, name: str, scalar: Scalar) -> tuple[str
     fields = len(arrays["observation_mean"])
     unit = next((kind for kind in ("gru", "lstm") if f"{kind}_memory_weight" in arrays), None)
     width = max([fields, *(values.shape[-1] for key, values in arrays.items() if "weight" in key)])
-    body = [f"float x[{width}], a[{width}]{f', b[{width}]' if unit else ''};", "int i;"]
+    words: dict[str, Any] = {"name": name, "real": scalar.name, "f": scalar.suffix}
+    words |= {key: literal(value, scalar) for key, value in (("zero", 0.0), ("half", 0.5), ("one", 1.0))}
+    body = [f"{scalar.name} x[{width}], a[{width}]{f', b[{width}]' if unit else ''};", "int i;"]
     limit = literal(OBSERVATION_LIMIT, scalar)
     body += [
         f"for (i = 0; i < {fields}; ++i) {{",
         f"    const {scalar.name} z = (shown[i] - ({scalar.name}){name}_observation_mean[i])"
         f" / ({scalar.name}){name}_observation_scale[i];",
-        f"    x[i] = (float)(z < -{limit} ? -{limit} : z > {limit} ? {limit} : z);",
+        f"    x[i] = z < -{limit} ? -{limit} : z > {limit} ? {limit} : z;",
         "}",
     ]
     inputs = fields
     if unit is not None:
         units = len(arrays[f"{unit}_memory_weight"])
-        words = {
-            "name": name, "inputs": inputs, "units": units, "twice": 2 * units, "thrice": 3 * units,
-            "gates": (3 if unit == "gru" else 4) * units,
-        }  # fmt: skip
+        words |= {"inputs": inputs, "units": units, "twice": 2 * units, "thrice": 3 * units}
+        words["gates"] = (3 if unit == "gru" else 4) * units
         body += (_GRU if unit == "gru" else _LSTM).format(**words).split("\n")
         inputs = units
     for i in range(len(network.layers)):
         outputs = len(arrays[f"bias_{i}"])
         body.append(f"{name}_layer(x, {inputs}, &{name}_weight_{i}[0][0], {name}_bias_{i}, {outputs}, a);")
-        between = "tanhf(a[i])" if network.activation is numpy.tanh else "a[i] > 0.0f ? a[i] : 0.0f"
+        zero = words["zero"]
+        smooth = network.activation is numpy.tanh
+        between = f"tanh{scalar.suffix}(a[i])" if smooth else f"a[i] > {zero} ? a[i] : {zero}"
         if i < len(network.layers) - 1:
             body.append(f"for (i = 0; i < {outputs}; ++i) x[i] = {between};")
         inputs = outputs
     body += _answer(network, inputs, scalar)
     parameters = [
         Parameter(f"const {scalar.name} *", "shown"),
-        Parameter("float *", "memory"),
+        Parameter(f"{scalar.name} *", "memory"),
         Parameter(f"{scalar.name} *", "answer"),
     ]
     text = [array_text(f"{name}_{key}", values, FLOAT) for key, values in arrays.items()]
-    text.append(_LAYER.format(name=name))
+    text.append(_LAYER.format(**words))
     if unit is not None:
-        text.append(_LOGISTIC.format(name=name))
+        text.append(_LOGISTIC.format(**words))
     text.append(function_text("static void", f"{name}_network", parameters, body))
     return "\n".join(text), sum(values.size for values in arrays.values()) * 4
 
@@ -128,10 +130,12 @@ def _answer(network: LearnedPolicy, count: int, scalar: Scalar) -> list[str]:
     space: Any = network.model.action_space
     lines = []
     for i, (low, high) in enumerate(zip(space.low.tolist(), space.high.tolist(), strict=True)):
-        least, most = literal(low, FLOAT), literal(high, FLOAT)
+        least, most = literal(low, scalar), literal(high, scalar)
         if network.output == "clip":
             expression = f"a[{i}] < {least} ? {least} : a[{i}] > {most} ? {most} : a[{i}]"
         else:
-            expression = f"{least} + {literal(high - low, FLOAT)} * 0.5f * (1.0f + tanhf(a[{i}]))"
-        lines.append(f"answer[{i}] = ({scalar.name})({expression});")
+            half, one = literal(0.5, scalar), literal(1.0, scalar)
+            width = literal(high - low, scalar)
+            expression = f"{least} + {width} * {half} * ({one} + tanh{scalar.suffix}(a[{i}]))"
+        lines.append(f"answer[{i}] = {expression};")
     return lines

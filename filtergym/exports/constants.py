@@ -206,10 +206,18 @@ def array_text(array: numpy.ndarray) -> str:
         return f"numpy.zeros({array.shape}{dtype}{order})"
     if array.size > LONG and array.ndim > 2 and not order:
         return f"{array_text(array.reshape(-1))}.reshape{array.shape}"
+    if array.size > LONG and array.dtype == numpy.float64 and _is_single(array):  # half the digits
+        return f"{array_text(array.astype(numpy.float32))}.astype(float)"
     rows = _rows_text(array)
     if array.ndim == 1 and "\n" in rows:
         return f"numpy.array(\n{textwrap.indent(rows, '    ')}{dtype}{order}\n)"
     return f"numpy.array({rows}{dtype}{order})"
+
+
+def _is_single(array: numpy.ndarray) -> bool:
+    """Whether all numbers are those of float32, to the bit."""
+    with numpy.errstate(over="ignore"):
+        return bool((array.astype(numpy.float32).astype(numpy.float64) == array).all())
 
 
 def _rows_text(array: numpy.ndarray) -> str:

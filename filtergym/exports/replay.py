@@ -146,22 +146,19 @@ class _Network:
         self.answer = numpy.atleast_2d(numpy.asarray(answer).T)
 
 
-def run_filter(
-    traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64, network_dtype: Any = numpy.float32
-) -> numpy.ndarray:
+def run_filter(traced: TracedFilter, replayed: Replay, dtype: Any = numpy.float64) -> numpy.ndarray:
     """Run the programs of a filter over episodes, step by step in NumPy.
 
     Args:
         traced: to run.
         replayed: what it is given.
-        dtype: in which everything but a network is computed.
-        network_dtype: in which the network is; it was trained in float.
+        dtype: in which everything is computed.
 
     Returns:
         Rows of the estimate, ``(T, rows, E)``.
     """
     E = replayed.initial.shape[1]
-    network = None if traced.network is None else _Network(traced.network, network_dtype)
+    network = None if traced.network is None else _Network(traced.network, dtype)
     state = interpret(traced.start, lambda _, row: replayed.initial[row], dtype)
     answers = []
     for measured in replayed.measurements:
