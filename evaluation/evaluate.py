@@ -14,12 +14,13 @@ import numpy
 import xarray
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, read_files, task_class
+from ..envs.catalogue import importable_name, nearest, task_class
 from ..envs.compiled import Report
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.recording import Recording
 from ..envs.reward import charge
+from ..envs.scenario_choice import find_scenario, make_task, read_files
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy
 import xarray
 
-from ...envs.catalogue import make_task
+from ...envs.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import keywords_of, slices_of
