@@ -4,6 +4,7 @@ import ctypes
 import functools
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -75,22 +76,28 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
     with LOCK:
         binding, (name, features) = llvm(), processor()
         library = library or fastest(features)
+        symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
-        known = cache.key(repr((program.steps, program.results, list(lane_first), library)), name, features)
-        if known not in _LIBRARIES:
-            text = emit(program, lane_first, library)
-            version = ".".join(map(str, binding.llvm_version_info))
-            _LIBRARIES[known] = _load(text, cache.key(text, name, features, version), library)
-        return _LIBRARIES[known]
+        made_of = repr((program.steps, program.results, list(lane_first), symbols))
+        key = cache.key(made_of, name, features, repr(binding.llvm_version_info), _own_text())
+        if key not in _LIBRARIES:
+            _LIBRARIES[key] = _load(key, program, lane_first, library)
+        return _LIBRARIES[key]
 
 
-def _load(text: str, key: str, library: Library) -> Native:
+@functools.cache
+def _own_text() -> str:
+    """Text of this compiler, which decides what becomes of a program."""
+    return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
+
+
+def _load(key: str, program: Program, lane_first: Sequence[bool], library: Library) -> Native:
     binding = llvm()
     for own in library.functions.values():
         binding.add_symbol(own.symbol, own.address)
     code = cache.load(key)
     if code is None:
-        module = binding.parse_assembly(text)
+        module = binding.parse_assembly(emit(program, lane_first, library))
         module.verify()
         code = _target().emit_object(module)
         cache.keep(key, code)
@@ -104,4 +111,4 @@ def _load(text: str, key: str, library: Library) -> Native:
 
 
 _LIBRARIES: dict[str, Native] = {}
-"""By program, processor and library: code that this process has loaded."""
+"""By its key: code that this process has loaded."""

@@ -6,12 +6,11 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cloudpickle
 import gymnasium
 import numpy
-import xarray
 
 from ..envs.backend import make_model
 from ..envs.catalogue import importable_name, nearest, task_class
@@ -33,6 +32,9 @@ from .rollout import Progress, Series, rollout
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
+
+if TYPE_CHECKING:
+    import xarray
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
@@ -240,7 +242,7 @@ def run_experiment(
     competitors: Mapping[str, Any],
     progress: Progress | None = None,
     workers: Workers | None = None,
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
     """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
@@ -410,11 +412,13 @@ class Plan(NamedTuple):
 
     def dataset(
         self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
-    ) -> xarray.Dataset:
+    ) -> "xarray.Dataset":
         """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
         experiment = self.experiment
         dataset = _dataset(per_policy, self, seeds)
         if self.flown is not None and self.lengths is not None:
+            import xarray
+
             beyond = dataset["time"].values <= self.lengths[:, None]
             there = xarray.DataArray(beyond, dims=("episode", "time"))
             of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
@@ -441,7 +445,7 @@ class Plan(NamedTuple):
 
 
 def _recording_coords(
-    recording: Recording, episodes: numpy.ndarray, dataset: xarray.Dataset
+    recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
     """What the evaluation of a recording says of its log.
 
@@ -623,7 +627,9 @@ def _actions_aligned(
 
 def _dataset(
     per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
+    import xarray
+
     kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
     model = next(iter(models.values()))
     names = list(per_policy)
