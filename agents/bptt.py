@@ -23,9 +23,9 @@ import numpy
 import torch
 
 from ..envs.backend import host_array
-from ..envs.catalogue import find_mixture
 from ..envs.environment import TaskVectorEnv
 from ..envs.model import Model
+from ..envs.scenario_choice import find_mixture
 from ..evaluation.seeds import episode_seeds
 from .gate import Gate, as_trained
 from .learned_estimator import EstimatorMaker

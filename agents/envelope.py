@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_mixture, make_task, parameter_names
+from ..envs.catalogue import parameter_names
 from ..envs.parameters import freeze
+from ..envs.scenario_choice import find_mixture, make_task
 from ..envs.task import Task
 from ..evaluation.competitors import Policy, make_competitor
 from ..evaluation.rollout import start_lanes

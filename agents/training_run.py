@@ -25,20 +25,12 @@ import numpy
 
 from ..baselines.problem import Problem, problem_of
 from ..envs.backend import make_model
-from ..envs.catalogue import (
-    catalogue,
-    find_mixture,
-    find_scenario,
-    import_task,
-    importable_name,
-    nearest,
-    parameter_names,
-    task_class,
-)
+from ..envs.catalogue import catalogue, import_task, importable_name, nearest, parameter_names, task_class
 from ..envs.environment import DTYPES
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.reward import REWARDS
+from ..envs.scenario_choice import find_mixture, find_scenario
 from ..envs.task import Task
 from ..evaluation.bootstrap import Bootstrap
 from ..evaluation.competitors import kind_of

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy
 import xarray
 
-from ..envs.catalogue import make_task
 from ..envs.recording import Recording
+from ..envs.scenario_choice import make_task
 from ..envs.task import Task
 from ..evaluation.bootstrap import Estimate
 from ..evaluation.likelihood import Span, WindowLikelihood, cut_windows

@@ -1,15 +1,15 @@
 """Which baselines an environment has.
 
-Every folder beside this file holds those of one environment and exports them as ``BASELINES``; a user's
-environment brings its own, or none.
+Every folder beside this file holds those of the environment whose folder has the same name, and exports them as
+``BASELINES``; a user's environment brings its own, or none.
 """
 
 import importlib
-import pkgutil
+import importlib.util
 from functools import cache
 from types import ModuleType
 
-from ..envs.catalogue import nearest
+from ..envs.catalogue import folders, nearest
 from ..envs.task import Task
 from ..evaluation.competitors import TOLD_MORE, RandomPolicy, kind_of
 from .table import Baselines
@@ -18,25 +18,13 @@ USER_BASELINES: dict[str, Baselines] = {}
 """Baselines of users' environments: Gymnasium id -> table."""
 
 
-def packages() -> list[ModuleType]:
-    """Return the packages of this folder that hold an environment's baselines."""
-    folder = importlib.import_module(__package__)
-    found = [
-        importlib.import_module(f"{__package__}.{module.name}")
-        for module in pkgutil.iter_modules(folder.__path__)
-        if module.ispkg
-    ]
-    return [package for package in found if hasattr(package, "BASELINES")]
-
-
 @cache
-def _by_environment() -> dict[str, ModuleType]:
-    return {package.BASELINES.environment: package for package in packages()}
-
-
 def package_of(id: str) -> ModuleType | None:
     """Return the package that holds the baselines of a Gymnasium id; None where there is none."""
-    return _by_environment().get(id)
+    folder = folders().get(id)
+    if folder is None or importlib.util.find_spec(f"{__package__}.{folder}") is None:
+        return None
+    return importlib.import_module(f"{__package__}.{folder}")
 
 
 def baselines_of(id: str) -> Baselines:

@@ -4,9 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from types import ModuleType
-from typing import Any
-
-import xarray
+from typing import TYPE_CHECKING, Any
 
 from ..envs.catalogue import import_task, importable_name, nearest, short_name, task_class
 from ..envs.task import Task
@@ -16,6 +14,9 @@ from ..evaluation.rollout import Progress
 from .catalogue import baselines_of, package_of
 from .table import Baselines
 from .tuned_values import TunedValues, table_path
+
+if TYPE_CHECKING:
+    import xarray
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Problem:
         progress: Progress | None = None,
         workers: Workers | None = None,
         **keywords: Any,
-    ) -> xarray.Dataset:
+    ) -> "xarray.Dataset":
         """Run competitors over the same episodes, with the paper's algorithm and the reference of its baselines.
 
         Args:

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, make_task, nearest, short_name
+from ..envs.catalogue import nearest, short_name
 from ..envs.model import Episode, Model
+from ..envs.scenario_choice import find_scenario, make_task
 from ..envs.task import Scenario
 from ..evaluation.competitors import kind_of
 from ..evaluation.parallel import Workers, check_workers

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy
 
-from .program import COMPARISONS, LOCK, Graph
+from .program import COMPARISONS, Graph, without_collection
 
 float64, float32, int64, int32 = (numpy.dtype(name) for name in ("float64", "float32", "int64", "int32"))
 bool = numpy.dtype("bool")
@@ -35,7 +35,7 @@ def tracing(graph: Graph) -> Iterator[Graph]:
     Raises:
         NotTraceable: in place of whatever is raised inside: a function may stumble over symbols in any way.
     """
-    with LOCK:
+    with without_collection():
         token = _OPEN.set(graph)
         try:
             yield graph

@@ -5,6 +5,7 @@ import functools
 import importlib.util
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -78,15 +79,17 @@ def native(program: Program, lane_first: Sequence[bool], library: Library | None
         library: where functions come from; default: the fastest for this processor.
     """
     with LOCK:
-        binding, (name, features) = llvm(), processor()
+        binding, (_, features) = llvm(), processor()
         library = library or fastest(features)
+        symbols = {name: (own.symbol, own.lanes) for name, own in library.functions.items()}
         # Its text takes longer to write than this to say, and other numbers leave the steps as they are.
-        known = cache.key(repr((program.steps, program.results, list(lane_first), library)), name, features)
-        if known not in _LIBRARIES:
+        made_of = repr((program.steps, program.results, list(lane_first), symbols))
+        key = _key(made_of, _own_text())
+        if key not in _LIBRARIES:
             for own in library.functions.values():
                 binding.add_symbol(own.symbol, own.address)
-            _LIBRARIES[known] = _load(emit(program, lane_first, library), name, features, NATIVE)
-        return _LIBRARIES[known]
+            _LIBRARIES[key] = _load(key, lambda: emit(program, lane_first, library), NATIVE)
+        return _LIBRARIES[key]
 
 
 def native_text(text: str, signature: Any = NATIVE) -> Any:
@@ -100,20 +103,29 @@ def native_text(text: str, signature: Any = NATIVE) -> Any:
         ImportError: without llvmlite.
     """
     with LOCK:
-        name, features = processor()
-        known = cache.key(text, name, features)
-        if known not in _LIBRARIES:
-            _LIBRARIES[known] = _load(text, name, features, signature)
-        return _LIBRARIES[known]
+        key = _key(text)
+        if key not in _LIBRARIES:
+            _LIBRARIES[key] = _load(key, lambda: text, signature)
+        return _LIBRARIES[key]
 
 
-def _load(text: str, name: str, features: str, signature: Any) -> Any:
-    """Translate a text, or find it in the cache."""
+def _key(*texts: str) -> str:
+    """Name of the code that is made of some texts for this processor."""
+    return cache.key(*texts, *processor(), repr(llvm().llvm_version_info))
+
+
+@functools.cache
+def _own_text() -> str:
+    """Text of this compiler, which decides what becomes of a program."""
+    return "".join(path.read_text(encoding="utf-8") for path in sorted(Path(__file__).parent.glob("*.py")))
+
+
+def _load(key: str, write: Callable[[], str], signature: Any) -> Any:
+    """Load the code of a text, translated or found in the cache."""
     binding = llvm()
-    key = cache.key(text, name, features, ".".join(map(str, binding.llvm_version_info)))
     code = cache.load(key)
     if code is None:
-        module = binding.parse_assembly(text)
+        module = binding.parse_assembly(write())
         module.verify()
         code = _target().emit_object(module)
         cache.keep(key, code)
@@ -125,4 +137,4 @@ def _load(text: str, name: str, features: str, signature: Any) -> Any:
 
 
 _LIBRARIES: dict[str, Native] = {}
-"""By program, processor and library: code that this process has loaded."""
+"""By its key: code that this process has loaded."""

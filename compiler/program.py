@@ -4,9 +4,11 @@ An expression is a number: its place in the :class:`Graph`. One that is made aga
 subexpressions), one of constants is computed at once, and what no result needs never enters a program.
 """
 
+import gc
 import os
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy
@@ -64,6 +66,21 @@ OTHERS = {"take": 1, "product": 2, "entry": 1}
 def unband(table: numpy.ndarray, rows: int, columns: int) -> numpy.ndarray:
     """Matrix ``(rows, columns)`` of the table of a product."""
     return table.reshape(-1, columns, BAND).swapaxes(1, 2).reshape(-1, columns)[:rows]
+
+
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Let nobody look for garbage inside: of a hundred thousand new expressions none is, and looking through them again
+    and again takes a third of the time.
+    """
+    with LOCK:  # else a process forked meanwhile would never collect
+        enabled = gc.isenabled()
+        gc.disable()
+        try:
+            yield
+        finally:
+            if enabled:
+                gc.enable()
 
 
 class Graph:
@@ -154,7 +171,8 @@ class Graph:
 
     def node(self, name: str, *arguments: int) -> int:
         """Expression of others."""
-        values = [self.values[argument] for argument in arguments]
+        known = self.values
+        values = [known[argument] for argument in arguments]
         if None not in values:
             with numpy.errstate(all="ignore"):
                 return self.constant(_COMPUTE[name](*values))
@@ -210,15 +228,15 @@ class Graph:
         seen: set[int] = set()
         order: list[int] = []
         for root in wanted:
-            waiting = [(root, False)]
+            waiting = [root]
             while waiting:
-                node, ready = waiting.pop()
-                if ready:
-                    order.append(node)
+                node = waiting.pop()
+                if node < 0:  # its parts are there
+                    order.append(~node)
                 elif node not in seen:
                     seen.add(node)
-                    waiting.append((node, True))
-                    waiting.extend((part, False) for part in reversed(self.parts(node)))
+                    waiting.append(~node)
+                    waiting.extend(reversed(self.parts(node)))
         return order
 
     def parts(self, node: int) -> tuple[int, ...]:
@@ -267,6 +285,7 @@ class Program(NamedTuple):
     """``node`` is a step's place."""
 
 
+@without_collection()
 def program(graph: Graph, wanted: Sequence[Result]) -> Program:
     """Program for some expressions of a graph."""
     order = graph.live(result.node for result in wanted)
@@ -291,7 +310,7 @@ def program(graph: Graph, wanted: Sequence[Result]) -> Program:
         elif name == "entry":
             arguments = (arguments[0], place[arguments[1]])
         elif name != "input":
-            arguments = tuple(place[argument] for argument in arguments)
+            arguments = tuple([place[argument] for argument in arguments])
         steps.append(Step(name, arguments, graph.logical[node]))
     values: list[Any] = [graph.values[node] for node in scalars]
     constants = numpy.concatenate(

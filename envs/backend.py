@@ -6,11 +6,12 @@ from typing import Any
 import numpy
 
 from ..compiler.namespace import NotTraceable
-from .catalogue import make_task, nearest
+from .catalogue import nearest
 from .compiled import AVAILABLE, CompiledModel, warn_of
 from .model import Model
 from .observation import Array
 from .parameters import Limits, check
+from .scenario_choice import make_task
 from .task import Task
 
 BACKENDS = ("auto", "compiled", "numpy", "torch")
@@ -31,7 +32,7 @@ def make_model(
     Args:
         cls: the task.
         control: what the action steers; default: the first of the task's controls.
-        scenario: as :func:`~.catalogue.find_scenario` takes it.
+        scenario: as :func:`~.scenario_choice.find_scenario` takes it.
         backend: "compiled", "numpy", "torch", or "auto": compiled where llvmlite is installed and the task can be
             traced, else NumPy.
         device: of torch, such as "cuda:1".

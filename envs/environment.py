@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from .backend import host_array, is_tensor, make_model, tensor_on
-from .catalogue import ScenarioChoice, check_names, find_mixture, find_scenario, nearest, task_class
+from .catalogue import check_names, nearest, task_class
 from .fleet import Course, Fleet, check_alike
 from .lanes import Lanes, mean_of
 from .model import Model
@@ -22,6 +22,7 @@ from .observation import Array, Field
 from .parameters import Limits, check, freeze
 from .privileged import context_shapes, in_sigmas
 from .reward import REWARDS
+from .scenario_choice import ScenarioChoice, find_mixture, find_scenario
 from .specification import with_episode_length
 from .step_report import step_report
 from .task import Task

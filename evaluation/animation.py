@@ -8,11 +8,11 @@ import numpy
 from PIL import Image
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario
 from ..envs.environment import TaskEnv
 from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
+from ..envs.scenario_choice import find_scenario
 from ..envs.task import Task
 from .competitors import kind_of, make_competitor
 from .evaluate import control_of

@@ -6,13 +6,15 @@ paired: both competitors have their means from the same resamples of the episode
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
-import xarray
 
 from ..envs.causes import RESERVED
 from .bootstrap import Bootstrap, Estimate, ratio
+
+if TYPE_CHECKING:
+    import xarray
 
 EVERYTHING, START, OTHER = RESERVED
 """Names of the whole, in the place of a cause, and of the causes that every evaluation adds."""
@@ -59,7 +61,7 @@ def cause_coords(names: Sequence[str], phrases: Sequence[str], start: int) -> di
     return {"cause": list(names), "cause_phrase": ("cause", list(phrases)), "start_measurements": start}
 
 
-def phrases_of(dataset: xarray.Dataset) -> dict[str, str]:
+def phrases_of(dataset: "xarray.Dataset") -> dict[str, str]:
     """Return what says when each cause of an evaluation holds, by name; nothing where it holds no causes."""
     if "cause" not in dataset.coords:
         return {}
@@ -68,7 +70,7 @@ def phrases_of(dataset: xarray.Dataset) -> dict[str, str]:
     return {**dict(declared), START: first, OTHER: "where none of the causes holds"}
 
 
-def held_causes(run: xarray.Dataset) -> Iterator[tuple[str, numpy.ndarray]]:
+def held_causes(run: "xarray.Dataset") -> Iterator[tuple[str, numpy.ndarray]]:
     """Yield every cause and whether it holds at each measurement, booleans ``(episodes, time)``; the whole first.
 
     Args:
@@ -84,7 +86,7 @@ def held_causes(run: xarray.Dataset) -> Iterator[tuple[str, numpy.ndarray]]:
     yield OTHER, (numbers == 0) & ~start
 
 
-def cause_sums(run: xarray.Dataset, nees: numpy.ndarray | None) -> numpy.ndarray:
+def cause_sums(run: "xarray.Dataset", nees: numpy.ndarray | None) -> numpy.ndarray:
     """Sum what is split over the measurements in which each cause holds.
 
     Args:
@@ -106,7 +108,7 @@ def cause_sums(run: xarray.Dataset, nees: numpy.ndarray | None) -> numpy.ndarray
 
 
 def split(
-    sums: numpy.ndarray, run: xarray.Dataset, bootstrap: Bootstrap
+    sums: numpy.ndarray, run: "xarray.Dataset", bootstrap: Bootstrap
 ) -> tuple[list[CauseMeasure], CauseCosts]:
     """Split a competitor's cost and consistency by cause; causes that never hold are left out.
 

@@ -8,12 +8,14 @@ remains in words: see the functions of this module for what they mean.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
-import xarray
 
 from .files import whole_file
+
+if TYPE_CHECKING:
+    import xarray
 
 MOST_BYTES = 2**31 - 1
 """Of one variable in NetCDF's classic format, as SciPy writes it."""
@@ -50,7 +52,7 @@ class Losses(NamedTuple):
         )
 
 
-def losses_in(run: xarray.Dataset) -> numpy.ndarray:
+def losses_in(run: "xarray.Dataset") -> numpy.ndarray:
     """Return at which measurement each episode was lost, and why, ``(episodes, 2)``; zeros where it was not.
 
     Args:
@@ -75,12 +77,12 @@ def count_losses(losses: numpy.ndarray) -> Losses | None:
     return Losses(int(lost.sum()), i, int(losses[i, 0]), int(losses[i, 1]))
 
 
-def fits_classic(dataset: xarray.Dataset) -> bool:
+def fits_classic(dataset: "xarray.Dataset") -> bool:
     """Whether NetCDF's classic format, which needs nothing but SciPy, has room for every variable."""
     return all(variable.nbytes <= MOST_BYTES for variable in dataset.variables.values())
 
 
-def write_dataset(path: Path, dataset: xarray.Dataset) -> None:
+def write_dataset(path: Path, dataset: "xarray.Dataset") -> None:
     """Write an evaluation in NetCDF's classic format with 64-bit offsets, which R, MATLAB and most others open.
 
     Raises:
@@ -94,7 +96,7 @@ def write_dataset(path: Path, dataset: xarray.Dataset) -> None:
         dataset.to_netcdf(partial, engine="scipy", format="NETCDF3_64BIT")
 
 
-def windows_of(dataset: xarray.Dataset) -> dict[str, tuple[int, int]]:
+def windows_of(dataset: "xarray.Dataset") -> dict[str, tuple[int, int]]:
     """Windows by name: first and last measurement of each, both included, from 1 on.
 
     Args:
@@ -104,12 +106,12 @@ def windows_of(dataset: xarray.Dataset) -> dict[str, tuple[int, int]]:
     return {name: (int(first), int(last)) for name, first, last in zip(*ends, strict=True)}
 
 
-def slices_of(dataset: xarray.Dataset) -> dict[str, slice]:
+def slices_of(dataset: "xarray.Dataset") -> dict[str, slice]:
     """Windows by name, as parts of the time axis."""
     return {name: slice(first - 1, last) for name, (first, last) in windows_of(dataset).items()}
 
 
-def with_windows(dataset: xarray.Dataset, windows: Mapping[str, tuple[int, int]]) -> xarray.Dataset:
+def with_windows(dataset: "xarray.Dataset", windows: Mapping[str, tuple[int, int]]) -> "xarray.Dataset":
     """Return a dataset with these windows, in place of those that it has."""
     first, last = (numpy.array([ends[i] for ends in windows.values()], dtype=numpy.int64) for i in (0, 1))
     return dataset.drop_vars(["window", "window_first", "window_last"], errors="ignore").assign_coords(
@@ -117,7 +119,7 @@ def with_windows(dataset: xarray.Dataset, windows: Mapping[str, tuple[int, int]]
     )
 
 
-def groups_of(dataset: xarray.Dataset) -> dict[str, tuple[str, ...]]:
+def groups_of(dataset: "xarray.Dataset") -> dict[str, tuple[str, ...]]:
     """Components of every group, such as ``position``, in the order of the components."""
     found: dict[str, list[str]] = {}
     for name, group in zip(
@@ -143,7 +145,7 @@ def group_of_each(components: Sequence[str], groups: Mapping[str, Sequence[str]]
     return found
 
 
-def keywords_of(dataset: xarray.Dataset) -> dict[str, Any]:
+def keywords_of(dataset: "xarray.Dataset") -> dict[str, Any]:
     """Parameters of the task that the evaluation was asked for; sequences are lists, as JSON has them.
 
     Other objects, of a task of one's own, are text, as Python's ``repr`` shows them.
@@ -168,12 +170,12 @@ def whole_number(value: int) -> int | str:
     return value if abs(value) <= MOST_WHOLE else str(value)
 
 
-def seed_of(dataset: xarray.Dataset) -> int:
+def seed_of(dataset: "xarray.Dataset") -> int:
     """Return the number of the experiment."""
     return int(dataset.attrs["seed"])
 
 
-def notes_of(dataset: xarray.Dataset) -> list[str]:
+def notes_of(dataset: "xarray.Dataset") -> list[str]:
     """What is to be told of the scenario, and of lost episodes, a line each."""
     notes = str(dataset.attrs["notes"]).splitlines()
     for name in dataset["policy"].values.tolist() if "lost" in dataset else ():

@@ -6,21 +6,21 @@ The result is an :class:`xarray.Dataset` from which every number and figure foll
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cloudpickle
 import gymnasium
 import numpy
-import xarray
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, importable_name, make_task, nearest, read_files, task_class
+from ..envs.catalogue import importable_name, nearest, task_class
 from ..envs.compiled import Report
 from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.model import Episode, Model
 from ..envs.parameters import check_integer
 from ..envs.recording import Recording
 from ..envs.reward import charge
+from ..envs.scenario_choice import find_scenario, make_task, read_files
 from ..envs.task import Scenario, Task
 from ..filters.gaussian import log_density
 from .bootstrap import block_of
@@ -33,6 +33,9 @@ from .rollout import More, Progress, run_episodes
 from .seeds import episode_seeds
 from .smoothers import check_open_loop
 from .threads import one_thread
+
+if TYPE_CHECKING:
+    import xarray
 
 LAST_ACTIONS = ("last_action", "action", "last", "last_weight")
 """Names of blocks of an observation that show the action before."""
@@ -238,7 +241,7 @@ def run_experiment(
     competitors: Mapping[str, Any],
     progress: Progress | None = None,
     workers: Workers | None = None,
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
     """Run policies, estimators, references and bounds over the same episodes.
 
     Args:
@@ -414,11 +417,13 @@ class Plan(NamedTuple):
 
     def dataset(
         self, per_policy: dict[str, dict[str, numpy.ndarray]], seeds: Sequence[int]
-    ) -> xarray.Dataset:
+    ) -> "xarray.Dataset":
         """Return what was kept of some competitors or episodes as an evaluation, and empty it on the way."""
         experiment = self.experiment
         dataset = _dataset(per_policy, self, seeds)
         if self.flown is not None and self.lengths is not None:
+            import xarray
+
             beyond = dataset["time"].values <= self.lengths[:, None]
             there = xarray.DataArray(beyond, dims=("episode", "time"))
             of_drawn = there.isel(episode=slice(experiment.drawn_episodes)).rename(episode="drawn_episode")
@@ -445,7 +450,7 @@ class Plan(NamedTuple):
 
 
 def _recording_coords(
-    recording: Recording, episodes: numpy.ndarray, dataset: xarray.Dataset
+    recording: Recording, episodes: numpy.ndarray, dataset: "xarray.Dataset"
 ) -> dict[str, Any]:
     """What the evaluation of a recording says of its log.
 
@@ -628,7 +633,9 @@ def _actions_aligned(
 
 def _dataset(
     per_policy: dict[str, dict[str, numpy.ndarray]], plan: Plan, seeds: Sequence[int]
-) -> xarray.Dataset:
+) -> "xarray.Dataset":
+    import xarray
+
     kinds, controls, models, scenario = plan.kinds, plan.controls, plan.models, plan.scenario
     model = next(iter(models.values()))
     names = list(per_policy)

@@ -5,15 +5,17 @@ filter whose model is that of the log has innovations that are white: successive
 those of :mod:`.predictions`, which one recording has, too.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy
-import xarray
 
 from ..envs.task import Task
 
+if TYPE_CHECKING:
+    import xarray
 
-def with_innovations(dataset: xarray.Dataset, task: Task) -> xarray.Dataset:
+
+def with_innovations(dataset: "xarray.Dataset", task: Task) -> "xarray.Dataset":
     """Return an evaluation of a recording with the variable ``prediction_error`` (policy, episode, time, measured).
 
     NaN where nothing was received, at the first measurement, and of a smoother, which predicts nothing. Where no log
@@ -45,7 +47,7 @@ def with_innovations(dataset: xarray.Dataset, task: Task) -> xarray.Dataset:
     )
 
 
-def received(run: xarray.Dataset, task: Task) -> numpy.ndarray | None:
+def received(run: "xarray.Dataset", task: Task) -> numpy.ndarray | None:
     """What was measured of what estimates predict, ``(m, episodes, time)``; None where nobody predicts.
 
     Args:
@@ -63,7 +65,7 @@ def received(run: xarray.Dataset, task: Task) -> numpy.ndarray | None:
 class _Measured:
     """Measurements of one competitor's part of a dataset by attribute, ``(..., episodes, time)``."""
 
-    def __init__(self, run: xarray.Dataset) -> None:
+    def __init__(self, run: "xarray.Dataset") -> None:
         self._run = run
 
     def __getattr__(self, name: str) -> Any:

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
-import xarray
-from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
 
 from .bootstrap import RESAMPLES, Bootstrap, Estimate, ratio
 from .cause_split import EVERYTHING, CauseCosts, cause_sums, compare, opponent_of, split
@@ -23,6 +21,8 @@ from .statistics import ALL, Function, Key, Statistic, identity, reduce_run
 from .threads import one_thread
 
 if TYPE_CHECKING:
+    import xarray
+
     from .own_metrics import OwnMetrics
 
 NOTHING = Estimate(math.nan, math.nan, math.nan)
@@ -60,7 +60,9 @@ class Measure(NamedTuple):
     unit: str
 
 
-def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[str, ...]]) -> numpy.ndarray:
+def squared_errors(
+    run: "xarray.Dataset", component: str, groups: dict[str, tuple[str, ...]]
+) -> numpy.ndarray:
     """Squared error of a component or group in one run, ``(episodes, time)``; of a bound its mean."""
     parts = list(groups.get(component, (component,)))
     if "mean_square" in run and not numpy.isnan(run["mean_square"].values[0, 0, 0]):
@@ -68,7 +70,7 @@ def squared_errors(run: xarray.Dataset, component: str, groups: dict[str, tuple[
     return (run["error"].sel(component=parts) ** 2).sum("component", skipna=False).values
 
 
-def components_and_groups(dataset: xarray.Dataset) -> dict[str, str]:
+def components_and_groups(dataset: "xarray.Dataset") -> dict[str, str]:
     """Components and groups of components whose truth is known, with their units."""
     units = dict(zip(dataset["component"].values.tolist(), dataset["unit"].values.tolist(), strict=True))
     if "truth_known" in dataset.coords:
@@ -91,13 +93,13 @@ def sums_of_present(values: numpy.ndarray) -> numpy.ndarray:
     return numpy.stack([numpy.where(present, values, 0.0).sum(axis=1), present.sum(axis=1)], axis=1)
 
 
-def bootstrap_of(dataset: xarray.Dataset, resamples: int = RESAMPLES) -> Bootstrap:
+def bootstrap_of(dataset: "xarray.Dataset", resamples: int = RESAMPLES) -> Bootstrap:
     """Resampling of the episodes of an evaluation; of whole flights where they fly several."""
     clusters = dataset["flight"].values.tolist() if "flight" in dataset.coords else None
     return Bootstrap(dataset.sizes["episode"], resamples, clusters=clusters)
 
 
-def mean_over_time(run: xarray.Dataset, values: numpy.ndarray) -> numpy.ndarray:
+def mean_over_time(run: "xarray.Dataset", values: numpy.ndarray) -> numpy.ndarray:
     """Mean of each episode, ``(episodes,)``; where flights differ in length, over its own.
 
     Args:
@@ -116,7 +118,7 @@ def _peak(means: numpy.ndarray) -> numpy.ndarray:
 
 
 def record_statistics(
-    run: xarray.Dataset, episodes: int, metrics: "OwnMetrics | None" = None
+    run: "xarray.Dataset", episodes: int, metrics: "OwnMetrics | None" = None
 ) -> Iterator[Statistic]:
     """Declare what records are made of: by metric, component, window and unit; and the cost of every episode.
 
@@ -180,7 +182,7 @@ def _mean_of_present(metric: str, component: str, window: str, unit: str, values
     )
 
 
-def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[Statistic]:
+def _consistency(run: "xarray.Dataset", metric: str, episodes: int) -> Iterator[Statistic]:
     """Whether errors and innovations are as large as the covariances say: one, and 95 %, where they are.
 
     The mean over the dimension, and the share of measurements inside the chi-square distribution's two-sided 95 %
@@ -202,7 +204,7 @@ def _consistency(run: xarray.Dataset, metric: str, episodes: int) -> Iterator[St
             yield Statistic(key, sums, functools.partial(_band, episodes=episodes), optional=True)
 
 
-def _over_dimension(run: xarray.Dataset, metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
+def _over_dimension(run: "xarray.Dataset", metric: str) -> tuple[numpy.ndarray, numpy.ndarray]:
     """NEES or NIS over its dimension, NaN where there is none, and that dimension, as their arrays are."""
     degrees = consistency_degrees(run, metric)
     some = numpy.where(degrees > 0.0, degrees, 1.0)
@@ -226,13 +228,13 @@ def _band(means: numpy.ndarray, episodes: int) -> Estimate:
     return Estimate(1.0, float(low[0] / total[0]), float(high[0] / total[0]))
 
 
-def consistency_metrics(run: xarray.Dataset) -> list[str]:
+def consistency_metrics(run: "xarray.Dataset") -> list[str]:
     """Which of ``nees`` and ``nis`` there are; the latter needs its dimension beside it, ``nis_degrees``."""
     present = ["nees"] * ("nees" in run) + ["nis"] * ("nis" in run and "nis_degrees" in run)
     return [metric for metric in present if not numpy.isnan(run[metric].values).all()]
 
 
-def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:
+def consistency_degrees(run: "xarray.Dataset", metric: str) -> numpy.ndarray:
     """Dimension of what ``nees`` or ``nis`` is of, as their arrays are."""
     if metric == "nees" and "nees_degrees" not in run:
         return numpy.full(run["nees"].shape, float(run.sizes["component"]))
@@ -241,6 +243,8 @@ def consistency_degrees(run: xarray.Dataset, metric: str) -> numpy.ndarray:
 
 def chi_square_band(degrees: numpy.ndarray, runs: int = 1) -> tuple[numpy.ndarray, numpy.ndarray]:
     """Two-sided 95 % interval of the mean over ``runs`` of chi-square numbers with these degrees of freedom."""
+    from scipy.special import gammaincinv  # scipy.stats has the quantile too, and takes a second to import
+
     # Few different ones, and the quantile is dear.
     different, which = numpy.unique(degrees, return_inverse=True)
     low, high = (2.0 * gammaincinv(0.5 * runs * different, p) / runs for p in (0.025, 0.975))
@@ -274,7 +278,7 @@ class Contender(NamedTuple):
     """None of bounds, without truth, and of an evaluation that holds no causes."""
 
 
-def mean_cost(dataset: xarray.Dataset, name: str) -> numpy.ndarray:
+def mean_cost(dataset: "xarray.Dataset", name: str) -> numpy.ndarray:
     """Mean cost of every episode of one competitor, ``(episodes,)``."""
     return mean_over_time(dataset, dataset["cost"].sel(policy=name).values)
 
@@ -323,7 +327,7 @@ class _Against:
             yield Measure(metric, "", "all", estimate, "1")
 
 
-def prediction_measures(run: xarray.Dataset) -> Iterator[Measure]:
+def prediction_measures(run: "xarray.Dataset") -> Iterator[Measure]:
     """What the innovations of one competitor come to: their size and whether they are white.
 
     ``prediction_error`` is the root of their mean square in the sensor's unit, ``innovation_correlation`` the
@@ -356,7 +360,7 @@ def _wins(ratio: numpy.ndarray) -> numpy.ndarray:
 
 
 @one_thread()
-def flight_records(dataset: xarray.Dataset) -> list[Record]:
+def flight_records(dataset: "xarray.Dataset") -> list[Record]:
     """Cost, errors and difference to the paper's algorithm of every flight, in the order of their names.
 
     Their scenario is the set's, a colon and the flight's name; their intervals are over the episodes of that flight.
@@ -379,7 +383,7 @@ PER_FLIGHT = ("rmse", "cost", "cost_difference", "relative_cost_difference")
 
 
 @one_thread()
-def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -> list[Record]:
+def tidy_records(dataset: "xarray.Dataset", metrics: "OwnMetrics | None" = None) -> list[Record]:
     """Every metric of every policy with its interval.
 
     ``rmse`` (root of the mean square over episodes and the window), ``peak_rmse`` (largest over time),
@@ -411,7 +415,7 @@ def tidy_records(dataset: xarray.Dataset, metrics: "OwnMetrics | None" = None) -
 
 
 def contender_of(
-    results: Mapping[Key, Any], run: xarray.Dataset, bootstrap: Bootstrap, metrics: "OwnMetrics | None"
+    results: Mapping[Key, Any], run: "xarray.Dataset", bootstrap: Bootstrap, metrics: "OwnMetrics | None"
 ) -> Contender:
     """Return what the records of a competitor are made of.
 
@@ -453,7 +457,7 @@ def _compare_causes(
 
 
 def records_of(
-    contenders: Sequence[Contender], evaluation: xarray.Dataset, bootstrap: Bootstrap
+    contenders: Sequence[Contender], evaluation: "xarray.Dataset", bootstrap: Bootstrap
 ) -> list[Record]:
     """Return every record, with the comparisons that take several competitors.
 

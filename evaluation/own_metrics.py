@@ -7,14 +7,16 @@ few numbers of it or what is only averaged over the episodes; and what follows f
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
-import xarray
 
 from .bootstrap import Bootstrap
 from .metrics import Measure
 from .statistics import ALL, Key, Statistic
+
+if TYPE_CHECKING:
+    import xarray
 
 Arrays = Mapping[str, numpy.ndarray]
 
@@ -34,12 +36,12 @@ class MetricInputs(NamedTuple):
 class OwnMetrics:
     """The metrics of an environment."""
 
-    gather: Callable[[xarray.Dataset], MetricInputs]
+    gather: "Callable[[xarray.Dataset], MetricInputs]"
     """From one policy's part of some episodes of an evaluation to what is needed of each."""
-    measures: Callable[[MetricInputs, Bootstrap, xarray.Dataset], list[Measure]]
+    measures: "Callable[[MetricInputs, Bootstrap, xarray.Dataset], list[Measure]]"
     """From what was gathered of all episodes, and the evaluation, of whose variables none is needed."""
 
-    def statistics(self, run: xarray.Dataset) -> Iterator[Statistic]:
+    def statistics(self, run: "xarray.Dataset") -> Iterator[Statistic]:
         """Declare what was gathered.
 
         Args:
@@ -54,7 +56,7 @@ class OwnMetrics:
             yield Statistic(("common", key), values[None], itemgetter(0), sample=1)
 
     def measures_of(
-        self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: xarray.Dataset
+        self, results: Mapping[Key, Any], bootstrap: Bootstrap, evaluation: "xarray.Dataset"
     ) -> list[Measure]:
         """Return the measures of one competitor.
 

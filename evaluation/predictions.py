@@ -5,12 +5,15 @@ Neighbouring measurements are not independent: intervals come from resampling wh
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy
-import xarray
 
 from ..envs.task import Task
 from .bootstrap import Bootstrap, Estimate, ratio
+
+if TYPE_CHECKING:
+    import xarray
 
 STRETCHES = 30
 """Into which measurements are cut for intervals, at most; a stretch has at least ``SHORTEST_STRETCH``."""
@@ -26,7 +29,7 @@ class Predictions:
         task: of the recording.
     """
 
-    def __init__(self, dataset: xarray.Dataset, task: Task) -> None:
+    def __init__(self, dataset: "xarray.Dataset", task: Task) -> None:
         self.dataset, self.task = dataset, task
         self.names = [str(name) for name in dataset["policy"].values]
         self.shape = dataset.sizes["episode"], dataset.sizes["time"]

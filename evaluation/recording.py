@@ -6,12 +6,12 @@ from typing import Any
 import numpy
 
 from ..envs.backend import make_model
-from ..envs.catalogue import find_scenario, make_task, read_files
 from ..envs.episode_noise import uniforms_of_seeds
 from ..envs.filter import Filter, Initial, Input
 from ..envs.model import Episode, Model
 from ..envs.recording import MOST_NUMBERS, Recording, measure_once
 from ..envs.recording_files import differing
+from ..envs.scenario_choice import find_scenario, make_task, read_files
 from ..envs.task import Task, named_arrays
 from .evaluate import Experiment
 from .rollout import Progress, start_lanes

@@ -10,12 +10,14 @@ import functools
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
-import xarray
 
 from .bootstrap import Bootstrap, block_of, mean_of_sums
+
+if TYPE_CHECKING:
+    import xarray
 
 ALL = sys.maxsize
 """Sample of all episodes."""
@@ -78,7 +80,7 @@ class Reduction(NamedTuple):
         return found
 
 
-def in_blocks(run: xarray.Dataset) -> Iterator[tuple[int, xarray.Dataset]]:
+def in_blocks(run: "xarray.Dataset") -> "Iterator[tuple[int, xarray.Dataset]]":
     """Cut a run into blocks of episodes; yields the number of each one's first episode in the run, and the block."""
     block = block_of(run.sizes["time"])
     for first in range(0, run.sizes["episode"], block):
@@ -86,8 +88,8 @@ def in_blocks(run: xarray.Dataset) -> Iterator[tuple[int, xarray.Dataset]]:
 
 
 def reduce_run(
-    run: xarray.Dataset,
-    declare: Callable[[xarray.Dataset], Iterable[Statistic]],
+    run: "xarray.Dataset",
+    declare: "Callable[[xarray.Dataset], Iterable[Statistic]]",
     bootstrap: Bootstrap,
     first: int = 0,
 ) -> Reduction:

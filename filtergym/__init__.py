@@ -4,19 +4,19 @@
 Without an import of one's own: ``gymnasium.make("filtergym:filtergym/ManeuveringTarget-v0")``.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
-from .baselines.catalogue import add_baselines
-from .baselines.table import Baselines
-from .envs.catalogue import read_recording, register
-from .envs.flights import Flights, read_flights
-from .envs.recording import Recording
-from .envs.registration import add_task
-from .envs.task import Task
-from .envs.trajectory import Trajectory
-from .evaluation.competitors import FunctionPolicy, Likelihood
+from .envs.catalogue import register
 
 if TYPE_CHECKING:
+    from .baselines.table import Baselines
+    from .envs.flights import Flights, read_flights
+    from .envs.recording import Recording
+    from .envs.scenario_choice import read_recording
+    from .envs.task import Task
+    from .envs.trajectory import Trajectory
+    from .evaluation.competitors import FunctionPolicy, Likelihood
     from .live import online
     from .names import evaluate, make_policy, record, tidy_records
 
@@ -37,11 +37,21 @@ __all__ = [
     "register_task",
     "tidy_records",
 ]
+MODULES = {
+    "envs.flights": ("Flights", "read_flights"),
+    "envs.recording": ("Recording",),
+    "envs.scenario_choice": ("read_recording",),
+    "envs.trajectory": ("Trajectory",),
+    "evaluation.competitors": ("FunctionPolicy", "Likelihood"),
+    "live": ("online",),
+    "names": ("evaluate", "make_policy", "record", "tidy_records"),
+}
+"""Where names of this package come from, when they are first used."""
 
 register()
 
 
-def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
+def register_task(task: "type[Task]", baselines: "Baselines | None" = None) -> None:
     """Make an environment of your own a citizen: it lists, makes, evaluates, renders and trains like the others.
 
     Call it where your module or package is imported, not inside a function. Then any process finds the
@@ -58,6 +68,9 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
         ValueError: if the task does not keep the contract, computes arrays of other shapes than it declares, its id is
             taken, or the table does not fit it.
     """
+    from .baselines.catalogue import add_baselines
+    from .envs.registration import add_task
+
     add_task(task)
     if baselines is not None:
         if baselines.environment != task.id:
@@ -66,13 +79,8 @@ def register_task(task: type[Task], baselines: Baselines | None = None) -> None:
 
 
 def __getattr__(name: str) -> Any:
-    # On first use: an evaluation brings xarray, and making environments needs none of it.
-    if name == "online":
-        from . import live
-
-        return live.online
-    if name not in ("evaluate", "make_policy", "record", "tidy_records"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from . import names
-
-    return getattr(names, name)
+    # On first use: an evaluation brings xarray, and who registers the environments needs none of it.
+    for module, names in MODULES.items():
+        if name in names:
+            return getattr(importlib.import_module(f".{module}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

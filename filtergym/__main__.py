@@ -31,7 +31,7 @@ Commands = Mapping[str, Callable[..., None] | str]
 """Functions by the names of their commands; or ``module:function`` of what is imported when it is called."""
 GROUPS: Mapping[str, Commands] = {
     "Use an environment": {
-        "list": "measure:list_environments",
+        "list": "listing:list_environments",
         "animate": "measure:animate",
         "record": "measure:record_scenario",
     },

@@ -7,8 +7,8 @@ from typing import Any
 from .agents.envelope import WatchedPolicy, training_range
 from .agents.learned_estimator import EstimatorMaker
 from .envs.backend import make_model
-from .envs.catalogue import find_scenario
 from .envs.live_input import Feed
+from .envs.scenario_choice import find_scenario
 from .evaluation.competitors import kind_of, make_competitor
 from .evaluation.evaluate import control_of
 from .evaluation.online import OnlineFilter

@@ -15,7 +15,7 @@ from filtergym.envs import compiled as compiled_tasks
 from filtergym.envs.catalogue import catalogue
 from filtergym.envs.compiled import CompiledModel
 from filtergym.envs.environment import TaskEnv, TaskVectorEnv
-from filtergym.envs.maneuvering_target import TASK as MANEUVERING
+from filtergym.envs.maneuvering_target.task import TASK as MANEUVERING
 from filtergym.envs.maneuvering_target.world import RadarWorld
 from filtergym.evaluation.recording import NoFilter
 from models import make_model

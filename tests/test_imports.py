@@ -1,10 +1,14 @@
-"""Imports run one way: a file knows only its own room and those before it."""
+"""Imports run one way, a file knows only its own room and those before it; and slow libraries wait until needed."""
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from filtergym.baselines.catalogue import baselines_of
+from filtergym.envs.catalogue import folders
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
@@ -71,3 +75,63 @@ def test_the_check_sees_every_kind_of_import() -> None:
         *imported_rooms(Path("docs/make/commands.py")),
     }
     assert set(imported_rooms(Path("filtergym/commands/report.py"))) == {"evaluation", "filtergym"}
+
+
+LIBRARIES = {
+    *("xarray", "pandas", "scipy", "matplotlib", "PIL", "torch", "stable_baselines3", "plotly", "joblib"),
+    *("llvmlite", "safetensors", "msgspec", "typer", "rich"),
+}
+"""What takes its time to import."""
+TASKS = {f"filtergym.envs.{folder}.task": id for id, folder in folders().items()}
+
+
+def imported_by(program: str, *arguments: str) -> set[str]:
+    """Libraries and tasks that a program has imported at its end, in a process of its own."""
+    watch = (
+        "import atexit, sys\n"
+        f"slow = {sorted(LIBRARIES | TASKS.keys())!r}\n"
+        "atexit.register(lambda: print('', *[name for name in slow if name in sys.modules], file=sys.stderr))\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", watch + program, *arguments], capture_output=True, text=True, check=True
+    )
+    return {*ended.stderr.splitlines()[-1].split()}
+
+
+COMMAND = "from filtergym.__main__ import main; main()"
+
+
+def test_the_package_alone_brings_gymnasium_and_no_environment() -> None:
+    assert imported_by("import filtergym") == set()
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",)])
+def test_the_command_line_alone_brings_what_it_prints_with(arguments: tuple[str, ...]) -> None:
+    assert imported_by(COMMAND, *arguments) == {"typer", "rich"}
+
+
+def test_listing_brings_no_library_that_computes_or_draws() -> None:
+    brought = imported_by(COMMAND, "list")
+    assert brought >= TASKS.keys()
+    assert brought - TASKS.keys() <= {"typer", "rich", "llvmlite"}
+
+
+def test_an_evaluation_brings_one_environment_and_draws_nothing_that_nobody_keeps() -> None:
+    task, id = next(iter(TASKS.items()))
+    brought = imported_by(COMMAND, "evaluate", id, "--policy", "random", "--episodes", "8")
+    assert brought & TASKS.keys() == {task}
+    assert not brought & {"matplotlib", "PIL", "torch", "stable_baselines3", "plotly", "joblib"}
+
+
+def test_an_environment_brings_itself_alone() -> None:
+    for task, id in TASKS.items():
+        steps = (
+            f"import filtergym, gymnasium\nenv = gymnasium.make({id!r})\nenv.reset(seed=0)\n"
+            "env.step(env.action_space.sample())"
+        )
+        assert imported_by(steps) - {"llvmlite", "scipy"} == {task}  # scipy where its constants take it
+
+
+def test_the_folders_of_baselines_are_those_of_environments() -> None:
+    for id in TASKS.values():
+        assert baselines_of(id).environment == id

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from filtergym.envs.backend import make_model
-from filtergym.envs.catalogue import read_recording
 from filtergym.envs.live_input import LiveInput
+from filtergym.envs.scenario_choice import read_recording
 from filtergym.envs.task import named_arrays
 from filtergym.evaluation.competitors import kind_of
 from filtergym.evaluation.evaluate import control_of

@@ -11,10 +11,11 @@ import warnings
 
 import numpy as np
 import pytest
-from filtergym.envs.catalogue import catalogue, find_scenario
+from filtergym.envs.catalogue import catalogue
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.parameters import field_limits
 from filtergym.envs.reward import REWARDS, paper_model
+from filtergym.envs.scenario_choice import find_scenario
 from filtergym.envs.step_report import step_report
 from models import make_model
 

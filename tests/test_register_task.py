@@ -95,7 +95,7 @@ def test_gymnasium_makes_and_renders_it(package):
     vector = gymnasium.make_vec(ID, num_envs=3, control="gain", horizon=5)
     np.testing.assert_array_equal(vector.reset(seed=3)[0][0], observation)
     assert "mine/Turns-v0" in catalogue()
-    assert "mine/Turns-v0" not in filtergym.envs.catalogue._builtin_tasks()
+    assert "mine/Turns-v0" not in filtergym.envs.catalogue.folders()
 
 
 def test_a_spawned_process_finds_it(package):

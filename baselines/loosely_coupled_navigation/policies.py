@@ -4,10 +4,9 @@ Equation numbers are those of the task's paper (Benkafo, Lobaty).
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy
-import xarray
 
 from ...envs.catalogue import task_class
 from ...envs.loosely_coupled_navigation.banks import SCHEMES, GainBank
@@ -25,6 +24,9 @@ from .alarm import FusionAlarm
 from .augmented import AugmentedFilter, AugmentedMemory, with_rules
 from .estimators import AugmentedEstimator
 from .references import Matched, MatchedCovariance
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def gain_bank(model: Model) -> GainBank:
@@ -264,7 +266,7 @@ def recovery_times(
     return numpy.where(counted, time.astype(float), math.nan)
 
 
-def _recoveries(run: xarray.Dataset) -> MetricInputs:
+def _recoveries(run: "xarray.Dataset") -> MetricInputs:
     """Seconds to recover of each episode, and whether it does not within a second; NaN without an outage."""
     if "available" not in run or numpy.isnan(run["available"].values).all():
         return MetricInputs()
@@ -281,7 +283,7 @@ def _recoveries(run: xarray.Dataset) -> MetricInputs:
 
 
 def _outage_measures(
-    gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset
+    gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset"
 ) -> list[Measure]:
     """``recovery_time`` after an outage and the share of runs that do not recover within a second."""
     means = gathered.averaged

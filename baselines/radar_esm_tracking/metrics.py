@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy
-import xarray
 
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import slices_of, windows_of
 from ...evaluation.metrics import Measure, squared_errors
 from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
+
+if TYPE_CHECKING:
+    import xarray
 
 CLASSES = 3
 SURE = 0.9
@@ -58,7 +61,7 @@ def _recognition(
     yield Measure(f"{name}_censored", component, "all", censored, "1")
 
 
-def _missing(run: xarray.Dataset, name: str) -> bool:
+def _missing(run: "xarray.Dataset", name: str) -> bool:
     return name not in run or bool(numpy.isnan(run[name].values).any())
 
 
@@ -72,7 +75,7 @@ def _of_group(true_class: numpy.ndarray) -> numpy.ndarray:
     return numpy.concatenate([numpy.ones((*true_class.shape, 1), bool), _of_class(true_class)], axis=-1)
 
 
-def gather(run: xarray.Dataset) -> MetricInputs:
+def gather(run: "xarray.Dataset") -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound, and of a reference no beliefs."""
     if _missing(run, "true_class"):
         return MetricInputs()
@@ -94,7 +97,7 @@ def gather(run: xarray.Dataset) -> MetricInputs:
     return found if _missing(run, "mode_probability") else _with_beliefs(run, found)
 
 
-def _with_beliefs(run: xarray.Dataset, errors: MetricInputs) -> MetricInputs:
+def _with_beliefs(run: "xarray.Dataset", errors: MetricInputs) -> MetricInputs:
     true_class, seconds = run["true_class"].values.astype(int), run["seconds"].values[0]
     true_probability, probability = run["true_class_probability"].values, run["mode_probability"].values
     moments = _moments(seconds)
@@ -131,7 +134,7 @@ def _last(seconds: numpy.ndarray) -> int:
     return _moments(seconds).get(TIMES[-1], len(seconds) - 1)
 
 
-def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
     """Errors by true class, recognition of the class, and calibration, of one policy.
 
     ``rmse_by_class`` (by the class at each measurement); ``mean_true_class_probability`` at stated times;
@@ -152,7 +155,7 @@ GROUPS = ("", *(f"S{s}" for s in range(CLASSES)))
 """Names of everybody, and of the targets of each class."""
 
 
-def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
+def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> Iterator[Measure]:
     names, units = evaluation["component"].values.tolist(), evaluation["unit"].values.tolist()
     for i, (component, unit) in enumerate(zip(names, units, strict=True)):
         for j, window in enumerate(windows_of(evaluation)):
@@ -166,7 +169,7 @@ def _errors(means: Arrays, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> 
             yield Measure("calibration_ratio", component, window, bootstrap.interval(ratio), "1")
 
 
-def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> Iterator[Measure]:
+def _beliefs(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> Iterator[Measure]:
     each, means, seconds = gathered.each, gathered.averaged, gathered.common["seconds"]
     for k, moment in enumerate(_moments(seconds)):
         shares, probability = means["share_at_moments"][:, k], means["probability"][:, k]

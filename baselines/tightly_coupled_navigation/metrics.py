@@ -2,16 +2,18 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy
-import xarray
 
 from ...envs.tightly_coupled_navigation.parameters import HYPOTHESES
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import groups_of
 from ...evaluation.metrics import Measure, squared_errors
 from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
+
+if TYPE_CHECKING:
+    import xarray
 
 UNITS = {"position": "m", "velocity": "m/s"}
 LASTING = 10
@@ -72,7 +74,7 @@ def switches(true_mode: numpy.ndarray, probability: numpy.ndarray) -> list[Switc
     return found
 
 
-def gather(run: xarray.Dataset) -> MetricInputs:
+def gather(run: "xarray.Dataset") -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound."""
     if str(run["kind"].values) == "bound":
         return MetricInputs()
@@ -115,7 +117,7 @@ def _count_changes(changes: Sequence[Switch], episodes: int, step: float) -> num
     return found
 
 
-def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
     """Errors by true hypothesis, adaptation, loss of track and robust costs of one policy.
 
     ``rmse_by_hypothesis``; ``cost_median`` and ``cost_95_quantile`` over episodes of the episode's mean cost,

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy
-import xarray
 
-from ...envs.catalogue import make_task
+from ...envs.scenario_choice import make_task
 from ...envs.uav_autopilot.task import UavAutopilot
 from ...evaluation.bootstrap import Bootstrap, Estimate
 from ...evaluation.dataset import keywords_of, slices_of
@@ -14,18 +14,21 @@ from ...evaluation.metrics import Measure
 from ...evaluation.own_metrics import Arrays, MetricInputs, OwnMetrics
 from .theory import stationary
 
+if TYPE_CHECKING:
+    import xarray
+
 LOST_SIGMAS = 100.0
 """Tracking error, over the nominal sigma of the output's sensor, beyond which a loop counts as lost."""
 
 
-def _task(evaluation: xarray.Dataset) -> UavAutopilot:
+def _task(evaluation: "xarray.Dataset") -> UavAutopilot:
     attrs = evaluation.attrs
     task = make_task(UavAutopilot, attrs["scenario"], **keywords_of(evaluation))
     assert isinstance(task, UavAutopilot)
     return task
 
 
-def gather(run: xarray.Dataset) -> MetricInputs:
+def gather(run: "xarray.Dataset") -> MetricInputs:
     """Return what the metrics need of each episode; nothing of a bound, and of a reference no innovation."""
     if "output" not in run or numpy.isnan(run["output"].values).all():
         return MetricInputs()
@@ -61,7 +64,7 @@ def _lag_products(values: numpy.ndarray) -> numpy.ndarray:
     return numpy.stack([(values[:, 1:] * values[:, :-1]).mean(axis=1), (values**2).mean(axis=1)], axis=1)
 
 
-def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: xarray.Dataset) -> list[Measure]:
+def measures(gathered: MetricInputs, bootstrap: Bootstrap, evaluation: "xarray.Dataset") -> list[Measure]:
     """Measures of the loop, beside those of the estimate.
 
     ``output_variance`` (of output minus command) and ``control_variance``: across episodes at each

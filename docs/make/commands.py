@@ -11,7 +11,7 @@ from command_line import MARKER as COMMANDS_MARKER
 from command_line import command_line_markdown
 from environment_page import environment_tables, put_tables
 from filtergym.baselines.problem import problem_of
-from filtergym.envs.catalogue import find_scenario
+from filtergym.envs.scenario_choice import find_scenario
 from filtergym.evaluation.files import whole_files, writable_file
 from filtergym.evaluation.parallel import Workers
 from filtergym.evaluation.print_layout import check_columns, check_formats, save

@@ -1,5 +1,4 @@
-"""LooselyCoupledNavigation: everything of one environment; ``TASK`` is what the catalogue finds."""
+"""LooselyCoupledNavigation: everything of one environment; ``task.py`` names it all."""
 
-from .task import TASK
-
-__all__ = ["TASK"]
+ID = "filtergym/LooselyCoupledNavigation-v0"
+"""Known before anything else is imported."""

@@ -14,6 +14,7 @@ from typing import Any
 
 from ..model import Model
 from ..task import Component, PaperPolicy, Task
+from . import ID
 from .banks import SCHEMES, GainBank, NoiseBank, SchemeBank
 from .causes import CAUSES
 from .kalman_net import KalmanNetBank
@@ -91,7 +92,7 @@ class LooselyCoupledNavigation(Task):
     v0: initial version.
     """
 
-    id = "filtergym/LooselyCoupledNavigation-v0"
+    id = ID
     interface = 2
     paper_source = (
         "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "

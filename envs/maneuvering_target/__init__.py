@@ -1,5 +1,4 @@
-"""ManeuveringTarget: everything of one environment; ``TASK`` is what the catalogue finds."""
+"""ManeuveringTarget: everything of one environment; ``task.py`` names it all."""
 
-from .task import TASK
-
-__all__ = ["TASK"]
+ID = "filtergym/ManeuveringTarget-v0"
+"""Known before anything else is imported."""

@@ -16,6 +16,7 @@ from ..model import Model
 from ..parameters import check, field_limits, freeze
 from ..task import Component, PaperPolicy, Scenario, Task
 from ..trajectory import Trajectory
+from . import ID
 from .banks import FilterBank, GainBank, SteeredFilterBank
 from .causes import CAUSES
 from .kalman_net import KalmanNetBank
@@ -89,7 +90,7 @@ class ManeuveringTarget(Task):
     * v0: first release
     """
 
-    id = "filtergym/ManeuveringTarget-v0"
+    id = ID
     # 2: scans may miss the target, and fields say so; under `gain` and `gains` the same action is another velocity gain then.
     interface = 2
     paper_source = (

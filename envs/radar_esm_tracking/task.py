@@ -14,6 +14,7 @@ from ...filters.ordered_sums import weighted_sum
 from ..model import Episode, Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
+from . import ID
 from .banks import ClassBank, one_hot
 from .causes import causes_of
 from .live import ScanInput
@@ -102,7 +103,7 @@ class RadarEsmTracking(Task):
     * v0: first release
     """
 
-    id = "filtergym/RadarEsmTracking-v0"
+    id = ID
     interface = 3
     paper_source = (
         "S. L. Ivanov, D. V. Seliverstov, Joint processing of radar and electronic support measures with "

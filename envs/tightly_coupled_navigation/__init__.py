@@ -1,5 +1,4 @@
-"""TightlyCoupledNavigation: everything of one environment; ``TASK`` is what the catalogue finds."""
+"""TightlyCoupledNavigation: everything of one environment; ``task.py`` names it all."""
 
-from .task import TASK
-
-__all__ = ["TASK"]
+ID = "filtergym/TightlyCoupledNavigation-v0"
+"""Known before anything else is imported."""

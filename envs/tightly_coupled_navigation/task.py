@@ -24,6 +24,7 @@ from ...filters import gnss_ins, satellites
 from ..model import Model
 from ..observation import Array
 from ..task import Component, PaperPolicy, Task
+from . import ID
 from .banks import HypothesisBank, NoiseBank, RobustBank
 from .causes import CAUSES
 from .live import ReceiverInput
@@ -93,7 +94,7 @@ class TightlyCoupledNavigation(Task):
     * v0: first version.
     """
 
-    id = "filtergym/TightlyCoupledNavigation-v0"
+    id = ID
     interface = 3
     paper_source = (
         "A. N. Moroz, Adaptive multi-hypothesis algorithm of integrated secondary processing in an "

@@ -1,5 +1,4 @@
-"""UavAutopilot: everything of one environment; ``TASK`` is what the catalogue finds."""
+"""UavAutopilot: everything of one environment; ``task.py`` names it all."""
 
-from .task import TASK
-
-__all__ = ["TASK"]
+ID = "filtergym/UavAutopilot-v0"
+"""Known before anything else is imported."""

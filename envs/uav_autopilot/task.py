@@ -22,6 +22,7 @@ from typing import Any
 from ..model import Episode, Model
 from ..observation import Array
 from ..task import PaperPolicy, Task
+from . import ID
 from .banks import GainBank, ModeBank, NoiseBank
 from .causes import CAUSES
 from .live import SensorInput
@@ -98,7 +99,7 @@ class UavAutopilot(Task):
     * v0: first version.
     """
 
-    id = "filtergym/UavAutopilot-v0"
+    id = ID
     interface = 3
     paper_source = (
         "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "

@@ -8,7 +8,7 @@ import xarray
 
 from ..agents.named_policies import pretrained_agents
 from ..baselines.problem import problem_of
-from ..envs.catalogue import catalogue, check_names
+from ..envs.catalogue import check_names
 from ..envs.recording import Recording
 from ..evaluation.figures import evaluation_figures
 from ..evaluation.files import whole_file, whole_files, writable_file, writable_folder, write_text
@@ -21,7 +21,6 @@ from ..offline import plan_datasets
 from ..reports.benchmark import BenchmarkOptions, Callbacks, Cell, all_records, run_benchmark
 from ..reports.export import latex_table, records_as_csv
 from ..reports.headline import headline_table
-from ..reports.listing import environment_lines
 from ..reports.results import RESULTS, Result, settings_of
 from ..reports.tables import datasets_table, results_tables
 from ..reports.worst import find_worst
@@ -63,27 +62,6 @@ from .terminal import (
     parse_settings,
     progress_bar,
 )
-
-
-def list_environments(
-    environment: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Environment ids, default all; module:id for one that a module registers.",
-            autocompletion=complete_environment,
-            callback=import_environments,
-        ),
-    ] = None,
-) -> None:
-    """List environments with their papers, controls, scenarios, policies, references and bounds.
-
-    Example: filtergym list filtergym/ManeuveringTarget-v0
-    """
-    for id in environment or catalogue():
-        first, *lines = environment_lines(problem_of(id))
-        console.print(first, style="bold")
-        for line in lines:
-            console.print(line, highlight=False, soft_wrap=True)
 
 
 def evaluate_policies(

@@ -6,9 +6,9 @@ import numpy
 
 from ..agents.learned_estimator import EstimatorMaker
 from ..baselines.table import ConstantMode
-from ..envs.catalogue import make_task
 from ..envs.model import Model
 from ..envs.recording import RecordedWorld
+from ..envs.scenario_choice import make_task
 from ..envs.task import Task
 from ..envs.world import World
 from ..evaluation.competitors import (

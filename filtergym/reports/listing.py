@@ -7,12 +7,17 @@ from ..baselines.problem import Problem
 from ..compiler.library import fastest
 from ..compiler.native import processor
 from ..envs.backend import make_model
-from ..envs.catalogue import parameter_names
+from ..envs.catalogue import USER_TASKS, parameter_names
+from ..envs.compiled import AVAILABLE
+from ..envs.task import Task
 
 
-def _library(backend: str) -> str:
-    """Where the exponentials of compiled steps come from."""
-    return f" (functions of {fastest(processor()[1]).name})" if backend == "compiled" else ""
+def _backend(cls: type[Task]) -> str:
+    """What computes an environment's steps, and where the exponentials of compiled ones come from."""
+    compiled = AVAILABLE
+    if cls.id in USER_TASKS:  # those of this package can all be traced
+        compiled = make_model(cls, backend="auto").backend == "compiled"
+    return f"compiled (functions of {fastest(processor()[1]).name})" if compiled else "numpy"
 
 
 def environment_lines(problem: Problem) -> Iterator[str]:
@@ -22,7 +27,6 @@ def environment_lines(problem: Problem) -> Iterator[str]:
     yield f"  {(cls.__doc__ or '').strip().partition(chr(10))[0]}"
     if cls.paper_source:
         yield f"  paper:       {cls.paper_source}"
-    model = make_model(cls, backend="auto")
     rows = {
         "controls": [f"{c} (default)" if c == cls.controls[0] else c for c in cls.controls],
         "policies": list(known.policies),
@@ -34,7 +38,7 @@ def environment_lines(problem: Problem) -> Iterator[str]:
     for title, names in rows.items():
         if names:
             yield f"  {title + ':':<12} {', '.join(names)}"
-    yield f"  {'backend:':<12} {model.backend}{_library(model.backend)}"
+    yield f"  {'backend:':<12} {_backend(cls)}"
     if known.smoothers:
         yield f"  smoothers:   {', '.join(known.smoothers)} (not causal: they use later measurements)"
     for title, table in (("references", known.references), ("bounds", known.bounds)):

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy
 
 from ...envs.backend import make_model
-from ...envs.catalogue import make_task
 from ...envs.filter import Initial
 from ...envs.maneuvering_target.task import ManeuveringTarget
+from ...envs.scenario_choice import make_task
 from ...evaluation.parallel import Workers
 from ...evaluation.rollout import start_lanes
 from ...evaluation.seeds import episode_seeds
