@@ -289,7 +289,7 @@ class NoiseBank(_KalmanBucyBank):
     def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
         """Covariance predicted to the measurement with the noises of an action."""
         p, xp = self.parameters, self.xp
-        coloured, white = xp.exp(math.log(p.process_scale) * action[1:])
+        coloured, white = xp.exp(p.noise_reach * math.log(p.process_scale) * action[1:])
         growth, displacement = p.variance_growth
         residual = p.coloured**2 * p.sampling.residual
         white_growth = coloured * residual + white * (displacement - residual)
@@ -298,7 +298,7 @@ class NoiseBank(_KalmanBucyBank):
     def receiver_variance(self, measurement: Measurement, action: Array) -> Array:
         """Variance of a measurement by an action, ``(N,)``, m^2."""
         p = self.parameters
-        up, down = math.log(p.receiver_scale), math.log(p.receiver_reduction)
+        up, down = (p.noise_reach * math.log(most) for most in (p.receiver_scale, p.receiver_reduction))
         scale = self.xp.exp(self.xp.where(action[0] > 0.0, up * action[0], down * action[0]))
         return scale * measurement.reported_deviation * measurement.reported_deviation
 
