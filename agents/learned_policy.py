@@ -237,20 +237,20 @@ class StoredPolicy:
 
     @property
     def task_keywords(self) -> dict[str, Any]:
-        """How far its actions reach, see :attr:`.Task.reach`, where it was trained with another reach than the default."""
-        reach = task_class(self.header["environment"]).reach
+        """How far its actions reach (:attr:`.Task.reach`), where its training said so."""
+        reach = task_class(self.header["environment"]).reach.get(self.control, ())
         return {name: value for name, value in self._keywords.items() if name in reach}
 
     def _check_reach(self, model: Model) -> None:
         """Raise ValueError if an action of the model does not reach as far as in training."""
         now, keywords = model.task.parameters, self.task_keywords
         defaults = type(now)()
-        for name in model.task.reach:
+        for name in model.task.reach.get(self.control, ()):
             trained = keywords.get(name, getattr(defaults, name))
             if getattr(now, name) != trained:
                 raise ValueError(
-                    f"{self.path} was trained with {name}={trained!r}, under which its actions mean something else than "
-                    f"with {name}={getattr(now, name)!r}: leave out {name}"
+                    f"{self.path} was trained with {name}={trained!r}, and its actions mean something else with "
+                    f"{name}={getattr(now, name)!r}: leave out {name}"
                 )
 
     def __call__(self, model: Model) -> Policy:

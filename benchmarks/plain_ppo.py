@@ -142,7 +142,9 @@ def main() -> None:
             quarter, fifth = (4, 5) if id in LONG else (1, 1)
             if any((found["environment"], found["seed"]) == (id, seed) for found in runs):
                 continue
-            runs.append(run(chosen.algo, id, seed, chosen.steps // quarter, chosen.episodes // fifth, chosen.envs))
+            runs.append(
+                run(chosen.algo, id, seed, chosen.steps // quarter, chosen.episodes // fifth, chosen.envs)
+            )
             chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
             console.print(
                 f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s"

@@ -3,10 +3,10 @@
     python benchmarks/time_to_beat.py [ENVIRONMENT] [--algo ppo] [--steps N] [--set algo.n_steps=25 ...]
 
 Every seed is trained in a process of its own, as ``filtergym train`` trains it, and is stopped at the first validation
-whose whole 95 % interval lies below the paper's algorithm (512 episodes of the validation split). ``wall`` runs from the
-start of the process to its end: imports, compilation, training, validations and checkpoints. ``processor`` is what the
-process took of all cores, ``training`` the seconds in ``run.json``, from the making of the environments on.
-With ``--whole`` a run is not stopped, and the best validation of the whole budget stands beside.
+whose whole 95 % interval lies below the paper's algorithm (512 episodes of the validation split). ``wall`` runs from
+the start of the process to its end: imports, compilation, training, validations and checkpoints. ``processor`` is what
+the process took of all cores, ``training`` the seconds in ``run.json``, from the making of the environments on. With
+``--whole`` a run is not stopped, and the best validation of the whole budget stands beside.
 """
 
 import argparse

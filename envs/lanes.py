@@ -282,7 +282,11 @@ class Lanes:
         assert self.beside is not None
         actions = [self.beside.action] * count
         discrete = isinstance(self.beside.action, int)
-        return self.task.xp.asarray(actions, device=self.task.device) if discrete else self.task.constant(actions)
+        return (
+            self.task.xp.asarray(actions, device=self.task.device)
+            if discrete
+            else self.task.constant(actions)
+        )
 
     def _reporting(self, report: Report) -> list[Any]:
         """Steppers that make a report, which hold the episodes from now on."""

@@ -10,10 +10,10 @@
   be both accurate and consistent.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
-* ``log-relative``: ``log(1 + x0) - log(1 + x)``, ``x0`` what the zero action of the same control is charged on the same
-  noise, ``x`` the agent, both in units of the paper's average. Zero where the agent does nothing; near a charge of zero
-  the difference, far from it the logarithm of the ratio. So it is of order one in calm and in wild episodes alike, where
-  few of these rule the mean of the charge and hide what an action has changed.
+* ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
+  action of the same control is charged on the same noise, both in units of the paper's average. It is zero where the
+  agent does nothing, the difference of small charges, and the logarithm of the ratio of large ones. So a few wild
+  episodes, which rule the mean of the charge, do not hide what an action changes in all others.
 
 :attr:`.Task.reward` says which is the default.
 
@@ -22,8 +22,6 @@ What an evaluation compares is the cost, neither compressed nor in another unit.
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
-
-import numpy
 
 from ..filters.gaussian import log_density
 from .model import Model
@@ -75,8 +73,8 @@ OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
     "log-relative": log_cost_reward,
     "none": no_reward,
 }
-"""Functions of a model and its episodes; from those of a :func:`reference` the same of the reference is subtracted later.
-"none" is that of recordings without truth."""
+"""Functions of a model and its episodes. Where there is a :func:`reference`, the same of it is subtracted later. "none"
+is that of recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 
@@ -101,6 +99,5 @@ def reference(kind: str, model: Model) -> Reference | None:
         paper = model.task.paper_policy
         return Reference(model.under(paper.control), paper.action)
     if kind == "log-relative":
-        zero: Any = numpy.zeros(model.action_space.shape).tolist()
-        return Reference(model, tuple(zero) if isinstance(zero, list) else 0)
+        return Reference(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
     return None

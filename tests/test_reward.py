@@ -39,7 +39,9 @@ def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
                 ],
                 axis=0,
             )
-            for t, states in zip((model, beside.model), zip(*watched.decide(action), strict=True), strict=True)
+            for t, states in zip(
+                (model, beside.model), zip(*watched.decide(action), strict=True), strict=True
+            )
         )
         if own:
             np.testing.assert_allclose(plain.pay(action, own), ours, rtol=1e-12)
@@ -95,7 +97,9 @@ def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_acti
     np.testing.assert_allclose(both, cost + likelihood / len(envs[0].task.components), rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["cost", "relative", "log-relative", "log-likelihood", "cost-and-likelihood"])
+@pytest.mark.parametrize(
+    "kind", ["cost", "relative", "log-relative", "log-likelihood", "cost-and-likelihood"]
+)
 def test_what_else_is_told_leaves_the_reward_alone(env_id, kind, short, random_actions):
     """To the last bit: compiled logarithms may round otherwise than NumPy's."""
     envs = [

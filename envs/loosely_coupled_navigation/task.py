@@ -114,7 +114,11 @@ class LooselyCoupledNavigation(Task):
         "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
         "weights": "weights of the three estimates, normalised; all zero is uniform",
     }
-    reach = ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale", "smallest_gain")
+    reach = {
+        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale"),
+        "gain": ("smallest_gain",),
+        "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
+    }
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
     trained_banks = {"kalman-net": KalmanNetBank}
     scenarios = SCENARIOS

@@ -116,7 +116,7 @@ class UavAutopilot(Task):
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
         "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
     }
-    reach = ("noise_reach", "process_decades", "sensor_decades", "gain_decades")
+    reach = {"noise": ("noise_reach", "process_decades", "sensor_decades"), "gain": ("gain_decades",)}
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": ModeBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]
