@@ -21,6 +21,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from ..envs.environment import TaskEnv, TaskVectorEnv
+from .eager_optimiser import exclude_from_compilation
 from .training_run import check_trust
 
 POLICY_CLASSES: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
@@ -216,6 +217,7 @@ def _load_model(path: Path) -> BaseAlgorithm:
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
     for algorithm, policy, stored in POLICY_CLASSES:
         if policy in names and (not stored or stored in data):
+            exclude_from_compilation()
             return algorithm.load(path, device="cpu")
     raise ValueError(
         f"its policy, {data['policy_class'].__name__}, is of none of the algorithms that are known: {NAMES}"
