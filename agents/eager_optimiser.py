@@ -2,8 +2,8 @@
 
 Torch's optimisers import ``torch._dynamo`` when the first one is made, and at every step, only to keep the compiler
 away from some of their functions. That import takes longer than an agent needs to beat the paper's algorithm. Nothing
-here is compiled by torch, so they can do without it. This reads names that torch keeps for itself: where another version
-has others, the import happens as ever, and the numbers are the same either way.
+here is compiled by torch, so they can do without it. This reads names that torch keeps for itself: where another
+version has others, the import happens as ever, and the numbers are the same either way.
 """
 
 import types

@@ -89,7 +89,9 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
     run.backend = env.unwrapped.backend
     inner = env.unwrapped.model
     corrected = policy_to_correct(inner, run.residual_to) if run.residual_to else None
-    adapted = to_sb3(env, residual_to=corrected, gate=Gate(inner, corrected) if run.gated else None)
+    gate = Gate(inner, corrected) if run.gated else None
+    # A rollout is shorter than an episode: side by side in step, it would show one part of the flight only.
+    adapted = to_sb3(env, staggered=True, residual_to=corrected, gate=gate)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
     return adapted
 
