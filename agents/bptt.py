@@ -27,6 +27,7 @@ from ..envs.environment import TaskVectorEnv
 from ..envs.model import Model
 from ..envs.scenario_choice import find_mixture
 from ..evaluation.seeds import episode_seeds
+from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, as_trained
 from .learned_estimator import EstimatorMaker
 from .learned_policy import LearnedPolicy, write_arrays
@@ -246,7 +247,9 @@ class Descent:
             len(self.env.model.fields), space, self.values["hidden_size"], first_action
         )
         self.learning_rate = schedule("learning_rate", self.values["learning_rate"])
+        exclude_from_compilation()
         self.optimiser = torch.optim.Adam(self.policy.parameters(), lr=self.learning_rate(1.0))
+        step_eagerly(self.optimiser)
         self.steps_done = 0
 
     def flight(self) -> Callable[[Callable[[], None]], float]:

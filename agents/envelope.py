@@ -160,12 +160,13 @@ def departure(cls: type[Task], maker: Any, scenario: Any, keywords: Mapping[str,
         return None
     header, run = stored.header, stored.header["run"]
     own = _own_parameters(cls, run)
+    keywords = {**stored.task_keywords, **keywords}  # what it acts with wherever it acts
     trained = make_task(cls, run.get("scenario"), **own).parameters
     differing = {name: (getattr(trained, name), value) for name, value in keywords.items()}
     # How long an episode is, is no other problem.
     differing = {n: (a, b) for n, (a, b) in differing.items() if a != freeze(b) and n != "horizon"}
     now, then = (cls.default_scenario if one is None else one for one in (scenario, run.get("scenario")))
-    if isinstance(now, str) and now == then and not (own or differing):
+    if isinstance(now, str) and now == then and not (own.keys() - stored.task_keywords or differing):
         return None  # it is what it was trained on, and need not be flown
     seen = training_range(cls, maker)
     assert seen is not None

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy
 
-from ..envs.catalogue import short_name
+from ..envs.catalogue import short_name, task_class
 from ..envs.model import Model
 from ..envs.task import Task
 from ..evaluation.competitors import Policy
@@ -238,6 +238,26 @@ class StoredPolicy:
         self.path = path
         self.control = self.header["control"]
         self.around = self.header["run"].get("residual_to", ""), self.header["run"].get("gated", False)
+        hyperparameters = self.header["run"].get("hyperparameters", {})
+        self._keywords: dict[str, Any] = hyperparameters.get("env_kwargs", {})
+
+    @property
+    def task_keywords(self) -> dict[str, Any]:
+        """How far its actions reach (:attr:`.Task.reach`), where its training said so."""
+        reach = task_class(self.header["environment"]).reach.get(self.control, ())
+        return {name: value for name, value in self._keywords.items() if name in reach}
+
+    def _check_reach(self, model: Model) -> None:
+        """Raise ValueError if an action of the model does not reach as far as in training."""
+        now, keywords = model.task.parameters, self.task_keywords
+        defaults = type(now)()
+        for name in model.task.reach.get(self.control, ()):
+            trained = keywords.get(name, getattr(defaults, name))
+            if getattr(now, name) != trained:
+                raise ValueError(
+                    f"{self.path} was trained with {name}={trained!r}, and its actions mean something else with "
+                    f"{name}={getattr(now, name)!r}: leave out {name}"
+                )
 
     def __call__(self, model: Model) -> Policy:
         """Make it, with what was around it in training."""
@@ -246,6 +266,7 @@ class StoredPolicy:
                 f"{self.path} was trained when fields or actions of {model.task.id} meant something else (its "
                 f"interface {self.header['interface']}, now {model.task.interface}): train it again"
             )
+        self._check_reach(model)
         try:
             network = LearnedPolicy(
                 model, self.arrays, self.header["output"], self.header["activation"], self.header["fields"]

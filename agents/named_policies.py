@@ -74,7 +74,9 @@ def _agent_of_run(cls: type[Task], folder: Path, trust: bool) -> Any:
 
 
 def _as_recorded(model: Any, run: TrainingRun) -> Any:
-    """Return a model with what was around it in training."""
+    """Return a model with what was around it in training, and the reach of its actions."""
+    reach = run.problem.task.reach.get(run.control, ())
+    model.task_keywords = {name: run.task_keywords[name] for name in reach if name in run.task_keywords}
     if not (run.residual_to or run.gated):
         return model
     return PolicyMaker(

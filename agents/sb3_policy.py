@@ -20,6 +20,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from ..envs.environment import TaskEnv, TaskVectorEnv
+from .eager_optimiser import exclude_from_compilation
 from .training_run import check_trust
 
 POLICY_CLASSES: tuple[tuple[type[BaseAlgorithm], str, str], ...] = (
@@ -67,6 +69,7 @@ class Sb3Policy:
         self.model = model
         self.observation_space, self.action_space = model.observation_space, model.action_space
         self.normalisation = model.get_vec_normalize_env() if normalisation is None else normalisation
+        self.task_keywords = _reach(model)
         if control is not None:
             self.control = control
         name = name or f"this model of {type(model).__name__}"
@@ -98,6 +101,18 @@ class Sb3Policy:
             normalised: Any = self.normalisation.normalize_obs(observation)
             observation = normalised
         return self.model.predict(observation, state, episode_start, deterministic)
+
+
+def _reach(model: BaseAlgorithm) -> dict[str, Any]:
+    """How far actions reach (:attr:`.Task.reach`) in the environment that a model holds, where not as by default."""
+    held = model.get_env()
+    inner: Any = None if held is None else held.unwrapped
+    env = inner.envs[0].unwrapped if isinstance(inner, DummyVecEnv) else getattr(inner, "env", None)
+    if not isinstance(env, TaskEnv | TaskVectorEnv):
+        return {}
+    own, names = env.task.parameters, env.task.reach.get(env.model.control, ())
+    defaults = type(own)()
+    return {name: getattr(own, name) for name in names if getattr(own, name) != getattr(defaults, name)}
 
 
 def _check_shape(normalisation: VecNormalize, model: BaseAlgorithm) -> None:
@@ -202,6 +217,7 @@ def _load_model(path: Path) -> BaseAlgorithm:
     names = {cls.__name__ for cls in data["policy_class"].__mro__}
     for algorithm, policy, stored in POLICY_CLASSES:
         if policy in names and (not stored or stored in data):
+            exclude_from_compilation()
             return algorithm.load(path, device="cpu")
     raise ValueError(
         f"its policy, {data['policy_class'].__name__}, is of none of the algorithms that are known: {NAMES}"

@@ -30,6 +30,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from ..envs.model import Model
 from ..evaluation.seeds import episode_seeds
 from .adapter import TaskVecEnv, to_sb3
+from .eager_optimiser import exclude_from_compilation, step_eagerly
 from .gate import Gate, PolicyMaker, as_trained
 from .learned_policy import LearnedPolicy, write_arrays
 from .network_arrays import network_arrays
@@ -88,9 +89,19 @@ def training_environment(run: TrainingRun) -> TaskVecEnv:
     run.backend = env.unwrapped.backend
     inner = env.unwrapped.model
     corrected = policy_to_correct(inner, run.residual_to) if run.residual_to else None
-    adapted = to_sb3(env, residual_to=corrected, gate=Gate(inner, corrected) if run.gated else None)
+    gate = Gate(inner, corrected) if run.gated else None
+    # A rollout is shorter than an episode: side by side in step, it would show one part of the flight only.
+    adapted = to_sb3(env, staggered=True, residual_to=corrected, gate=gate)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))
     return adapted
+
+
+def _step_eagerly(model: BaseAlgorithm) -> None:
+    """Let every optimiser of a model step without torch's compiler."""
+    found = [getattr(module, "optimizer", None) for module in model.policy.modules()]
+    for optimiser in (*found, getattr(model, "ent_coef_optimizer", None)):
+        if optimiser is not None:
+            step_eagerly(optimiser)
 
 
 def save_model(model: BaseAlgorithm, normalisation: VecNormalize | None, folder: Path) -> None:
@@ -159,7 +170,9 @@ def load_checkpoint(
     try:
         if (folder / "vecnormalize.pkl").exists():
             env = normalisation = VecNormalize.load(str(folder / "vecnormalize.pkl"), adapted)
+        exclude_from_compilation()
         model = ALGORITHMS[run.algorithm].load(folder / "model.zip", env, device="cpu", force_reset=False)
+        _step_eagerly(model)
         if isinstance(model, OffPolicyAlgorithm):
             model.load_replay_buffer(folder / "replay_buffer.pkl")
         rest = pickle.loads((folder / "rest.pkl").read_bytes())
@@ -204,7 +217,9 @@ def begin_model(run: TrainingRun) -> tuple[BaseAlgorithm, TaskVecEnv, VecNormali
     if normalize:
         # A Q-value of minus hundreds learns slowly; a discounted return of order one does not.
         env = normalisation = VecNormalize(adapted, gamma=values.get("gamma", 0.99))
+    exclude_from_compilation()
     model = ALGORITHMS[run.algorithm](env=env, seed=run.seed, device="cpu", **values)
+    _step_eagerly(model)
     adapted.seed_episodes(episode_seeds("train", run.seed, run.envs))  # the model has seeded it too
     return model, adapted, normalisation
 

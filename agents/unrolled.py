@@ -159,7 +159,7 @@ class Unrolled:
             noise.
         policy: a :class:`~.bptt.RecurrentPolicy`.
         truncation: most decisions of a window.
-        reward: that is ascended, as in :mod:`~..envs.reward`, but "relative".
+        reward: that is ascended, as in :mod:`~..envs.reward`: the agent's own part of it.
         gate: that decides whether the policy acts; a decision in which it does not, has no gradient.
         largest: see :func:`.bptt.descend_episodes`.
     """

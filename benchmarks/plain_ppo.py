@@ -1,10 +1,11 @@
-"""What somebody gets who tries reinforcement learning for ten minutes: PPO of Stable-Baselines3 with its defaults.
+"""What somebody gets who tries reinforcement learning for ten minutes: Stable-Baselines3 with its defaults.
 
     python benchmarks/plain_ppo.py --out plain_ppo.json
+    python benchmarks/plain_ppo.py --algo sac --out plain_sac.json
 
 One environment by ``gymnasium.make(id)`` with the defaults of filtergym, 200,000 decisions (50,000 where one holds for
-ten measurements), five training seeds; then the deterministic policy and the paper's algorithm meet the same episodes
-of the test split. Runs that a file holds are not repeated.
+ten measurements), five training seeds; then the deterministic policy, the action zero and the paper's algorithm meet
+the same episodes of the test split. Runs that a file holds are not repeated.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import json
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy
@@ -25,10 +27,21 @@ LONG = {"filtergym/TightlyCoupledNavigation-v0"}
 """Where a decision holds for ten measurements of three filters: fewer of them, and fewer episodes."""
 
 
+POLICIES = {"ppo": "MlpPolicy", "recurrent-ppo": "MlpLstmPolicy", "sac": "MlpPolicy"}
+"""Algorithms, and the kind of their networks."""
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--algo", choices=sorted(POLICIES), default="ppo")
     parser.add_argument("--environment", action="append", help="id; default: all")
     parser.add_argument("--seeds", type=int, default=5, help="training runs of each")
+    parser.add_argument(
+        "--envs",
+        type=int,
+        default=1,
+        help="native environments side by side, and PPO's rollout shared among them: faster, not quite the same",
+    )
     parser.add_argument(
         "--steps", type=int, default=200_000, help="decisions; a quarter in TightlyCoupledNavigation"
     )
@@ -40,22 +53,32 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def run(id: str, seed: int, steps: int, episodes: int) -> dict:
-    """Train once and compare with the paper's algorithm."""
+def run(algo: str, id: str, seed: int, steps: int, episodes: int, envs: int) -> dict:
+    """Train once and compare with the paper's algorithm and with the action zero."""
     import torch
-    from stable_baselines3 import PPO
+    from filtergym.agents import to_sb3
+    from filtergym.agents.sb3_training import ALGORITHMS
 
     torch.set_num_threads(1)
-    env = gymnasium.make(id)
+    env: Any = gymnasium.make(id)
+    settings = {}
+    if envs > 1:
+        env = to_sb3(gymnasium.make_vec(id, num_envs=envs, autoreset_mode="SameStep"))
+        settings = {"n_steps": 2048 // envs} if algo == "ppo" else {}
     begun = time.perf_counter()
-    model = PPO("MlpPolicy", env, seed=seed, device="cpu").learn(steps)
+    model: Any = ALGORITHMS[algo](POLICIES[algo], env, seed=seed, device="cpu", **settings).learn(steps)
     seconds = time.perf_counter() - begun
     paper = baselines_of(id).score_paper
+    nothing = numpy.zeros(env.action_space.shape)
+    zero = filtergym.FunctionPolicy(lambda observation: numpy.tile(nothing, (len(observation), 1)))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a model that is not normalised, and was not
-        results = filtergym.evaluate(id, {"plain": model, paper: paper}, episodes=episodes, seed=0)
-    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("plain", paper)}
+        results = filtergym.evaluate(
+            id, {"plain": model, paper: paper, "zero": zero}, episodes=episodes, seed=0
+        )
+    cost = {name: results["cost"].sel(policy=name).values.mean(axis=1) for name in ("plain", paper, "zero")}
     return {
+        "algorithm": algo,
         "environment": id,
         "seed": seed,
         "steps": steps,
@@ -63,7 +86,9 @@ def run(id: str, seed: int, steps: int, episodes: int) -> dict:
         "control": str(results["control"].sel(policy="plain").values),
         "difference": float(cost["plain"].mean() / cost[paper].mean() - 1.0),
         "median_difference": float(numpy.median(cost["plain"] / cost[paper]) - 1.0),
-        "standard_deviation": model.policy.log_std.exp().tolist(),
+        "zero_difference": float(cost["zero"].mean() / cost[paper].mean() - 1.0),
+        "zero_median_difference": float(numpy.median(cost["zero"] / cost[paper]) - 1.0),
+        "median_difference_to_zero": float(numpy.median(cost["plain"] / cost["zero"]) - 1.0),
     }
 
 
@@ -71,7 +96,8 @@ def table(runs: list[dict]) -> Table:
     """Mean over the seeds with Student's interval for a new one, and every seed."""
     from scipy.stats import t
 
-    shown = Table(title="SB3's PPO, its defaults and ours: cost against the paper, %")
+    title = "Stable-Baselines3, its defaults and ours: cost against the paper, %"
+    shown = Table(title=title)
     for head in (
         "environment",
         "control",
@@ -79,6 +105,8 @@ def table(runs: list[dict]) -> Table:
         "mean",
         "95 %",
         "median episode",
+        "zero action",
+        "its median",
         "seeds",
         "decisions/s",
     ):
@@ -96,6 +124,8 @@ def table(runs: list[dict]) -> Table:
             f"{each.mean():+.1f}",
             f"[{each.mean() - half:+.1f}, {each.mean() + half:+.1f}]",
             f"{median:+.1f}",
+            f"{100.0 * own[0]['zero_difference']:+.1f}",
+            f"{100.0 * own[0]['zero_median_difference']:+.1f}",
             ", ".join(f"{value:+.1f}" for value in each),
             f"{rate:,.0f}",
         )
@@ -112,7 +142,9 @@ def main() -> None:
             quarter, fifth = (4, 5) if id in LONG else (1, 1)
             if any((found["environment"], found["seed"]) == (id, seed) for found in runs):
                 continue
-            runs.append(run(id, seed, chosen.steps // quarter, chosen.episodes // fifth))
+            runs.append(
+                run(chosen.algo, id, seed, chosen.steps // quarter, chosen.episodes // fifth, chosen.envs)
+            )
             chosen.out.write_text(json.dumps(runs, indent=1) + "\n")
             console.print(
                 f"{id} seed {seed}: {100 * runs[-1]['difference']:+.1f} % in {runs[-1]['seconds']:.0f} s"

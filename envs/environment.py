@@ -189,12 +189,8 @@ class _EnvBase:
         course = self._course(scenario, {})
         if not all(model.task.has_whole_truth for model in course.models):
             self._disable_reward(course)
-        self.model, self._first_course, beside_paper = (
-            course.models[0],
-            course,
-            self.reward_kind == "relative",
-        )
-        self.fleet = Fleet(count, course, beside_paper, longest)
+        self.model, self._first_course = course.models[0], course
+        self.fleet = Fleet(count, course, self.reward_kind, longest)
         self.last_decision = self.fleet.decisions_per_episode
         self._scaled_errors: Array = None
         """Errors after the last action, in sigmas, ``(count, components)``; only where observations are privileged."""
@@ -396,7 +392,7 @@ class _EnvBase:
         last = answers[-1][0]
         for name, values in (last.details or {}).items():
             info[name] = task.xp.moveaxis(values[..., :count], -1, 0)
-        rewards = [own.reward if paper is None else own.reward - paper.reward for own, paper in answers]
+        rewards = [own.reward if other is None else own.reward - other.reward for own, other in answers]
         scaled = in_sigmas(last.error, last.covariance, count, task.xp) if self.privileged else None
         return mean_of(rewards)[:count], scaled
 
@@ -591,7 +587,8 @@ class TaskVectorEnv(_EnvBase, gymnasium.vector.VectorEnv[Any, Any, Any]):
         control: what the action steers.
         scenario: name of a scenario, a trajectory or a dictionary of its fields, or the path of a file with one; or a
             mixture, ``{"random": 0.8, "paper": 0.2}``.
-        reward: "cost", "log-likelihood", "cost-and-likelihood" or "relative"; default: the environment's own.
+        reward: "cost", "log-likelihood", "cost-and-likelihood", "relative" or "log-relative"; default: the
+            environment's own.
         render_mode: None, or "rgb_array": :meth:`render` draws the first few sub-environments.
         backend: "auto" (default), "compiled" or "numpy", see :func:`~.backend.make_model`; or "torch": observations,
             rewards, masks and ``info`` are tensors, actions may be. Episodes are the same everywhere, their

@@ -22,7 +22,7 @@ from .lanes import Lanes
 from .model import Model
 from .observation import Array
 from .recording import Recording
-from .reward import paper_model
+from .reward import reference
 from .specification import plain
 
 ROOM = 8
@@ -86,15 +86,15 @@ class Fleet:
     Args:
         count: number of lanes.
         course: of all of them, until :meth:`send` names others.
-        beside_paper: whether the paper's algorithm runs beside every episode.
+        kind: of reward, which may need a reference that runs beside every episode.
         longest: decisions after which an episode ends at the latest; default: its task's horizon.
     """
 
-    def __init__(self, count: int, course: Course, beside_paper: bool, longest: int | None = None) -> None:
+    def __init__(self, count: int, course: Course, kind: str, longest: int | None = None) -> None:
         self.count = count
         self.generators: list[numpy.random.Generator] = []
         self._courses = [course] * count
-        self._beside_paper, self._longest = beside_paper, longest
+        self._kind, self._longest = kind, longest
         self._part = numpy.full(count, -1)
         """Which of ``_parts`` each lane flies in; -1 before its first episode."""
         self._place = numpy.arange(count)
@@ -163,7 +163,7 @@ class Fleet:
         return most if self._longest is None else min(most, self._longest)
 
     def _make_lanes(self, model: Model, count: int) -> Lanes:
-        return Lanes(model, count, paper_model(model) if self._beside_paper else None, longest=self._longest)
+        return Lanes(model, count, reference(self._kind, model), longest=self._longest)
 
     def _part_of(self, model: Model) -> Lanes:
         """Lanes of a task, made when they are first asked for."""

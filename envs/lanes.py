@@ -24,7 +24,7 @@ from .compiled import Report, Stepper, can_step
 from .episode_noise import EpisodeNoise
 from .model import Episode, Model
 from .observation import Array
-from .reward import OWN_PAY
+from .reward import OWN_PAY, Reference
 
 
 def whole_episode(model: Model, episode: Episode) -> Episode:
@@ -144,7 +144,7 @@ class Lanes:
     Args:
         model: task with a filter; the task's namespace decides where arrays live.
         count: number of lanes.
-        paper: the same task under the control of the paper's algorithm, run beside it on the same noise.
+        beside: what the reward is relative to, run beside it on the same noise.
         on_start: called with new episodes at the start of the track, before their first measurement.
         longest: decisions after which an episode ends at the latest; default: the task's horizon.
 
@@ -157,7 +157,7 @@ class Lanes:
         self,
         model: Model,
         count: int,
-        paper: Model | None = None,
+        beside: Reference | None = None,
         on_start: Callable[[Episode], None] | None = None,
         longest: int | None = None,
     ) -> None:
@@ -165,13 +165,13 @@ class Lanes:
         self.task = task = model.task
         self.count = count
         self.width = round_up_lanes(count)
-        self.paper = paper
-        self._models = [model] if paper is None else [model, paper]
+        self.beside = beside
+        self._models = [model] if beside is None else [model, beside.model]
         self._on_start = on_start
         self._steppers: dict[Report, list[Stepper]] = {}
         """Those of compiled models, by what they report."""
         self._moving: list[Any] = []
-        """Steppers that hold the episodes, of the task and of the paper's; none before the first episode."""
+        """Steppers that hold the episodes, of the task and of what runs beside it; none before the first episode."""
         self.noise = EpisodeNoise(task, count)
         self._some: dict[int, EpisodeNoise] = {}
         """Noise of lanes that restart while others fly on, by their number."""
@@ -240,7 +240,7 @@ class Lanes:
             kind: one of :data:`~.reward.REWARDS`.
         """
         answers = self.decide(action, OWN_PAY[kind])
-        return mean_of([own if paper is None else own - paper for own, paper in answers])[: self.count]
+        return mean_of([own if other is None else own - other for own, other in answers])[: self.count]
 
     def decide(self, action: Array, report: Report = whole_episode) -> list[tuple[Any, Any]]:
         """Apply one decision to as many measurements as it holds for, and report on each.
@@ -251,7 +251,7 @@ class Lanes:
 
         Returns:
             The reports on every measurement that the decision held for, arrays ``(..., width)``: of the model, and of
-            ``paper`` (None without).
+            ``beside`` (None without).
         """
         steppers = self._reporting(report)
         own = steppers[0]
@@ -262,7 +262,7 @@ class Lanes:
             self.noise.advance()
             for stepper in steppers:
                 stepper.step(self.noise)
-            answers.append((own.report(), steppers[1].report() if self.paper else None))
+            answers.append((own.report(), steppers[1].report() if self.beside else None))
             if self._averaged:
                 total = total + own.observation_by_field()[self._averaged]
         if self._averaged:
@@ -301,9 +301,20 @@ class Lanes:
     def _by_functions(self) -> list[Any]:
         """Steppers by the models' functions, without episodes."""
         steppers = [ModelStepper(model, self.width) for model in self._models]
-        if self.paper is not None:
-            steppers[1].take(self.paper.task.constant([self.paper.task.paper_policy.action] * self.width))
+        if self.beside is not None:
+            steppers[1].take(self._beside_action(self.width))
         return steppers
+
+    def _beside_action(self, count: int) -> Array:
+        """Action of what runs beside, batch first."""
+        assert self.beside is not None
+        actions = [self.beside.action] * count
+        discrete = isinstance(self.beside.action, int)
+        return (
+            self.task.xp.asarray(actions, device=self.task.device)
+            if discrete
+            else self.task.constant(actions)
+        )
 
     def _reporting(self, report: Report) -> list[Any]:
         """Steppers that make a report, which hold the episodes from now on."""
@@ -311,10 +322,8 @@ class Lanes:
             return self._moving
         if report not in self._steppers and all(can_step(model, report) for model in self._models):
             self._steppers[report] = [Stepper(model, report, self.width) for model in self._models]
-            if self.paper is not None:
-                self._steppers[report][1].action[...] = self.paper.task.constant(
-                    self.paper.task.paper_policy.action
-                )[:, None]
+            if self.beside is not None:
+                self._steppers[report][1].take(self._beside_action(self.width))
         before, after = self._moving, self._steppers.get(report)
         if after is None:
             self._settle()

@@ -10,6 +10,10 @@
   be both accurate and consistent.
 * ``relative``: the ``cost`` reward minus that of the paper's algorithm on the same noise (a control variate):
   positive where the agent does better than the paper.
+* ``log-relative``: ``log(1 + x0) - log(1 + x)``, where ``x`` is what the agent is charged and ``x0`` what the zero
+  action of the same control is charged on the same noise, both in units of the paper's average. It is zero where the
+  agent does nothing, the difference of small charges, and the logarithm of the ratio of large ones. So a few wild
+  episodes, which rule the mean of the charge, do not hide what an action changes in all others.
 
 :attr:`.Task.reward` says which is the default.
 
@@ -17,7 +21,7 @@ What an evaluation compares is the cost, neither compressed nor in another unit.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..filters.gaussian import log_density
 from .model import Model
@@ -37,6 +41,11 @@ def charge(model: Model, state: Any) -> Array:
 def cost_reward(model: Model, state: Any) -> Array:
     """Minus the compressed charge of the estimate, ``(N,)``."""
     return -charge(model, state)
+
+
+def log_cost_reward(model: Model, state: Any) -> Array:
+    """Minus ``log(1 + x)`` of the charge x in units of the paper's average, ``(N,)``."""
+    return -model.task.xp.log1p(model.charge(state) * (1.0 / model.task.reward_unit))
 
 
 def log_likelihood_reward(model: Model, state: Any) -> Array:
@@ -61,14 +70,34 @@ OWN_PAY: dict[str, Callable[[Model, Any], Array]] = {
     "log-likelihood": log_likelihood_reward,
     "cost-and-likelihood": cost_and_likelihood_reward,
     "relative": cost_reward,
+    "log-relative": log_cost_reward,
     "none": no_reward,
 }
-"""Functions of a model and its episodes; from "relative" the same of the paper's algorithm is subtracted later. "none"
+"""Functions of a model and its episodes. Where there is a :func:`reference`, the same of it is subtracted later. "none"
 is that of recordings without truth."""
 REWARDS = tuple(kind for kind in OWN_PAY if kind != "none")
 """Those that can be asked for."""
 
 
-def paper_model(model: Model) -> Model:
-    """Return the same task under the control of the paper's algorithm."""
-    return model.under(model.task.paper_policy.control)
+class Reference(NamedTuple):
+    """What runs beside every episode on the same noise, for rewards that are relative."""
+
+    model: Model
+    """The same task, under a control."""
+    action: tuple[float, ...] | int
+    """That holds in every decision, as the control's space has it."""
+
+
+def reference(kind: str, model: Model) -> Reference | None:
+    """Return what the reward of an agent is relative to; None where it is the agent's own.
+
+    Args:
+        kind: of reward.
+        model: in which the agent acts.
+    """
+    if kind == "relative":
+        paper = model.task.paper_policy
+        return Reference(model.under(paper.control), paper.action)
+    if kind == "log-relative":
+        return Reference(model, (0.0,) * model.action_space.shape[0] if model.action_space.shape else 0)
+    return None

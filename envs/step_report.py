@@ -13,7 +13,7 @@ class StepReport(NamedTuple):
     """What is asked about, lanes last; the rest is None."""
 
     reward: Array
-    """``(N,)``; of a relative reward before the paper's is taken away."""
+    """``(N,)``; of a relative reward before the reference's is taken away."""
     error: Array = None
     """Estimate minus truth, ``(C, N)``."""
     covariance: Array = None

@@ -68,7 +68,8 @@ def move_roundings(env, repetition=0):
     """
     lanes = env.unwrapped.fleet.only
     pattern = 1000 * repetition + np.arange(lanes.width)
-    for model in filter(None, (lanes.model, lanes.paper)):
+    beside = lanes.beside.model if lanes.beside else lanes.model
+    for model in {id(model): model for model in (lanes.model, beside)}.values():
         parts = ((model.task.world, "world"), (model.filter, "filter"))
         for owner, names in ((model, ("observe", "charge")), *((part, PARTS[p]) for part, p in parts)):
             for name in names:

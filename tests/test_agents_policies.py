@@ -15,7 +15,7 @@ from filtergym.envs.catalogue import catalogue, task_class
 from filtergym.envs.model import Model
 from filtergym.envs.observation import Block
 from filtergym.envs.task import named_arrays
-from filtergym.evaluation.competitors import ConstantPolicy, kind_of
+from filtergym.evaluation.competitors import ConstantPolicy, FunctionPolicy, kind_of
 from filtergym.evaluation.rollout import run_competitor
 from models import make_model
 
@@ -126,7 +126,8 @@ def test_fields_are_found_by_their_names(file):
     cls = task_class(id)
     control = cls.controls[0] if kind_of(maker) == "estimator" else maker.control
     interval = min(cls.Parameters().decision_interval, 5)
-    parameters = cls.Parameters(horizon=4 * interval, decision_interval=interval)
+    own_reach = getattr(maker, "task_keywords", {})
+    parameters = cls.Parameters(horizon=4 * interval, decision_interval=interval, **own_reach)
     costs = []
     for own in (cls, wider(cls)):
         model = Model(own(parameters), control)
@@ -199,6 +200,43 @@ def test_policy_of_an_older_interface_is_refused_in_one_sentence(stored, command
     assert code == 2
     assert error.startswith("Error: ")
     assert error.count("\n") == 1
+
+
+NOISE = "filtergym/UavAutopilot-v0"
+"""Where actions reach a fifth of what the shipped agents were trained with."""
+
+
+def test_an_agent_keeps_the_reach_that_it_was_trained_with():
+    """The same cost whether its reach is named or not; another one is refused, and other policies are as asked."""
+    from filtergym.agents.learned_policy import load_policy, pretrained_path
+
+    stored = load_policy(task_class(NOISE), pretrained_path(NOISE, "ppo"))
+    assert stored.task_keywords == {"noise_reach": 1.0}
+    short = {"episodes": 4, "split": "validation", "horizon": 30}
+    named = evaluate(NOISE, ["ppo"], noise_reach=1.0, **short)["cost"]
+    np.testing.assert_array_equal(evaluate(NOISE, ["ppo"], **short)["cost"], named)
+    with pytest.raises(ValueError, match=r"was trained with noise_reach=1.0, .* noise_reach=0.2: leave out"):
+        evaluate(NOISE, ["ppo"], noise_reach=0.2, **short)
+
+
+def test_the_whole_reach_is_five_times_a_fifth():
+    """An action at the whole reach is what five times that action is at a fifth of it."""
+
+    def constant(action, reach):
+        width = make_model(NOISE, "noise").action_space.shape[0]
+        return FunctionPolicy(lambda o: np.full((len(o), width), action), "noise", {"noise_reach": reach})
+
+    costs = [
+        evaluate(
+            NOISE,
+            {"constant": constant(action, reach)},
+            episodes=3,
+            horizon=30,
+        )["cost"].values
+        for action, reach in ((0.2, 1.0), (1.0, 0.2), (0.2, 0.2))
+    ]
+    np.testing.assert_allclose(costs[1], costs[0], rtol=1e-9)  # the product of reach and action rounds
+    assert not np.allclose(costs[2], costs[0], rtol=1e-3)
 
 
 def test_layers_by_hand():

@@ -14,7 +14,7 @@ import pytest
 from filtergym.envs.catalogue import catalogue
 from filtergym.envs.lanes import Lanes
 from filtergym.envs.parameters import field_limits
-from filtergym.envs.reward import REWARDS, paper_model
+from filtergym.envs.reward import REWARDS, reference
 from filtergym.envs.scenario_choice import find_scenario
 from filtergym.envs.step_report import step_report
 from models import make_model
@@ -94,7 +94,7 @@ def finding(env_id, keywords, kind, rng):
     """Run three episodes with these keywords: "" if all is well, "refused: ..." or what went wrong."""
     try:
         model = make_model(env_id, **{"horizon": 60, "decision_interval": 1, **keywords})
-        lanes = Lanes(model, 3, paper_model(model) if kind == "relative" else None)
+        lanes = Lanes(model, 3, reference(kind, model))
     except np.linalg.LinAlgError as error:
         return f"LinAlgError: {error}"
     except ValueError as error:

@@ -7,7 +7,7 @@ import pytest
 from filtergym.baselines.catalogue import baselines_of
 from filtergym.envs.environment import TaskVectorEnv
 from filtergym.envs.lanes import Lanes
-from filtergym.envs.reward import paper_model
+from filtergym.envs.reward import reference
 from models import make_model
 
 import filtergym
@@ -15,11 +15,14 @@ import filtergym
 ID = "filtergym/ManeuveringTarget-v0"
 
 
-def test_reward_is_the_compressed_charge(env_id):
-    """By hand: with the charge x in units of the paper's, -30 log(1 + x / 30); relative adds the paper's own."""
+@pytest.mark.parametrize(("own", "kind", "beyond"), [("cost", "relative", 30.0), (None, "log-relative", 1.0)])
+def test_reward_is_the_compressed_charge(env_id, own, kind, beyond):
+    """By hand, with the charge x in units of the paper's: -30 log(1 + x / 30), and relative less the paper's own; or
+    -log(1 + x), less that of the zero action.
+    """
     model = make_model(env_id)
-    paper = paper_model(model)
-    watched, plain, relative = (Lanes(model, 8, beside) for beside in (paper, None, paper))
+    beside = reference(kind, model)
+    watched, plain, relative = (Lanes(model, 8, each) for each in (beside, None, beside))
     for lanes in (watched, plain, relative):
         for lane in range(8):
             lanes.seed(lane, np.random.default_rng(lane))
@@ -31,16 +34,19 @@ def test_reward_is_the_compressed_charge(env_id):
         ours, theirs = (
             np.mean(
                 [
-                    [-30.0 * math.log1p(x / model.task.reward_unit / 30.0) for x in t.charge(s)]
+                    [-beyond * math.log1p(x / model.task.reward_unit / beyond) for x in t.charge(s)]
                     for s in states
                 ],
                 axis=0,
             )
-            for t, states in zip((model, paper), zip(*watched.decide(action), strict=True), strict=True)
+            for t, states in zip(
+                (model, beside.model), zip(*watched.decide(action), strict=True), strict=True
+            )
         )
-        np.testing.assert_allclose(plain.pay(action, "cost"), ours, rtol=1e-12)
+        if own:
+            np.testing.assert_allclose(plain.pay(action, own), ours, rtol=1e-12)
         difference = np.subtract(ours, theirs)
-        np.testing.assert_allclose(relative.pay(action, "relative"), difference, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(relative.pay(action, kind), difference, rtol=1e-9, atol=1e-12)
         seen.append(max(abs(difference)))
     assert max(seen) > 0.0
 
@@ -70,6 +76,17 @@ def test_the_default_is_the_environments_own(env_id, short, random_actions):
     assert (cost != relative).any()
 
 
+def test_doing_nothing_is_worth_nothing(env_id, short, random_actions):
+    """Under "log-relative", to the last bit, under every control; anything else is worth something."""
+    for control in make_model(env_id).task.controls:
+        env = TaskVectorEnv(env_id, 3, control=control, reward="log-relative", **short)
+        env.reset(seed=4)
+        space = env.single_action_space
+        nothing = np.zeros((3, *space.shape), dtype=space.dtype)
+        assert all((env.step(nothing)[1] == 0.0).all() for _ in range(3))
+        assert any((env.step(random_actions(space, 3, i))[1] != 0.0).any() for i in range(3))
+
+
 def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_actions):
     kinds = ("cost", "log-likelihood", "cost-and-likelihood")
     envs = [TaskVectorEnv(env_id, 3, reward=kind, **short) for kind in kinds]
@@ -80,7 +97,9 @@ def test_cost_and_likelihood_is_the_sum_per_component(env_id, short, random_acti
     np.testing.assert_allclose(both, cost + likelihood / len(envs[0].task.components), rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["cost", "relative", "log-likelihood", "cost-and-likelihood"])
+@pytest.mark.parametrize(
+    "kind", ["cost", "relative", "log-relative", "log-likelihood", "cost-and-likelihood"]
+)
 def test_what_else_is_told_leaves_the_reward_alone(env_id, kind, short, random_actions):
     """To the last bit: compiled logarithms may round otherwise than NumPy's."""
     envs = [

@@ -255,6 +255,11 @@ class NoiseBank(_KalmanBucyBank):
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES),), numpy.float32)
 
     @property
+    def reach(self) -> float:
+        """Share of the logarithms of the largest factors that an action of one has."""
+        return self.parameters.noise_reach
+
+    @property
     def blocks(self) -> Sequence[Block]:
         """What every filter shows, and the deviation that this one predicts."""
         nominal = math.sqrt(self.parameters.receiver_variance)
@@ -289,7 +294,7 @@ class NoiseBank(_KalmanBucyBank):
     def predict_covariance(self, state: Augmented, action: Array) -> ins_gnss.AugmentedCovariance:
         """Covariance predicted to the measurement with the noises of an action."""
         p, xp = self.parameters, self.xp
-        coloured, white = xp.exp(math.log(p.process_scale) * action[1:])
+        coloured, white = xp.exp(self.reach * math.log(p.process_scale) * action[1:])
         growth, displacement = p.variance_growth
         residual = p.coloured**2 * p.sampling.residual
         white_growth = coloured * residual + white * (displacement - residual)
@@ -298,7 +303,7 @@ class NoiseBank(_KalmanBucyBank):
     def receiver_variance(self, measurement: Measurement, action: Array) -> Array:
         """Variance of a measurement by an action, ``(N,)``, m^2."""
         p = self.parameters
-        up, down = math.log(p.receiver_scale), math.log(p.receiver_reduction)
+        up, down = (self.reach * math.log(most) for most in (p.receiver_scale, p.receiver_reduction))
         scale = self.xp.exp(self.xp.where(action[0] > 0.0, up * action[0], down * action[0]))
         return scale * measurement.reported_deviation * measurement.reported_deviation
 

@@ -4,7 +4,8 @@ r"""The filter of LooselyCoupledNavigation that a recurrent network steers from 
 The augmented filter of the position with the rate errors beta and eta. At every measurement the network answers with
 six numbers a in [-1, 1]:
 
-    noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise``
+    noise    the receiver's, the coloured and the white one, scaled by a1, a2, a3 as under control ``noise`` at its
+             whole reach
     gain     K = diag(1, rate_range^a5, rate_range^a6) P' H^T / (H P' H^T + caution^a4 R)
     update   x = x' + K nu,  P = (I - K H) P' (I - K H)^T + K R K^T                                 (Joseph form)
 
@@ -35,6 +36,7 @@ class KalmanNetBank(NoiseBank):
     """The augmented filter, whose noises and gain the action sets."""
 
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (len(NOISES) + len(GAINS),), numpy.float32)
+    reach = 1.0  # it learns through the filter, and does not explore
 
     @property
     def blocks(self) -> Sequence[Block]:

@@ -108,6 +108,10 @@ class LooselyCoupledNavigationParameters(TaskParameters):
     process_scale: float = parameter(10.0, above=1.0, at_most=1e6)
     """Largest factor and divisor of the coloured and the white rate error's intensities under control ``noise``;
     ours."""
+    noise_reach: float = parameter(0.1, above=0.0, at_most=1.0)
+    """Share of the logarithms of these three that an action of one has. Ours: a policy that has just been made explores
+    with a standard deviation of about one, and at the whole reach that costs half as much again as doing nothing, so
+    that it learns to survive its own noise. Who explores less may ask for more."""
 
     def __post_init__(self) -> None:
         """Turn the duration into a horizon, and check every field."""

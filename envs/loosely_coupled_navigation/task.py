@@ -69,8 +69,10 @@ class LooselyCoupledNavigation(Task):
 
     ### Rewards
 
-    ``-30 log(1 + x / 30)``, x the squared error of position, summed over the axes, over the nominal variance of a
-    measurement (``N / sampling_interval``), in units of 0.15, what the paper's plain scheme is charged on average.
+    By default ("log-relative") ``log(1 + x0) - log(1 + x)``, x the squared error of position, summed over the axes, over
+    the nominal variance of a measurement (``N / sampling_interval``), in units of 0.15, what the paper's plain scheme is
+    charged on average, and x0 that of the action zero on the same noise. Outages and jamming rule the mean of x and are
+    nobody's merit. "cost" is ``-30 log(1 + x / 30)``.
 
     ### Starting State
 
@@ -93,7 +95,7 @@ class LooselyCoupledNavigation(Task):
     """
 
     id = ID
-    interface = 2
+    interface = 3
     paper_source = (
         "A. S. Benkafo, A. A. Lobaty, Features of application of Kalman-Bucy filters in orientation and "
         "navigation complexes (in Russian)"
@@ -104,13 +106,19 @@ class LooselyCoupledNavigation(Task):
     live_input = PositionInput
     actions = {
         "noise": "what the augmented filter takes the variances of its noises to be, over the modelled ones: "
-        "`receiver_scale` to the power of a positive, `receiver_reduction` to that of a negative action for the "
-        "receiver, `process_scale` for the coloured and the white rate error; **0 is the paper's augmented filter**",
+        "`receiver_scale` to the power of r times a positive, `receiver_reduction` to that of a negative action for the "
+        "receiver, `process_scale` for the coloured and the white rate error, r = 0.1 (`noise_reach`); **0 is the paper's "
+        "augmented filter**",
         "gain": "gain of this sample, logarithmic from the settled gain of the paper's reduced tuning (0.042, "
         "`K = 4.2 1/s`) at 0 to 1 at +1 (GNSS only) and to `smallest_gain` just above -1; exactly 0 (INS only) at "
         "-1. In continuous time `K = gain / sampling_interval`; **0 is the paper's plain scheme**",
         "mode": "the filter that is believed: plain-white, plain-reduced, augmented",
         "weights": "weights of the three estimates, normalised; all zero is uniform",
+    }
+    reach = {
+        "noise": ("noise_reach", "receiver_scale", "receiver_reduction", "process_scale"),
+        "gain": ("smallest_gain",),
+        "kalman-net": ("receiver_scale", "receiver_reduction", "process_scale"),
     }
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": SchemeBank, "weights": SchemeBank}
     trained_banks = {"kalman-net": KalmanNetBank}
@@ -120,6 +128,8 @@ class LooselyCoupledNavigation(Task):
     start_measurements = 50
     cost_description = "squared error of position over the nominal variance of a measurement"
     reward_unit = 0.15
+    # Few outages rule the mean of the error, and the deviation of a return is three times its mean.
+    reward = "log-relative"
     paper_policy = PaperPolicy("gain", (0.0,))
 
     parameters: LooselyCoupledNavigationParameters

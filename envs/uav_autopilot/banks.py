@@ -321,14 +321,15 @@ class NoiseBank(_AutopilotFilter):
         return Block("action", lambda f, _: f.action, "last action", ("process", *self.task.sensors))
 
     def decode_action(self, action: Array) -> tuple[Array, Array]:
-        """Scale the process noise by ``10 ** (process_decades a)``."""
-        xp = self.xp
+        """Scale the process noise by ``10 ** (noise_reach process_decades a)``."""
+        xp, p = self.xp, self.parameters
         shown = xp.clip(xp.astype(action, xp.float64), -1.0, 1.0)
-        return shown, xp.exp(shown[0] * (self.parameters.process_decades * math.log(10.0)))
+        return shown, xp.exp(shown[0] * (p.noise_reach * p.process_decades * math.log(10.0)))
 
     def sensor_variances(self, shown: Array) -> Array:
-        """Nominal ones times ``10 ** (2 sensor_decades a)``."""
-        scale = self.xp.exp(shown[1:] * (2.0 * self.parameters.sensor_decades * math.log(10.0)))
+        """Nominal ones times ``10 ** (2 noise_reach sensor_decades a)``."""
+        p = self.parameters
+        scale = self.xp.exp(shown[1:] * (2.0 * p.noise_reach * p.sensor_decades * math.log(10.0)))
         return self.nominal_variances * scale
 
 

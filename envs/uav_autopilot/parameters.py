@@ -147,10 +147,14 @@ class UavAutopilotParameters(TaskParameters):
     circle for every positive scale, so the value is what is useful, and no more, because an agent that explores
     over decades learns to shun them. The limit is half the digits of a number."""
     process_decades: float = parameter(1.5, above=0.0, at_most=8.0)
-    """Decades by which an action of one scales the process noise under control ``noise``. Ours: what levels from 0.2 to
+    """Decades by which an action can scale the process noise under control ``noise``. Ours: what levels from 0.2 to
     5 are worth, and a little more."""
     sensor_decades: float = parameter(0.8, above=0.0, at_most=4.0)
-    """Decades by which it scales the standard deviation of a sensor. Ours: the largest factor of ``random``."""
+    """Decades by which it can scale the standard deviation of a sensor. Ours: the largest factor of ``random``."""
+    noise_reach: float = parameter(0.2, above=0.0, at_most=1.0)
+    """Share of these two that an action of one has under control ``noise``. Ours: a policy that has just been made
+    explores with a standard deviation of about one, and at the whole reach that costs several times what the paper's
+    filter costs, so that it learns to survive its own noise. Who explores less may ask for more."""
     wide_band_scale: float = parameter(100.0, above=0.0)
     """Scale of the process noise in mode "wide-band"."""
     over_smoothed_scale: float = parameter(0.01, above=0.0)

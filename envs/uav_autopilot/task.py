@@ -100,7 +100,7 @@ class UavAutopilot(Task):
     """
 
     id = ID
-    interface = 3
+    interface = 4
     paper_source = (
         "Y. V. Gridnev, A. Y. Rusetski, S. A. Rak, Stochastic simulation of the automatic control systems of "
         "unmanned aircraft using optimal Kalman filter"
@@ -109,14 +109,15 @@ class UavAutopilot(Task):
     World = AircraftWorld
     live_input = SensorInput
     actions = {
-        "noise": "the process noise Q of the filter is scaled by 10^(1.5 a) (`process_decades`), the standard deviation of "
-        "each sensor by 10^(0.8 a) (`sensor_decades`), in the update by the measurement that was just shown; "
-        "**0 is the paper's filter**",
+        "noise": "the process noise Q of the filter is scaled by 10^(1.5 r a) (`process_decades`), the standard deviation of "
+        "each sensor by 10^(0.8 r a) (`sensor_decades`), r = 0.2 (`noise_reach`), in the update by the measurement that "
+        "was just shown; **0 is the paper's filter**",
         "gain": "the process noise Q of the filter is scaled by 10^(a/2) (`gain_decades` = 0.5) in the "
         "update by the measurement that was just shown; **0 is the paper's filter**",
         "mode": "0 nominal; 1 wide-band, Q times 100; 2 raw sensors: the same L on the readings (held "
         "during dropouts), zero for coordinates without a sensor; the filter runs on behind; 3 over-smoothed, Q over 100",
     }
+    reach = {"noise": ("noise_reach", "process_decades", "sensor_decades"), "gain": ("gain_decades",)}
     banks = {"noise": NoiseBank, "gain": GainBank, "mode": ModeBank}
     scenarios = SCENARIOS
     components = COORDINATES["U"]

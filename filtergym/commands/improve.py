@@ -129,7 +129,7 @@ def train(
         Path | None, typer.Option(help="YAML file of settings, in rl-zoo3's form or with keys env and algo.")
     ] = None,
     reward: Annotated[
-        str | None, typer.Option(help="cost, log-likelihood, cost-and-likelihood or relative.")
+        str | None, typer.Option(help="cost, log-likelihood, cost-and-likelihood, relative or log-relative.")
     ] = None,
     residual_to: Annotated[
         str, typer.Option(metavar="POLICY", help="Policy of the environment that the agent corrects.")
