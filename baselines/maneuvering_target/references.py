@@ -34,10 +34,7 @@ class KnownTurn(KalmanModel):
     """
 
     kind = "reference"
-    knows = (
-        "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every "
-        "measurement; of a flight given by positions the acceleration from scan to scan"
-    )
+    knows = "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every scan"
 
     def start(self, initial: Initial, truth: Truth) -> TurnMemory:
         """Start where everyone starts."""
