@@ -107,8 +107,12 @@ def log_mixture_density(log_weights: Array, log_likelihood: Array) -> Array:
         log_weights: of the components, ``(M, N)``; the weights sum to one.
         log_likelihood: logarithms of their densities, ``(M, N)``.
     """
-    xp = namespace(log_likelihood)
-    logarithms = log_weights + log_likelihood
+    return log_sum(log_weights + log_likelihood)
+
+
+def log_sum(logarithms: Array) -> Array:
+    """Logarithm of the sum over the first axis of what has these logarithms, ``(M, ...)``."""
+    xp = namespace(logarithms)
     largest = xp.max(logarithms, axis=0)
     return largest + xp.log(ordered_sum(xp.exp(logarithms - largest)))
 

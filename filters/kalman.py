@@ -115,3 +115,26 @@ def white_acceleration(T: float, sigma: float, axes: int = 1) -> tuple[list[list
         for i in range(n)
     ]
     return F, Q
+
+
+def constant_acceleration(T: Array, axes: int = 1) -> Array:
+    """Transition matrices of constant acceleration for the state (positions, velocities, accelerations).
+
+    ``F = [[I, T I, T^2/2 I], [0, I, T I], [0, 0, I]]``; Bar-Shalom, Li and Kirubarajan, section 6.2.3.
+
+    Args:
+        T: intervals, s, ``(N,)``.
+        axes: number of coordinates.
+
+    Returns:
+        ``(3 axes, 3 axes, N)``.
+    """
+    xp, zero = namespace(T), 0.0 * T
+    derivatives = [1.0 + zero, T, 0.5 * T**2]
+    size = range(3 * axes)
+    return xp.stack(
+        [
+            xp.stack([derivatives[(j - i) // axes] if j >= i and (j - i) % axes == 0 else zero for j in size])
+            for i in size
+        ]
+    )

@@ -44,6 +44,12 @@ def transpose(A: Array) -> Array:
     return namespace(A).moveaxis(A, 0, 1)
 
 
+def mirror_lower(A: Array) -> Array:
+    """Symmetric matrix, ``(n, n, ...)``, of the lower triangle of another: rounding makes products differ in both."""
+    xp, rows = namespace(A), range(A.shape[0])
+    return xp.stack([xp.stack([A[max(i, j), min(i, j)] for j in rows]) for i in rows])
+
+
 def outer(x: Array, y: Array) -> Array:
     """Return ``x y^T``, ``(n, m, ...)``, of vectors ``(n, ...)`` and ``(m, ...)``."""
     return x[:, None] * y[None]

@@ -7,6 +7,7 @@ from ...envs.maneuvering_target.world import Measurement, RadarWorld, Truth
 from ...envs.observation import Array
 from ...evaluation.competitors import Likelihood
 from ...filters import bounds, kalman, polar
+from ...filters.small_matrices import apply
 from .estimators import KalmanModel
 
 
@@ -15,38 +16,53 @@ class TurnMemory(NamedTuple):
 
     mean: Array
     covariance: Array
-    velocity: Array
-    """True one at the last scan, ``(2, N)``."""
+    truth: Truth
+    """At the last scan."""
 
 
 class KnownTurn(KalmanModel):
-    """A Kalman filter that is told in which scans the target manoeuvres, not how.
+    """The Kalman filter that is told the manoeuvres of the episode: the optimal one, given these.
 
-    Inside a manoeuvre its acceleration noise is as large as the manoeuvre's acceleration, elsewhere zero.
+    It knows when each begins and ends and what it is: the acceleration of thrust, the rate of a turn. Then nothing
+    disturbs the flight. With x the state, z what is told of the target and F the transition that turns a deviation of
+    the velocity as the target turns (:meth:`.Course.carry`), the errors obey ``x(k) - z(k) = F (x(k-1) - z(k-1))``: its
+    prediction is ``x' = F x + (z(k) - F z(k-1))``, whose second term is the effect of thrust alone and zero in a turn.
+    Of the measurements it is told the variances at the true position, and in which scans there is glint.
+
+    Of flights that are tables, such as those of aircraft, nobody knows turn rates: there it is told the acceleration
+    from scan to scan, which is thrust.
     """
 
     kind = "reference"
-    knows = "the scans of every manoeuvre and the size of its acceleration"
+    knows = "when every manoeuvre begins and ends, its acceleration or turn rate, and the variance of every scan"
 
     def start(self, initial: Initial, truth: Truth) -> TurnMemory:
         """Start where everyone starts."""
-        return TurnMemory(*initial, truth.velocity)
+        return TurnMemory(*initial, truth)
 
     def update(
         self, measurement: Measurement, truth: Truth, memory: TurnMemory
     ) -> tuple[Array, Array, TurnMemory, Likelihood]:
-        """Predict with the noise of this scan and update with its measurement.
-
-        The acceleration is the change of the velocity since the scan before, as large along x as along y.
-        """
-        T = measurement.interval
-        F, unit = self.motion(T)
-        change = (truth.velocity - memory.velocity) / T
-        variance = 0.5 * (change[0] ** 2 + change[1] ** 2)
-        result = self.update_estimate(
-            kalman.predict(memory.mean, memory.covariance, F, variance * unit), measurement
+        """Predict with what is known of the flight since the scan before, and update with the measured position."""
+        xp, world = self.xp, self.task.world
+        assert isinstance(world, RadarWorld)
+        early = None
+        if truth.scans is not None and memory.truth.scans is not None:
+            early = memory.truth.scans.early, truth.scans.early
+        one = xp.ones_like(truth.scan)
+        identity = xp.stack([xp.stack([one, 0.0 * one]), xp.stack([0.0 * one, one])])
+        columns = [world.course.carry(truth.flight, truth.scan, early, identity[i]) for i in range(2)]
+        by_velocity = xp.stack([xp.concat(column) for column in columns], axis=1)
+        F = xp.concat([xp.concat([identity, 0.0 * identity]), by_velocity], axis=1)
+        before, now = (xp.concat([state.position, state.velocity]) for state in (memory.truth, truth))
+        predicted = kalman.predict(memory.mean, memory.covariance, F, 0.0 * F, now - apply(F, before))
+        variance = polar.cartesian_variances(
+            truth.position, self.task.parameters.range_sigma, world.bearing_sigma
         )
-        memory = TurnMemory(result.mean, result.covariance, truth.velocity)
+        if truth.error_factor is not None:
+            variance = truth.error_factor**2 * variance
+        result = self.update_estimate(predicted, measurement._replace(variance=variance))
+        memory = TurnMemory(result.mean, result.covariance, truth)
         return result.mean, result.covariance, memory, self.likelihood(measurement, *result[2:])
 
 

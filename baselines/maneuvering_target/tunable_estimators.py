@@ -3,19 +3,30 @@
 Deviations and small probabilities are searched by their logarithm: their sizes are not known beforehand.
 """
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from math import log10
 from typing import Any
 
-from ..table import tunable, without_logarithms
+from ..table import Variant, tunable, without_logarithms
 from .adaptive_estimators import SageHusa, VariationalBayes, VariationalBayesPrediction
 from .estimators import KalmanInteractingMultipleModel, KalmanTurnInteractingMultipleModel, UnscentedTurn
+from .semi_markov import TRAINING_PRIOR, VAGUE_PRIOR, SemiMarkov
 
 Settings = tuple[dict[str, Any], Callable[[Any], Any]]
+
+SEMI_MARKOV_VAGUE = Variant(
+    SemiMarkov,
+    "The semi-Markov Gaussian sum with one vague prior for all flights: manoeuvres twice as often as in training, of "
+    "any length, disturbed, and measurements that may be outliers.",
+    **VAGUE_PRIOR,
+)
 
 ESTIMATORS = {
     "kalman-imm": KalmanInteractingMultipleModel,
     "kalman-imm-turn": KalmanTurnInteractingMultipleModel,
+    "semi-markov": SemiMarkov,
+    "semi-markov-vague": SEMI_MARKOV_VAGUE,
     "unscented-turn": UnscentedTurn,
     "sage-husa": SageHusa,
     "variational-bayes": VariationalBayes,
@@ -39,6 +50,32 @@ def _imm_turn(values: Mapping[str, float]) -> Settings:
         v["turn_rate_change"],
         [1.0 - v[f"leave_{mode}"] for mode in modes],
     )
+
+
+def _semi_markov(
+    make: Callable[..., Any], hazards: Sequence[float]
+) -> Callable[[Mapping[str, float]], Settings]:
+    def apply(values: Mapping[str, float]) -> Settings:
+        v = without_logarithms(values)
+        gentle, steep, leave = (v.pop(name) for name in ("turn_gentle", "turn_steep", "leave"))
+        prior = {"turns": (gentle, steep), "hazards": (*hazards[:-1], leave), **v}
+        return {}, functools.partial(make, **prior)
+
+    return apply
+
+
+def _semi_markov_limits(prior: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
+    return {
+        "log10_begin": (-3.0, log10(prior["begin"]), -1.0),
+        "turning": (0.1, prior["turning"], 0.9),
+        "log10_leave": (-1.5, log10(prior["hazards"][-1]), -0.3),
+        "log10_thrust": (0.0, log10(prior["thrust"]), 1.0),
+        "turn_gentle": (0.5, prior["turns"][0], 3.0),
+        "turn_steep": (3.0, prior["turns"][1], 7.0),
+        "turn_spread": (0.3, prior["turn_spread"], 2.0),
+        "log10_noise": (-3.0, log10(prior["noise"]), 0.0),
+        "log10_change": (-3.0, log10(prior["change"]), 0.0),
+    }
 
 
 _TURN_RATES = {
@@ -65,6 +102,16 @@ TUNABLE = {
         log10_leave_quiet=(-3.0, log10(0.05), -1.0),
         log10_leave_noisy=(-3.0, log10(0.2), -0.5),
         log10_leave_turn=(-3.0, log10(0.2), -0.5),
+    ),
+    "semi-markov": tunable(
+        SemiMarkov,
+        _semi_markov(SemiMarkov, TRAINING_PRIOR["hazards"]),
+        **_semi_markov_limits(TRAINING_PRIOR),
+    ),
+    "semi-markov-vague": tunable(
+        SEMI_MARKOV_VAGUE,
+        _semi_markov(SEMI_MARKOV_VAGUE, VAGUE_PRIOR["hazards"]),
+        **_semi_markov_limits(VAGUE_PRIOR),
     ),
     "unscented-turn": tunable(UnscentedTurn, log10_acceleration=(-1.5, log10(0.3), 1.0), **_TURN_RATES),
     "sage-husa": tunable(

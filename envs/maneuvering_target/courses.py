@@ -11,6 +11,7 @@ from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 from ...filters import coordinated_turn
+from ...filters.array_namespace import namespace
 from ...filters.ordered_sums import ordered_sum
 from ..draws import Draws
 from ..observation import Array
@@ -60,6 +61,25 @@ class Course(ABC):
             on_time: motion when this one would have.
         """
         return self.advance(flight, scan - early, before)
+
+    def carry(self, flight: Any, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
+        """Carry a deviation of the velocity from the scan before to a scan: what it has become, and where it has led.
+
+        Turns are at a rate and thrust is an acceleration, so that a turn turns the deviation, too, and thrust does not.
+        Here, where no turn rates are known, the target is as if thrust moved it.
+
+        Args:
+            flight: of :meth:`begin`.
+            scan: its number.
+            early: shares of the scan period by which the scan before and this one come early, ``(N,)`` each; None where
+                none does.
+            velocity: the deviation at the scan before, m/s, ``(2, N)``.
+
+        Returns:
+            Deviations of position and velocity.
+        """
+        before, now = early or (0.0, 0.0)
+        return (self.parameters.sampling_interval * (1.0 + (before - now))) * velocity, velocity
 
     def context(self, flight: Any, scan: Array, time: Array) -> dict[str, Array]:
         """What the context tells of the flight.
@@ -132,6 +152,24 @@ class Maneuvered(Course):
         )
         position, velocity = after(time, turn, before, self.task)
         return position + (0.5 * time * time) * acceleration, velocity + time * acceleration
+
+    def carry(
+        self, flight: Maneuvers, scan: Array, early: tuple[Array, Array] | None, velocity: Array
+    ) -> Motion:
+        """Turn it at the rates of the two scan periods in which the interval lies."""
+        if not self.turns:
+            return super().carry(flight, scan, early, velocity)
+        nowhere = 0.0 * velocity
+        if early is None:
+            still = flight._replace(effect=self._without_thrust(flight.effect))
+            return self.advance(still, scan, (nowhere, velocity))
+        T, (before, now) = self.parameters.sampling_interval, early
+        rates = [self._pick(flight, flight.turn, number) / T for number in (scan - 1.0, scan)]
+        motion = after(T * before, rates[0], (nowhere, velocity), self.task)
+        return after(T * (1.0 - now), rates[1], motion, self.task)
+
+    def _without_thrust(self, effect: Array) -> Array:
+        return self.xp.concat([effect[:4], 0.0 * effect[4:]])
 
     def _pick(self, flight: Maneuvers, values: Array, scan: Array) -> Array:
         """Values ``(..., manoeuvres, N)`` of the manoeuvre that is flown in the scan period that ends with a scan."""
@@ -276,6 +314,13 @@ class Legs(NamedTuple):
         return self.begins[:, 1]
 
 
+def _times(one: Array, other: Array) -> Array:
+    """Product of vectors ``(2, N)`` taken for complex numbers."""
+    return namespace(one).stack(
+        [one[0] * other[0] - one[1] * other[1], one[0] * other[1] + one[1] * other[0]]
+    )
+
+
 class LegCourse(Course):
     """Stated legs, with start, course, side and times drawn around the stated ones."""
 
@@ -311,6 +356,17 @@ class LegCourse(Course):
         now = self.parameters.sampling_interval * scan
         leg = Steps(flight.begins, flight.time[1:]).at(now, self.xp)
         return after(now - leg[0], leg[1], (leg[2:4], leg[4:]), self.task)
+
+    def carry(self, flight: Legs, scan: Array, early: tuple[Array, Array] | None, velocity: Array) -> Motion:
+        """Turn and stretch it as the target's velocity and way: on straight legs and turns both are proportional."""
+        before, now = early or (0.0, 0.0)
+        (position, flown), (there, afterwards) = (
+            self.advance(flight, time, (velocity, velocity)) for time in (scan - 1.0 - before, scan - now)
+        )
+        square = ordered_sum(flown * flown)
+        square = self.xp.where(square > 0.0, square, 1.0)
+        deviation = _times(self.xp.stack([flown[0], -flown[1]]) / square, velocity)
+        return _times(there - position, deviation), _times(afterwards, deviation)
 
     def context(self, flight: Legs, scan: Array, time: Array) -> dict[str, Array]:
         """Where legs begin (s), their turn rates (rad/s), and whether the target turns now."""

@@ -28,6 +28,8 @@ class Truth(NamedTuple):
     """What the course has drawn; None where it draws nothing."""
     scans: Reliability | None
     """None where every scan comes on time and sees the target."""
+    error_factor: Array | None = None
+    """Standard deviation of this scan's errors over that of usual ones, ``(N,)``; None where there is no glint."""
 
 
 class Odometry(NamedTuple):
@@ -98,7 +100,8 @@ class RadarWorld(World[Task, Truth, Measurement]):
         diagonal = xp.concat([variance, (2.0 / p.sampling_interval**2) * variance])
         identity = xp.eye(4, dtype=diagonal.dtype, device=diagonal.device)[:, :, None]
         scans = self.scans.begin(draws, (position, velocity))
-        truth = Truth(0.0 * ones, position, velocity, flight, scans)
+        factor = ones if p.glint_probability else None
+        truth = Truth(0.0 * ones, position, velocity, flight, scans, factor)
         return truth, Initial(xp.concat([start, start_velocity]), identity * diagonal)
 
     def advance(self, truth: Truth, noise: Array, feedback: None) -> tuple[Truth, Measurement]:
@@ -108,14 +111,18 @@ class RadarWorld(World[Task, Truth, Measurement]):
         before, glint = (truth.position, truth.velocity), uniforms[self.scans.row_uniforms :]
         scans, scan = self.scans.advance(truth.scans, flight, number, before, uniforms)
         (position, velocity), available = scan.motion, scan.available
-        measured = self._measure(position, self.glint.amplify(errors, glint, self.xp))
+        factor = None
+        if p.glint_probability:
+            factor = self.glint.amplify(self.xp.ones_like(number), glint, self.xp)
+            errors = factor * errors
+        measured = self._measure(position, errors)
         variance = self._variances(measured)
         if not p.regular:
             seen = available > 0.0
             measured = self.xp.where(seen, measured, 0.0)
             variance = self.xp.where(seen, variance, p.range_sigma**2)
         return (
-            Truth(number, position, velocity, flight, scans),
+            Truth(number, position, velocity, flight, scans, factor),
             Measurement(number, measured, variance, available, scan.interval, scan.elapsed),
         )
 

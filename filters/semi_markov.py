@@ -1,0 +1,156 @@
+r"""Gaussian sums over hypotheses of kind and age: switching that depends on how long a mode has lasted.
+
+A Markov chain forgets how long its mode has lasted, so that dwell times are geometric. In a semi-Markov chain they
+have any distribution f(d), d = 1, 2, ... steps, and a mode of age d ends with its **hazard**
+
+    h(d) = f(d) / sum_{i >= d} f(i)                                                                            (1)
+
+before the next step. Kind and age together are Markov again. What is unknown of a mode (an acceleration, a turn rate)
+is constant while it lasts, so each hypothesis has a filter of its own, conditional on when its mode began; the filters
+are not mixed. With p the probabilities after the last measurement, before the next
+
+    p'(kind, d + 1) = (1 - h(d)) p(kind, d)                                                                    (2)
+    e = sum_kinds sum_d h(d) p(kind, d)                                 modes that end                         (3)
+    p'(kind, 1) = b(kind) (e + sum_d p(rest, d))                        modes that begin                       (4)
+    p'(rest, 1) = (1 - b) e,  p'(rest, d + 1) = (1 - b) p(rest, d),  b = sum_kinds b(kind)                     (5)
+
+where "rest" is what the target does between modes. The exact Gaussian sum grows without end; here all hypotheses of one
+kind and age are one Gaussian with their mean and covariance, and the last age of a table stands for all beyond it. A
+table of fixed size needs no sorting.
+
+L. Campo, P. Mookerjee and Y. Bar-Shalom, State estimation for systems with sojourn-time-dependent Markov model
+switching, IEEE Trans. Automatic Control 36 (1991), 238-243, with the merging of H. A. P. Blom and Y. Bar-Shalom, The
+interacting multiple model algorithm, ibid. 33 (1988), 780-783.
+
+Shapes: means ``(n, H, N)``, covariances ``(n, n, H, N)``, probabilities ``(H, N)``, H hypotheses by age.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from . import imm, packed_covariance
+from .array_namespace import Array, namespace
+from .ordered_sums import ordered_sum
+
+LEAST_PROBABILITY = 1e-30
+"""Of a hypothesis: it can always come back, and weights of what is merged are never zero by zero."""
+
+
+class Hypotheses(NamedTuple):
+    """Hypotheses of one kind, by age."""
+
+    mean: Array
+    """``(n, H, N)``."""
+    covariance: Array
+    """``(n, n, H, N)``."""
+    probability: Array
+    """``(H, N)``."""
+
+    def take(self, ages: slice, state: int | None = None) -> "Hypotheses":
+        """Return those of some ages, with the first components of their states."""
+        return Hypotheses(
+            self.mean[:state, ages], self.covariance[:state, :state, ages], self.probability[ages]
+        )
+
+    def pack(self) -> "Hypotheses":
+        """Return them with the lower triangles of their covariances, as memory keeps them."""
+        return self._replace(covariance=packed_covariance.pack(self.covariance))
+
+    def unpack(self) -> "Hypotheses":
+        """Undo :meth:`pack`."""
+        return self._replace(covariance=packed_covariance.unpack(self.covariance, self.mean.shape[0]))
+
+
+def hazards(durations: Sequence[float], ages: int) -> list[float]:
+    """Probabilities (1) that a mode ends after each age of a table.
+
+    The last age stands for all beyond it: dwell times go on geometrically with the mean that they have from there.
+
+    Args:
+        durations: f(1), f(2), ..., relative to each other, more than ``ages``.
+        ages: hypotheses of the table.
+    """
+    exact = [durations[d] / sum(durations[d:]) for d in range(ages - 1)]
+    rest = durations[ages - 1 :]
+    return [*exact, sum(rest) / sum((d + 1) * f for d, f in enumerate(rest))]
+
+
+def join(tables: Sequence[Hypotheses]) -> Hypotheses:
+    """Hypotheses of several tables, whose states are of the same size, one table after another."""
+    xp = namespace(tables[0].mean)
+    return Hypotheses(
+        xp.concat([table.mean for table in tables], axis=1),
+        xp.concat([table.covariance for table in tables], axis=2),
+        xp.concat([table.probability for table in tables]),
+    )
+
+
+def merge(hypotheses: Hypotheses) -> Hypotheses:
+    """One hypothesis with the probability, mean and covariance of several together."""
+    total = ordered_sum(hypotheses.probability)
+    mean, covariance = imm.combine(hypotheses.mean, hypotheses.covariance, hypotheses.probability / total)
+    return Hypotheses(mean[:, None], covariance[:, :, None], total[None])
+
+
+def grow_older(table: Hypotheses, begun: Hypotheses) -> Hypotheses:
+    """Table one step later: each hypothesis is of the next age, and the last two together are of the last.
+
+    Args:
+        table: before.
+        begun: the hypothesis of the first age.
+    """
+    if table.probability.shape[0] == 1:
+        return merge(join([begun, table]))
+    return join([begun, table.take(slice(None, -2)), merge(table.take(slice(-2, None)))])
+
+
+class Mode(NamedTuple):
+    """A kind of mode and its hypotheses."""
+
+    table: Hypotheses
+    hazard: Array
+    """(1), ``(H, 1)``."""
+    begin: float
+    """Probability (4) that one begins before a step."""
+    augment: Callable[[Array, Array], tuple[Array, Array]]
+    """From mean ``(4, N)`` and covariance of the state at rest to those of the mode that begins."""
+
+
+def switch(rest: Hypotheses, modes: Sequence[Mode]) -> tuple[Hypotheses, list[Hypotheses]]:
+    """Let modes end, begin and grow older, equations (2) to (5).
+
+    Args:
+        rest: hypotheses of what the target does between modes.
+        modes: kinds of modes; the first components of their states are those at rest.
+
+    Returns:
+        The tables of rest and of the modes, before the time update.
+    """
+    n = rest.mean.shape[0]
+    rest, modes = _keep_possible(rest), [mode._replace(table=_keep_possible(mode.table)) for mode in modes]
+    begin = sum(mode.begin for mode in modes)
+    everything = slice(None)
+    ended = merge(
+        join(
+            [
+                mode.table._replace(probability=mode.hazard * mode.table.probability).take(everything, n)
+                for mode in modes
+            ]
+        )
+    )
+    ready = merge(join([ended, rest]))
+    tables = []
+    for mode in modes:
+        mean, covariance = mode.augment(ready.mean[:, 0], ready.covariance[:, :, 0])
+        begun = Hypotheses(mean[:, None], covariance[:, :, None], mode.begin * ready.probability)
+        lasting = mode.table._replace(probability=(1.0 - mode.hazard) * mode.table.probability)
+        tables.append(grow_older(lasting, begun))
+    older = grow_older(rest, ended)
+    older = older._replace(probability=(1.0 - begin) * older.probability)
+    return _keep_possible(older), [_keep_possible(table) for table in tables]
+
+
+def _keep_possible(table: Hypotheses) -> Hypotheses:
+    """Give every hypothesis the least probability, whether a measurement or the hazard has ruled it out."""
+    probability = namespace(table.mean).clip(table.probability, LEAST_PROBABILITY, None)
+    return table._replace(probability=probability)

@@ -1,0 +1,226 @@
+"""The semi-Markov Gaussian sum: its dwell times, its update with outliers, and all sequences of modes enumerated."""
+
+import math
+
+import numpy as np
+import pytest
+from filtergym.baselines.maneuvering_target.semi_markov import SLOWEST, VAGUE_PRIOR, SemiMarkov
+from filtergym.evaluation.rollout import rollout
+from filtergym.evaluation.seeds import episode_seeds
+from filtergym.filters import contaminated_normal, coordinated_turn, kalman, semi_markov
+from models import make_model
+from scipy.stats import multivariate_normal
+
+ID = "filtergym/ManeuveringTarget-v0"
+T, LANES = 6.0, 8
+
+
+def test_hazards_give_the_durations_back():
+    f = np.array([0.0, 0.2, 0.5, 0.1, 0.15, 0.05])
+    hazard = semi_markov.hazards(list(f), 4)
+    survives = np.cumprod([1.0, *(1.0 - np.array(hazard[:3]))])
+    np.testing.assert_allclose(survives[:3] * hazard[:3], f[:3], rtol=1e-14)
+    # From the fourth step on geometric, with the mean 1 / h of what is left.
+    left = (1 * 0.1 + 2 * 0.15 + 3 * 0.05) / 0.3
+    assert hazard[3] == pytest.approx(1.0 / left, rel=1e-14)
+
+
+def random_gaussian(rng, n):
+    root = rng.normal(size=(n, n))
+    return rng.normal(size=n), root @ root.T + 0.1 * np.eye(n)
+
+
+def moments(weights, means, covariances):
+    """Of a mixture."""
+    x = sum(w * m for w, m in zip(weights, means, strict=True))
+    spread = (w * (P + np.outer(m - x, m - x)) for w, m, P in zip(weights, means, covariances, strict=True))
+    return x, sum(spread)
+
+
+@pytest.mark.parametrize("n", [4, 6])
+@pytest.mark.parametrize(("probability", "factor"), [(0.0, 5.0), (0.1, 5.0), (0.5, 2.0)])
+def test_update_with_outliers_is_two_kalman_updates_merged(n, probability, factor):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        mean, covariance = random_gaussian(rng, n)
+        z, variance = 2.0 * rng.normal(size=2), rng.uniform(0.1, 2.0, size=2)
+        found = contaminated_normal.update_position(
+            mean[:, None], covariance[..., None], z[:, None], variance[:, None], probability, factor
+        )
+        updates, weights = [], []
+        for scale, prior in ((1.0, 1.0 - probability), (factor, probability)):
+            R = scale**2 * np.diag(variance)
+            updates.append(kalman.update(mean[:, None], covariance[..., None], z[:, None], np.eye(2, n), R))
+            S = covariance[:2, :2] + R
+            weights.append(prior * multivariate_normal.pdf(z, mean[:2], S))
+        total = sum(weights)
+        weights = [w / total for w in weights]
+        x, P = moments(weights, [u.mean[:, 0] for u in updates], [u.covariance[..., 0] for u in updates])
+        np.testing.assert_allclose(found.mean[:, 0], x, rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(found.covariance[..., 0], P, rtol=1e-10, atol=1e-11)
+        assert found.log_likelihood[0] == pytest.approx(math.log(total), rel=1e-11)
+        nis = sum(w * u.squared_distance[0] for w, u in zip(weights, updates, strict=True))
+        assert found.squared_distance[0] == pytest.approx(nis, rel=1e-10)
+
+
+# --- every sequence of modes, each with its own filter
+
+
+def block_transition(dt, order):
+    """Of position, velocity and, of order three, acceleration."""
+    rows = [[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]]
+    return np.kron(np.array(rows)[:order, :order], np.eye(2))
+
+
+def padded(P, variances):
+    full = np.zeros((len(P) + len(variances),) * 2)
+    full[: len(P), : len(P)] = P
+    full[len(P) :, len(P) :] = np.diag(variances)
+    return full
+
+
+def squared_pace(x):
+    return max(x[2] ** 2 + x[3] ** 2, SLOWEST**2)
+
+
+def begun(filter, kind, x, P):
+    """State of a mode that begins, of position and velocity."""
+    if kind == "thrust":
+        return np.append(x, [0.0, 0.0]), padded(P, [filter.thrust**2] * 2)
+    pace = math.sqrt(squared_pace(x))
+    return np.append(x, kind / pace), padded(P, [(filter.turn_spread / pace) ** 2])
+
+
+def predicted(filter, kind, x, P, dt):
+    step = np.array([dt**2 / 2, dt])
+    Q = filter.noise**2 * np.kron(np.outer(step, step), np.eye(2))
+    change = filter.change**2 * dt / T
+    if kind == "rest":
+        F = block_transition(dt, 2)
+    elif kind == "thrust":
+        F, Q = block_transition(dt, 3), padded(Q, [change] * 2)
+    else:
+        F, Q = coordinated_turn.jacobian(x, dt), padded(Q, [change / squared_pace(x)])
+        return coordinated_turn.propagate(x, dt), F @ P @ F.T + Q
+    return F @ x, F @ P @ F.T + Q
+
+
+def enumerated(filter, initial, measurements, b):
+    """Posterior moments and log-likelihoods of all sequences of kinds and durations, none merged."""
+    hazard = filter.hazard[:, 0]
+    kinds = {"thrust": (1.0 - filter.turning) * filter.begin}
+    kinds |= {turn: filter.turning * filter.begin / len(filter.turns) for turn in filter.turns}
+    found = [(0.0, "rest", 0, initial.mean[:, b], initial.covariance[..., b])]
+    answers = []
+    for m in measurements:
+        branches = []
+        for log_weight, kind, age, x, P in found:
+            free = log_weight
+            if kind != "rest":
+                ends = hazard[min(age, len(hazard)) - 1]
+                if ends < 1.0:
+                    branches.append((log_weight + math.log(1.0 - ends), kind, age + 1, x, P))
+                if ends == 0.0:
+                    continue
+                free, x, P = log_weight + math.log(ends), x[:4], P[:4, :4]
+            branches.append((free + math.log(1.0 - filter.begin), "rest", 0, x, P))
+            for other, probability in kinds.items():
+                branches.append((free + math.log(probability), other, 1, *begun(filter, other, x, P)))
+        found = []
+        for log_weight, kind, age, x, P in branches:
+            x, P = predicted(filter, kind, x, P, m.interval[b])
+            if m.available[b]:
+                H, R = np.eye(2, len(x)), np.diag(m.variance[:, b])
+                S = H @ P @ H.T + R
+                log_weight += multivariate_normal.logpdf(m.position[:, b], x[:2], S)
+                K = P @ H.T @ np.linalg.inv(S)
+                x, P = x + K @ (m.position[:, b] - x[:2]), P - K @ S @ K.T
+            found.append((log_weight, kind, age, x, P))
+        logs = np.array([entry[0] for entry in found])
+        total = logs.max() + math.log(np.exp(logs - logs.max()).sum())
+        found = [(entry[0] - total, *entry[1:]) for entry in found]
+        x, P = moments(
+            [math.exp(e[0]) for e in found], [e[3][:4] for e in found], [e[4][:4, :4] for e in found]
+        )
+        answers.append((x, P, total))
+    return answers
+
+
+def answers_of(model, estimator, count):
+    """Start, measurements and answers of the first scans."""
+    given, answers = [], []
+
+    class Watched:
+        def start(self, initial, N):
+            given.append(initial)
+            return estimator.start(initial, N)
+
+        def update(self, measurement, memory):
+            mean, covariance, memory, likelihood = estimator.update(measurement, memory)
+            given.append(measurement)
+            answers.append((mean, covariance, likelihood.log_likelihood))
+            return mean, covariance, memory
+
+    for _ in rollout(model, Watched(), episode_seeds("train", 3, LANES)):
+        pass
+    return given[0], given[1 : count + 1], answers[:count]
+
+
+@pytest.fixture(scope="module", params=["regular", "irregular"])
+def model(request):
+    irregular = {"detection_probability": (0.6, 0.8), "scan_jitter": (0.8, 0.8)}
+    # Manoeuvres at once, so that a short horizon holds them.
+    free = {"horizon": 40, "maneuver_count": (3, 3)}
+    return make_model(ID, None, "random", **free, **(irregular if request.param == "irregular" else {}))
+
+
+def prior(**changed):
+    # Without outliers, which the enumeration leaves out, and with manoeuvres that are not rare.
+    return {"begin": 0.2, "noise": 0.05, "change": 0.1, "outliers": 0.0, **changed}
+
+
+def test_equals_the_enumeration_while_nothing_is_merged(model):
+    # Until a manoeuvre may have ended there is one straight flight that others may begin from.
+    filter = SemiMarkov(model.task, **prior(hazards=(0.0, 0.0, 0.0, 0.0, 0.3)))
+    initial, measurements, answers = answers_of(model, filter, 4)
+    for b in range(LANES):
+        for (x, P, total), (mean, covariance, log_likelihood) in zip(
+            enumerated(filter, initial, measurements, b), answers, strict=True
+        ):
+            # Positions of 60 km, in which the extended filter of the turn rounds.
+            np.testing.assert_allclose(mean[:, b], x, rtol=1e-9, atol=1e-6)
+            np.testing.assert_allclose(covariance[..., b], P, rtol=1e-7, atol=1e-5)
+            if not np.isnan(log_likelihood[b]):
+                assert log_likelihood[b] == pytest.approx(total, rel=1e-8, abs=1e-9)
+
+
+def test_stays_near_the_enumeration_where_it_merges(model):
+    # Manoeuvres end and begin again: what is merged differs only in when.
+    filter = SemiMarkov(model.task, **prior(begin=0.05, hazards=(0.0, 0.3, 0.4)))
+    initial, measurements, answers = answers_of(model, filter, 6)
+    distances, differences = [], []
+    for b in range(LANES):
+        for (x, P, total), (mean, _, log_likelihood) in zip(
+            enumerated(filter, initial, measurements, b), answers, strict=True
+        ):
+            distances.append((mean[:, b] - x) @ np.linalg.solve(P, mean[:, b] - x))
+            differences.append(0.0 if np.isnan(log_likelihood[b]) else log_likelihood[b] - total)
+    assert max(distances) > 1e-12  # something was merged
+    # What is added to the normalised squared error, of which the mean is four.
+    assert np.mean(distances) < 0.02
+    assert abs(np.mean(differences)) < 0.02
+
+
+def test_survives_what_its_prior_rules_out():
+    # Jumps of thousands of sigma leave no hypothesis a weight that a float64 can hold.
+    model = make_model(ID, None, "random", detection_probability=(1.0, 1.0), scan_jitter=(0.0, 0.0))
+    for settings in ({}, {"hazards": (0.0, 1.0)}, VAGUE_PRIOR):
+        filter = SemiMarkov(model.task, **settings)
+        initial, measurements, _ = answers_of(model, filter, 12)
+        memory = filter.start(initial, LANES)
+        for k, m in enumerate(measurements):
+            moved = m._replace(position=m.position + (1e6 if k % 5 == 4 else 0.0))
+            mean, covariance, memory, likelihood = filter.update(moved, memory)
+            assert np.isfinite(mean).all()
+            assert np.isfinite(likelihood.log_likelihood).all()
+            assert (np.linalg.eigvalsh(np.moveaxis(covariance, -1, 0)) > 0.0).all()
