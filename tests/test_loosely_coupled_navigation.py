@@ -246,6 +246,7 @@ def test_the_steered_filter_equals_a_naive_one_and_ends_are_exact():
         gain = said.available * np.where(
             a == -1, 0.0, np.where(a > 0, settled ** (1 - a), settled ** (1 + a) * 1e-5**-a)
         )
+        x = said.ins[0] - said.increment[0] if k == 0 else x
         before = x + said.increment[0]
         x = np.where(said.available > 0, (1 - gain) * before + gain * said.fix[0], before)
         v = (1 - gain) ** 2 * (v + 0.0036) + gain**2 * said.reported_deviation**2
@@ -398,7 +399,8 @@ def test_disturbances_stand_where_they_are_drawn():
             np.testing.assert_allclose(seen.truth.deviation, math.sqrt(2) * jammed, rtol=1e-14)
             np.testing.assert_allclose(said.reported_deviation, math.sqrt(2), rtol=1e-14)
             pull = np.where(inside & (name == "spoof-ramp"), 0.02 * (k - first + 1), 0.0)
-            fix = np.where(inside & (name == "outage"), 0.0, 2 * math.sin(0.008 * k) + pull)
+            fix = np.where(inside & (name == "outage"), 0.0, seen.truth.reference[0] + pull)
+            # Sums of three numbers of up to 100 m.
             np.testing.assert_allclose(said.fix[0], fix, atol=1e-12)
         # One row of a hundredth of a second is the rounding of start and end.
         p, windows = model.task.parameters, TASK.scenarios[name].windows
@@ -575,11 +577,11 @@ def test_what_is_shown_and_paid_does_not_depend_on_the_motion(control):
     drawn, actions = numbers(make("random"), 4, 100, 5), random_actions(make("random", control), 4, 100, 5)
     model = make("random", control)
     at_rest, moving = (
-        states(make("random", control, reference_amplitude=a), drawn, lambda k, s: actions[k])
-        for a in (0.0, 1000.0)
+        states(make("random", control, manoeuvre_acceleration=(a, a)), drawn, lambda k, s: actions[k])
+        for a in (0.0, 100.0)
     )
     for (seen, acted), (same, same_acted) in zip(at_rest, moving, strict=True):
-        # 1000 m in double precision, 100 steps, over a noise of centimetres.
+        # Hundreds of metres in double precision, 100 steps, over a noise of centimetres.
         np.testing.assert_allclose(model.observe(same), model.observe(seen), rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(model.cost(same_acted), model.cost(acted), rtol=1e-6, atol=1e-8)
 

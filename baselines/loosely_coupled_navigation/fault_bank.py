@@ -64,8 +64,15 @@ class FaultPrior(NamedTuple):
 
 TRAINING = FaultPrior()
 VAGUE = FaultPrior(
-    drift=(0.02, 5.0), intensity=(0.002, 10.0), onset=(0.0, math.inf), onset_rate=0.05, shortest=0.0, longest=4.0,
-    rate=3.0, level_rate=0.3, outlier=0.01,
+    drift=(0.02, 5.0),
+    intensity=(0.002, 10.0),
+    onset=(0.0, math.inf),
+    onset_rate=0.05,
+    shortest=0.0,
+    longest=3.0,
+    rate=3.0,
+    level_rate=0.3,
+    outlier=0.01,
 )
 
 
@@ -106,8 +113,7 @@ class FaultBank:
     kind = "estimator"
     traceable = True
 
-    def __init__(self, task: LooselyCoupledNavigation, prior: FaultPrior = TRAINING, shared=False, **changed: Any) -> None:
-        self.shared = shared
+    def __init__(self, task: LooselyCoupledNavigation, prior: FaultPrior = TRAINING, **changed: Any) -> None:
         self.prior = prior = prior._replace(**changed)
         p = self.parameters = task.parameters
         self.xp, self.step = task.xp, p.sampling_interval
@@ -142,10 +148,9 @@ class FaultBank:
         ins = AugmentedCovariance(many, many, many, many + self.drift**2, many, many + self.coloured**2)
         P = faults.FaultCovariance(ins, many, many, many, many)
         still = 0.0 * initial.mean[:, None, None] + many[None]
-        first = task_first(xp, M)
-        return Hypotheses(
-            still, still, still, still, P, self.ins_weights * first + many, self.fresh + none, none
-        )
+        unpulled = xp.concat([xp.ones((1, 1, 1)), xp.zeros((1, M - 1, 1))], axis=1)
+        weights = self.ins_weights * unpulled + many
+        return Hypotheses(still, still, still, still, P, weights, self.fresh + none, none)
 
     def change(self, h: Hypotheses, number: Array) -> tuple[Hypotheses, Array]:
         """End pulls and let others begin; hypotheses, and the age of each pull, s, ``(M, N)``, zero of the first."""
@@ -179,7 +184,9 @@ class FaultBank:
         (delta, drift, coloured), ins = merged
         zero = 0.0 * total
         P, old = h.covariance, h.covariance.ins
-        moved = AugmentedCovariance(*(replace(v, m, copy(v, v[..., 0, :])) for v, m in zip(old, ins, strict=True)))
+        moved = AugmentedCovariance(
+            *(replace(v, m, copy(v, v[..., 0, :])) for v, m in zip(old, ins, strict=True))
+        )
         covariance = faults.FaultCovariance(
             moved,
             *(replace(v, zero, xp.where(born, 0.0, v[:, 1:])) for v in P[1:4]),
@@ -246,18 +253,7 @@ class FaultBank:
             levels = xp.concat([R, wide[None]])
             q = xp.concat([(1.0 - prior.outlier) * chain, prior.outlier + 0.0 * chain[:1]])
         squares = ordered_sum(innovation * innovation)
-        if self.shared:
-            w0 = xp.reshape(h.weights, (-1, q.shape[-1]))
-            iv = xp.reshape(innovation, (axes, *w0.shape))
-            vv = xp.reshape(along.variance, w0.shape)
-            nb = ordered_sum(w0[i] * iv[:, i] for i in range(w0.shape[0]))
-            vb = ordered_sum(w0[i] * vv[i] for i in range(w0.shape[0]))
-            common = faults.weigh_levels(ordered_sum(nb * nb), axes, vb, levels, q)
-            Re = 1.0 / ordered_sum(common.responsibilities / levels)
-            g = 1.0 / (along.variance + Re)
-            noise = faults.NoiseMixture(-0.5 * squares * g + 0.5 * axes * xp.log(g), common.responsibilities[:, None, None] + 0.0 * g, g, 0.0 * g)
-        else:
-            noise = faults.weigh_levels(squares, axes, along.variance, levels[:, None, None], q[:, None, None])
+        noise = faults.weigh_levels(squares, axes, along.variance, levels[:, None, None], q[:, None, None])
 
         log_weights = log_probabilities(h.weights) + xp.where(there, noise.log_density, 0.0)
         flat = xp.reshape(log_weights, (-1, log_weights.shape[-1]))
@@ -294,14 +290,10 @@ class FaultBank:
         mean = ordered_sum(W[i] * each[:, i] for i in range(flat.shape[0]))
         own = ordered_sum(W * xp.reshape(P.ins.position, flat.shape))
         offsets = each - mean[:, None]
-        spread = ordered_sum(
-            W[i] * offsets[:, None, i] * offsets[None, :, i] for i in range(flat.shape[0])
-        )
+        spread = ordered_sum(W[i] * offsets[:, None, i] * offsets[None, :, i] for i in range(flat.shape[0]))
         S = ordered_sum(W * xp.reshape(along.variance, flat.shape)) + 1.0 / ordered_sum(chain / R)
         seen = xp.where(there, ordered_sum(innovation[:, 0, 0] ** 2) / S, math.nan)
-        likelihood = Likelihood(
-            xp.where(there, log_likelihood, math.nan), seen, axes * measurement.available
-        )
+        likelihood = Likelihood(xp.where(there, log_likelihood, math.nan), seen, axes * measurement.available)
         return measurement.ins - mean, self.eye * own + spread, memory, likelihood
 
 

@@ -66,7 +66,7 @@ class Matched:
         xp, still, zero = self.xp, 0.0 * initial.mean, 0.0 * truth.number
         drift, coloured = truth.drift_deviation, truth.coloured_step / self.sampling.coloured
         P = ins_gnss.AugmentedCovariance(zero, zero, zero, drift * drift, zero, coloured * coloured)
-        decay, kick = truth.receiver_process
+        decay, kick = truth.receiver_decay, truth.receiver_kick
         lost = 1.0 - decay * decay
         wandering = xp.where(lost > 0.0, kick * kick / xp.where(lost > 0.0, lost, 1.0), 0.0)
         covariance = receiver_faults.FaultCovariance(P, zero, zero, zero, wandering)
@@ -79,7 +79,7 @@ class Matched:
         xp, s = self.xp, self.sampling
         delta = memory.delta + s.step * memory.drift + s.drive * memory.coloured
         coloured = s.decay * memory.coloured
-        decay, kick = truth.receiver_process
+        decay, kick = truth.receiver_decay, truth.receiver_kick
         receiver = decay * memory.receiver
         P = receiver_faults.predict_fault(
             memory.covariance, s, truth.coloured_step**2, truth.white_step**2, decay, kick * kick

@@ -58,8 +58,10 @@ class Truth(NamedTuple):
     """Standard deviation of the receiver noise under jamming over that without, ``(N,)``."""
     spoofing_rate: Array
     """Rate at which every axis is pulled off, m/s, ``(N,)``."""
-    receiver_process: GaussMarkov
-    """Of the receiver's coloured error."""
+    receiver_decay: Array
+    """What is left of the receiver's coloured error from one measurement to the next, ``(N,)``."""
+    receiver_kick: Array
+    """Standard deviation of what it gains, m, ``(N,)``."""
     receiver_error: Array
     """That error, m, ``(A, N)``; zero where the task has none."""
     deviation: Array
@@ -148,6 +150,7 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         lasting = zeros[0] + draw_between(
             draws.log_uniform, "receiver_correlation_time", p.receiver_correlation_time
         )
+        receiver = GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp)
         truth = Truth(
             number=zeros[0],
             reference=reference,
@@ -169,7 +172,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
                 zeros[0] + draw_between(draws.log_uniform, "jamming_factor", p.jamming_factor)
             ),
             spoofing_rate=zeros[0] + draw_between(draws.uniform, "spoofing_rate", p.spoofing_rate),
-            receiver_process=GaussMarkov.sampled(coloured, lasting, p.sampling_interval, xp),
+            receiver_decay=receiver.decay,
+            receiver_kick=receiver.kick,
             receiver_error=coloured * normals[2 * p.axes :] if self.receiver_is_coloured else zeros,
             deviation=levels[0],
             reported_deviation=reported[0],
@@ -236,7 +240,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
         fix = reference + deviation * noise[2 * n : 3 * n]
         error = truth.receiver_error
         if self.receiver_is_coloured:
-            error = truth.receiver_process.advance(error, noise[3 * n : 4 * n])
+            process = GaussMarkov(truth.receiver_decay, truth.receiver_kick)
+            error = process.advance(error, noise[3 * n : 4 * n])
             fix = fix + error
         if p.spoofing_probability:
             pull = (truth.spoofing_rate * p.sampling_interval) * (number - truth.spoofing[0] + 1.0)
@@ -304,8 +309,8 @@ class InsGnssWorld(World[Task, Truth, Measurement]):
             **windows,
             "jamming_gain": truth.jamming_gain,
             "spoofing_rate": truth.spoofing_rate,
-            "receiver_decay": truth.receiver_process.decay,
-            "receiver_kick": truth.receiver_process.kick,
+            "receiver_decay": truth.receiver_decay,
+            "receiver_kick": truth.receiver_kick,
             "drift": truth.drift,
             "receiver_deviation": truth.deviation,
             "available": truth.available,
