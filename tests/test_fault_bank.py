@@ -20,14 +20,14 @@ from models import make_model
 import filtergym  # noqa: F401  # registers the environments
 
 ID = "filtergym/LooselyCoupledNavigation-v0"
-STEPS, INTERVAL = 7, 0.1
+INTERVAL = 0.1
 
 
-def measurements(task, seed, axes=1):
-    """A few measurements of noise, jumps and a missing fix, one lane."""
+def measurements(seed, steps=7, axes=1):
+    """A few measurements of noise, a ramp and a missing fix, one lane."""
     rng = np.random.default_rng(seed)
-    ins = np.cumsum(rng.normal(0.0, 0.3, (STEPS, axes, 1)), axis=0)
-    for k in range(STEPS):
+    ins = np.cumsum(rng.normal(0.0, 0.3, (steps, axes, 1)), axis=0)
+    for k in range(steps):
         available = np.array([0.0 if k == 4 else 1.0])
         fix = ins[k] + rng.normal(0.0, 1.5, (axes, 1)) + 0.5 * max(k - 2, 0)
         before = ins[k - 1] if k else np.zeros((axes, 1))
@@ -41,17 +41,17 @@ def enumerated(bank, task, seen):
 
     A pull begins at a multiple of the spacing; being there with its age, it ends with the hazard of its duration.
     """
-    p, prior, T = task.parameters, bank.prior, INTERVAL
+    p, prior, T, steps = task.parameters, bank.prior, INTERVAL, len(seen)
     levels, L = np.array(prior.levels), len(prior.levels)
     stay = math.exp(-prior.level_rate * T)
     change = stay * np.eye(L) + (1.0 - stay) / L
     share = prior.onset_rate * bank.spacing * T
     begins = share / (1.0 + share)
     # Histories of the pull: onset and end, numbers of measurements, None for never.
-    births = [None, *range(bank.spacing, STEPS + 1, bank.spacing)]
+    births = [None, *range(bank.spacing, steps + 1, bank.spacing)]
     histories = []
     for onset in births:
-        ends = [None] if onset is None else [None, *range(onset + 1, STEPS + 1)]
+        ends = [None] if onset is None else [None, *range(onset + 1, steps + 1)]
         histories += [(onset, end) for end in ends]
     total, parts = [], []
     drift, coloured = np.ravel(bank.drift), np.ravel(bank.coloured)
@@ -61,7 +61,7 @@ def enumerated(bank, task, seen):
         F, Q = np.eye(4), np.zeros((4, 4))
         F[:3, :3], Q[:3, :3] = van_loan(A, W, T)
         weight = math.log(float(np.ravel(bank.ins_weights)[j]))
-        for k in range(1, STEPS + 1):
+        for k in range(1, steps + 1):
             pulled = onset is not None and onset <= k and (end is None or k < end)
             if onset is None or k < onset:
                 weight += math.log(1.0 - begins) if k % bank.spacing == 0 else 0.0
@@ -76,7 +76,7 @@ def enumerated(bank, task, seen):
         if weight == -math.inf:
             continue
         first = (1.0 - prior.distrust) * np.isclose(levels, 1.0) + prior.distrust / L
-        for sequence in itertools.product(range(L), repeat=STEPS):
+        for sequence in itertools.product(range(L), repeat=steps):
             log, x, P = weight, np.zeros(4), np.zeros((4, 4))
             P[:3, :3] = P0
             for k, said in enumerate(seen, 1):
@@ -115,7 +115,7 @@ def of_bank(bank, seen):
 
 def small(**changed):
     """A bank of few hypotheses and its task."""
-    task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=STEPS).task
+    task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=7).task
     prior = {"points": 2, "onsets": 3, "shortest": 5.0, "longest": 0.9, "onset": (0.0, 9.0), "onset_rate": 0.5}
     return FaultBank(task, TRAINING, **{**prior, "levels": (1.0,), **changed}), task
 
@@ -124,7 +124,7 @@ def small(**changed):
 def test_without_merging_the_bank_is_the_enumeration_of_all_hypotheses(seed):
     """No pull ends, and the receiver has one level."""
     bank, task = small()
-    seen = list(measurements(task, seed))
+    seen = list(measurements(seed))
     np.testing.assert_allclose(of_bank(bank, seen), enumerated(bank, task, seen), rtol=1e-10, atol=1e-10)
 
 
@@ -132,24 +132,20 @@ def test_without_merging_the_bank_is_the_enumeration_of_all_hypotheses(seed):
 def test_merging_costs_little(seed):
     """With ends and two levels the bank merges, which no bound limits; what it loses here is small."""
     bank, task = small(shortest=0.0, levels=(1.0, 6.0), points=1, onsets=4, longest=1.2, level_rate=1.0, onset_rate=0.2)
-    seen = list(measurements(task, seed))
+    seen = list(measurements(seed, 5))
     found, exact = of_bank(bank, seen), enumerated(bank, task, seen)
-    assert found[0] == pytest.approx(exact[0], abs=0.03 * STEPS)
+    assert found[0] == pytest.approx(exact[0], abs=0.15)
     assert found[1] == pytest.approx(exact[1], abs=0.2 * math.sqrt(exact[2]))
     assert found[2] == pytest.approx(exact[2], rel=0.25)
 
 
 def test_the_first_fix_gives_the_exact_mixture():
     bank, task = small(levels=(1.0, 6.0), distrust=0.4)
-    (first, *_) = measurements(task, 3)
+    (first, *_) = measurements(3)
     memory = bank.start(Initial(np.zeros((1, 1)), np.zeros((1, 1, 1))), 1)
     _, _, memory, found = bank.update(first, memory)
     p, nu = task.parameters, first.ins[0, 0] - first.fix[0, 0]
     density = 0.0
-    mixed = np.array([0.8, 0.2])
-    mixed = mixed * math.exp(-bank.prior.level_rate * INTERVAL) + 0.5 * -math.expm1(
-        -bank.prior.level_rate * INTERVAL
-    )
     mixed = np.array([0.8, 0.2])  # a report that is new says more than what was known before
     for weight, drift, coloured, white in zip(
         *(np.ravel(x) for x in (bank.ins_weights, bank.drift, bank.coloured, bank.white_growth)), strict=True
