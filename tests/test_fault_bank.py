@@ -116,7 +116,14 @@ def of_bank(bank, seen):
 def small(**changed):
     """A bank of few hypotheses and its task."""
     task = make_model(ID, "gain", "random", sampling_interval=INTERVAL, horizon=7).task
-    prior = {"points": 2, "onsets": 3, "shortest": 5.0, "longest": 0.9, "onset": (0.0, 9.0), "onset_rate": 0.5}
+    prior = {
+        "points": 2,
+        "onsets": 3,
+        "shortest": 5.0,
+        "longest": 0.9,
+        "onset": (0.0, 9.0),
+        "onset_rate": 0.5,
+    }
     return FaultBank(task, TRAINING, **{**prior, "levels": (1.0,), **changed}), task
 
 
@@ -131,7 +138,9 @@ def test_without_merging_the_bank_is_the_enumeration_of_all_hypotheses(seed):
 @pytest.mark.parametrize("seed", range(5))
 def test_merging_costs_little(seed):
     """With ends and two levels the bank merges, which no bound limits; what it loses here is small."""
-    bank, task = small(shortest=0.0, levels=(1.0, 6.0), points=1, onsets=4, longest=1.2, level_rate=1.0, onset_rate=0.2)
+    bank, task = small(
+        shortest=0.0, levels=(1.0, 6.0), points=1, onsets=4, longest=1.2, level_rate=1.0, onset_rate=0.2
+    )
     seen = list(measurements(seed, 5))
     found, exact = of_bank(bank, seen), enumerated(bank, task, seen)
     assert found[0] == pytest.approx(exact[0], abs=0.15)
@@ -151,7 +160,12 @@ def test_the_first_fix_gives_the_exact_mixture():
         *(np.ravel(x) for x in (bank.ins_weights, bank.drift, bank.coloured, bank.white_growth)), strict=True
     ):
         s = p.sampling
-        V = (s.step * drift) ** 2 + (s.drive * coloured) ** 2 + (s.coupling * s.coloured * coloured) ** 2 + white
+        V = (
+            (s.step * drift) ** 2
+            + (s.drive * coloured) ** 2
+            + (s.coupling * s.coloured * coloured) ** 2
+            + white
+        )
         for q, level in zip(mixed, (1.0, 6.0), strict=True):
             S = V + level * 1.44
             density += weight * q * math.exp(-0.5 * nu**2 / S) / math.sqrt(2.0 * math.pi * S)

@@ -82,9 +82,7 @@ def test_axes_share_their_level(axes):
     levels, q, nu = np.array([0.5, 2.0, 20.0]), np.array([0.2, 0.5, 0.3]), np.array([0.4, -2.0, 3.0])[:axes]
     noise = receiver_faults.weigh_levels(np.array((nu**2).sum()), axes, 0.3, levels, q)
     S = 0.3 + levels
-    densities = q * np.prod(
-        np.exp(-0.5 * nu[:, None] ** 2 / S) / np.sqrt(2.0 * math.pi * S), axis=0
-    )
+    densities = q * np.prod(np.exp(-0.5 * nu[:, None] ** 2 / S) / np.sqrt(2.0 * math.pi * S), axis=0)
     assert noise.log_density == pytest.approx(math.log(densities.sum()), rel=1e-12)
     np.testing.assert_allclose(noise.responsibilities, densities / densities.sum(), rtol=1e-12)
 
